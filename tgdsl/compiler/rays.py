@@ -1,0 +1,334 @@
+"""Parallel rays onto a surface: what they hit first, and the rectangle in which they can hit a region at all.
+
+Rays travel along one direction and start outside, so the first hit is on the outer surface by construction: inner
+shells and overlapping geoms need no cleaning. All rays being parallel, casting is drawing triangles: everything is
+expressed as (u, v, t) with u along the columns, v along the rows and t along the rays, a right-handed frame, and a ray
+is a point in the (u, v) plane.
+
+Shapes: `f` faces that are not seen edge-on, `ray` rays, `pair` (face, ray) pairs whose bounding boxes meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tgdsl.geometry.surface import Surface
+
+EDGE_ON = 1e-6
+"""Faces with a smaller |cosine| between normal and rays are left out: their neighbours cover the same rays."""
+ROUNDING = 1e-9
+"""Widening of faces, relative to the surface's extent, so that no ray slips between two faces that share an edge."""
+RASTER = 256
+"""Rays along the longer side of the raster that looks for the visible part of a region."""
+LENGTH_TOLERANCE = 1e-7
+"""Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
+ANGLE_TOLERANCE = 1e-9
+"""The same for angles [rad]."""
+_PAIRS = 1_000_000  # (face, ray) pairs tested at a time, to bound memory
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Part of a surface: the intersection of parts, all in the body frame.
+
+    Attributes:
+        is_geom: Which of the surface's geoms belong to it; None: all.
+        facings: Unit direction and largest angle [rad] between it and the outward normal.
+        boxes: Lower and upper corner [m].
+        spheres: Centre and radius [m].
+    """
+
+    is_geom: Bool[np.ndarray, " geom"] | None
+    facings: tuple[tuple[Float[np.ndarray, "3"], float], ...]
+    boxes: tuple[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]], ...]
+    spheres: tuple[tuple[Float[np.ndarray, "3"], float], ...]
+
+    @property
+    def is_everything(self) -> bool:
+        """Whether nothing is left out."""
+        return self.is_geom is None and not (self.facings or self.boxes or self.spheres)
+
+    def has_faces(self, normals: Float[np.ndarray, "n 3"], geom: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return which faces may belong, by their outward unit normals (body frame) and geoms."""
+        is_in = np.ones(len(normals), dtype=bool) if self.is_geom is None else self.is_geom[geom]
+        for direction, within in self.facings:
+            sine = np.linalg.norm(np.cross(normals, direction), axis=1)
+            is_in = is_in & (np.arctan2(sine, normals @ direction) <= within + ANGLE_TOLERANCE)
+        return is_in
+
+    def has_points(self, pos: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Return which points of such faces belong, by position (body frame) [m]."""
+        is_in = np.ones(pos.shape[:-1], dtype=bool)
+        for low, high in self.boxes:
+            is_in &= ((pos >= low - LENGTH_TOLERANCE) & (pos <= high + LENGTH_TOLERANCE)).all(axis=-1)
+        for center, radius in self.spheres:
+            is_in &= np.linalg.norm(pos - center, axis=-1) <= radius + LENGTH_TOLERANCE
+        return is_in
+
+    def extremes(
+        self, corners: Float[np.ndarray, "n 3 3"], normals: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "2 3"]
+    ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+        """Return the points where the part of a face in the region can reach farthest along some axes.
+
+        Args:
+            corners: The faces' corners (body frame) [m].
+            normals: Their unit normals (body frame).
+            axes: Unit vectors (body frame).
+
+        Returns:
+            The points, and for each a point within its face, both in the body frame [m].
+        """
+        polygons, owner = corners, np.arange(len(corners))
+        for bounds in self.boxes:
+            for side, bound in zip((-1.0, 1.0), bounds, strict=True):
+                for axis in range(3):
+                    polygons, kept = _clipped(polygons, axis, side, bound[axis])
+                    owner = owner[kept]
+        found = [polygons]
+        for center, radius in self.spheres:
+            found.append(_rim(polygons, center, radius))
+            found.append(_disc(corners[owner], normals[owner], axes, center, radius))
+        points = np.concatenate(found, axis=1)
+        inner = np.broadcast_to(polygons.mean(axis=1, keepdims=True), points.shape)
+        is_in = self.has_points(points)  # false for NaN
+        return points[is_in], inner[is_in]
+
+
+def _clipped(
+    polygons: Float[np.ndarray, "n m 3"], axis: int, side: float, bound: float
+) -> tuple[Float[np.ndarray, "k m+1 3"], Int[np.ndarray, " k"]]:
+    """Return convex polygons cut at a plane, and which are left; a polygon with few corners repeats its last."""
+    height = side * (polygons[..., axis] - bound)
+    height = np.where(np.abs(height) <= LENGTH_TOLERANCE, 0.0, height)
+    polygons = polygons.copy()
+    polygons[..., axis] = np.where(height == 0.0, bound, polygons[..., axis])
+    next_height, following = np.roll(height, -1, axis=1), np.roll(polygons, -1, axis=1)
+    is_cut = height * next_height < 0
+    share = np.divide(height, height - next_height, out=np.zeros_like(height), where=is_cut)
+    cut = polygons + share[..., None] * (following - polygons)
+    cut[..., axis] = bound
+    count, size = height.shape
+    points = np.stack([polygons, cut], axis=2).reshape(count, 2 * size, 3)
+    is_kept = np.stack([height <= 0, is_cut], axis=2).reshape(count, 2 * size)
+    num = is_kept.sum(axis=1)
+    order = np.argsort(~is_kept, axis=1, kind="stable")
+    slot = np.minimum(np.arange(size + 1), np.maximum(num - 1, 0)[:, None])
+    kept = np.flatnonzero(num)
+    return np.take_along_axis(points, np.take_along_axis(order, slot, 1)[..., None], 1)[kept], kept
+
+
+def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, "3"], radius: float) -> Float[np.ndarray, "n k 3"]:
+    """Return where the edges of polygons pass through a sphere; NaN where they do not."""
+    start, along = polygons - center, np.roll(polygons, -1, axis=1) - polygons
+    a, b = (along**2).sum(-1), (start * along).sum(-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(b**2 - a * ((start**2).sum(-1) - radius**2))
+        share = np.concatenate([(-b - root) / a, (-b + root) / a], axis=1)
+    share = np.where((share >= 0) & (share <= 1), share, np.nan)
+    return np.tile(polygons, (1, 2, 1)) + share[..., None] * np.tile(along, (1, 2, 1))
+
+
+def _disc(
+    corners: Float[np.ndarray, "n 3 3"],
+    normals: Float[np.ndarray, "n 3"],
+    axes: Float[np.ndarray, "2 3"],
+    center: Float[np.ndarray, "3"],
+    radius: float,
+) -> Float[np.ndarray, "n 4 3"]:
+    """Return where the disc that a sphere cuts out of a face's plane reaches farthest along ±axes; NaN off the face."""
+    height = ((corners[:, 0] - center) * normals).sum(-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        disc_radius = np.sqrt(radius**2 - height**2)
+        toward = np.concatenate([axes, -axes]) - (normals @ np.concatenate([axes, -axes]).T)[..., None] * normals[:, None]
+        toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
+    points = (center + height[:, None] * normals)[:, None] + disc_radius[:, None, None] * toward
+    along = np.roll(corners, -1, axis=1) - corners
+    inward = np.cross(normals[:, None], along)
+    offset = np.einsum("nkpx,nkx->npk", points[:, None] - corners[:, :, None], inward)
+    is_on = (offset >= 0).all(axis=-1) | (offset <= 0).all(axis=-1)
+    return np.where(is_on[..., None], points, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A surface seen along a direction.
+
+    Attributes:
+        axes: Rows are the unit vectors of u, v and t in the body frame, right-handed; rays travel along +t.
+        face_id: Index of each face into the surface's faces.
+        corners: (u, v, t) of each face's corners, counter-clockwise in (u, v) [m].
+        normals: Unit face normals against the rays, body frame: the side that a ray comes from is outside.
+        geom: Index of each face's geom.
+        rounding: Lengths below this are rounding noise [m].
+    """
+
+    axes: Float[np.ndarray, "3 3"]
+    face_id: Int[np.ndarray, " f"]
+    corners: Float[np.ndarray, "f 3 3"]
+    normals: Float[np.ndarray, "f 3"]
+    geom: Int[np.ndarray, " f"]
+    rounding: float
+
+    @staticmethod
+    def of(surface: Surface, axes: Float[np.ndarray, "3 3"]) -> View:
+        """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area."""
+        cosine = surface.face_normals @ axes[2]
+        face_id = np.flatnonzero(np.abs(cosine) > EDGE_ON)
+        corners = surface.corners[face_id] @ axes.T
+        is_front = cosine[face_id] < 0
+        # A face that looks against the rays turns clockwise in (u, v), because t points away from its viewer.
+        corners = np.where(is_front[:, None, None], corners[:, ::-1], corners)
+        normals = np.where(is_front[:, None], 1.0, -1.0) * surface.face_normals[face_id]
+        extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max()) if len(face_id) else 0.0
+        return View(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """First hits of some rays.
+
+    Attributes:
+        face: Index into the view's faces; −1 where a ray misses.
+        depth: t of the hit [m]; infinite where a ray misses.
+    """
+
+    face: Int[np.ndarray, " ray"]
+    depth: Float[np.ndarray, " ray"]
+
+
+def first_hits(view: View, uv: Float[np.ndarray, "ray 2"]) -> Hits:
+    """Return what each ray hits first.
+
+    Where several faces are hit at the same depth (a shared edge), the one that faces the ray most squarely counts, then
+    the first in the surface's order.
+
+    Args:
+        view: The surface, seen along the rays.
+        uv: Where the rays pass through the (u, v) plane [m].
+    """
+    found = [_hits(view, uv, face, ray) for face, ray in _pairs(view, uv)]
+    face, ray, t = (np.concatenate([part[i] for part in found]) for i in range(3)) if found else (np.zeros(0, int),) * 3
+    nearest = np.full(len(uv), np.inf)
+    np.minimum.at(nearest, ray, t)
+    is_first = t <= nearest[ray] + view.rounding
+    face, ray, t = face[is_first], ray[is_first], t[is_first]
+    squarely = view.normals[face] @ view.axes[2]
+    order = np.lexsort((face, squarely, ray))
+    ray, first = np.unique(ray[order], return_index=True)
+    hit_face = np.full(len(uv), -1, dtype=np.int64)
+    hit_face[ray] = face[order][first]
+    nearest[ray] = t[order][first]
+    return Hits(hit_face, nearest)
+
+
+def _hits(
+    view: View, uv: Float[np.ndarray, "ray 2"], face: Int[np.ndarray, " pair"], ray: Int[np.ndarray, " pair"]
+) -> tuple[Int[np.ndarray, " hit"], Int[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
+    """Return face, ray and depth of the pairs that meet."""
+    u, v = uv[ray].T
+    is_hit = np.ones(len(ray), dtype=bool)
+    for i in range(3):
+        start, end = view.corners[:, i, :2], view.corners[:, (i + 1) % 3, :2]
+        along = end - start
+        length = np.linalg.norm(along, axis=1)
+        inward = np.divide(np.stack([-along[:, 1], along[:, 0]], -1), length[:, None], where=length[:, None] > 0)
+        is_hit &= inward[face, 0] * (u - start[face, 0]) + inward[face, 1] * (v - start[face, 1]) >= -view.rounding
+    face, ray = face[is_hit], ray[is_hit]
+    corners = view.corners[face]
+    slope = view.normals[face] @ view.axes.T
+    offset = uv[ray] - corners[:, 0, :2]
+    t = corners[:, 0, 2] - (slope[:, 0] * offset[:, 0] + slope[:, 1] * offset[:, 1]) / slope[:, 2]
+    # Steep faces extrapolate badly across the rounding margin.
+    return face, ray, np.clip(t, corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1))
+
+
+def _pairs(
+    view: View, uv: Float[np.ndarray, "ray 2"]
+) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
+    """Yield (face, ray) pairs whose bounding boxes meet, in chunks: rays are sorted into the squares of a coarse mesh."""
+    if not len(uv):
+        return
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    side = min(RASTER, int(np.ceil(np.sqrt(len(uv)))))
+    scale = side / np.maximum(high - low, max(view.rounding, np.finfo(float).tiny))
+
+    def squares(points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n 2"]:
+        return np.clip(np.floor((points - low) * scale), 0, side - 1).astype(np.int64)
+
+    of_ray = squares(uv) @ [side, 1]
+    order = np.argsort(of_ray, kind="stable")
+    starts = np.searchsorted(of_ray[order], np.arange(side * side + 1))
+    face_low = view.corners[:, :, :2].min(axis=1) - view.rounding
+    face_high = view.corners[:, :, :2].max(axis=1) + view.rounding
+    near = np.flatnonzero(((face_low <= high) & (face_high >= low)).all(axis=1))
+    first, last = squares(face_low[near]), squares(face_high[near])
+    # Squares of one u are contiguous, so that each (face, u) pair is one slice of the sorted rays.
+    which, u = _expanded(last[:, 0] - first[:, 0] + 1)
+    row = (first[which, 0] + u) * side
+    begin, end = starts[row + first[which, 1]], starts[row + last[which, 1] + 1]
+    chunk = np.cumsum(end - begin) // _PAIRS
+    for start, stop in zip(*_runs(chunk), strict=True):
+        part, step = _expanded((end - begin)[start:stop])
+        yield near[which[start:stop][part]], order[begin[start:stop][part] + step]
+
+
+def _expanded(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Return each index i `counts[i]` times, and the running number within it."""
+    which = np.repeat(np.arange(len(counts)), counts)
+    return which, np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _runs(sorted_ids: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " run"], Int[np.ndarray, " run"]]:
+    """Return start and stop of each run of equal values."""
+    if not len(sorted_ids):
+        return np.zeros(0, int), np.zeros(0, int)
+    cuts = np.flatnonzero(np.diff(sorted_ids)) + 1
+    return np.concatenate([[0], cuts]), np.concatenate([cuts, [len(sorted_ids)]])
+
+
+def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
+    """Return the bounding rectangle, in (u, v), of all first hits in the region; None if there is no such hit.
+
+    Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
+    region on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where an occluding part cuts
+    the region it is known to within one raster cell, 1/256 of the region's longer side.
+
+    Args:
+        view: The surface, seen along the rays.
+        region: What counts as a hit.
+    """
+    if region.is_everything:
+        corners = view.corners[:, :, :2].reshape(-1, 2)
+        return (corners.min(axis=0), corners.max(axis=0)) if len(corners) else None
+    faces = np.flatnonzero(region.has_faces(view.normals, view.geom))
+    extremes, inner = region.extremes(view.corners[faces] @ view.axes, view.normals[faces], view.axes[:2])
+    if not len(extremes):
+        return None
+    uv = extremes @ view.axes[:2].T
+    found = _raster_hits(view, region, uv.min(axis=0), uv.max(axis=0))
+    low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.full(2, np.inf), np.full(2, -np.inf))
+    is_outside = ((uv < low) | (uv > high)).any(axis=1)
+    # A corner can be visible although its face is hidden, so look a little way inside the face.
+    looked_at = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
+    uvt = looked_at @ view.axes.T
+    is_seen = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2] - view.rounding - 3 * LENGTH_TOLERANCE
+    seen = np.concatenate([found, uv[is_outside][is_seen]])
+    return (seen.min(axis=0), seen.max(axis=0)) if len(seen) else None
+
+
+def _raster_hits(
+    view: View, region: Region, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "hit 2"]:
+    """Return the rays of a fine raster over a rectangle whose first hit is in the region."""
+    size = np.maximum(high - low, view.rounding)
+    num = np.clip(np.ceil(RASTER * size / size.max()), 16, RASTER).astype(int)
+    u, v = (low[i] + (np.arange(num[i]) + 0.5) / num[i] * size[i] for i in range(2))
+    uv = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    hits = first_hits(view, uv)
+    uv, face, depth = (array[hits.face >= 0] for array in (uv, hits.face, hits.depth))
+    pos = np.column_stack([uv, depth]) @ view.axes
+    return uv[region.has_faces(view.normals[face], view.geom[face]) & region.has_points(pos)]

@@ -1,0 +1,82 @@
+"""Errors that a user can act on: what was found, where, and what would be right."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+
+class TgdslError(Exception):
+    """Base of every error that tgdsl raises on purpose."""
+
+
+class RobotError(TgdslError):
+    """A robot or scene file that cannot be read, or that holds something tgdsl does not support."""
+
+
+class StateError(TgdslError):
+    """A `SceneState` that does not hold what a compiled module wants."""
+
+
+class ArtifactError(TgdslError):
+    """A compiled artefact that is damaged, of another version, or whose assets have changed."""
+
+
+class SimulationError(TgdslError):
+    """A simulator that cannot run what was asked of it, or that diverged."""
+
+
+@dataclass(frozen=True, order=True)
+class Problem:
+    """One mistake in a document.
+
+    Attributes:
+        file: The document's file name, as the user gave it.
+        line: Line of the mistake, from 1; 0 where the document did not come from a file.
+        column: Column of the mistake, from 1.
+        path: Where it is in the document, such as `sensors.touch.links`.
+        what: What was found and what was expected.
+        hint: What would be right, or empty.
+    """
+
+    file: str
+    line: int
+    column: int
+    path: str
+    what: str
+    hint: str = ""
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}:{self.column}: " if self.line else f"{self.file}: "
+        path = f"{self.path}: " if self.path else ""
+        return f"{place}{path}{self.what}" + (f"; {self.hint}" if self.hint else "")
+
+
+class SpecError(TgdslError):
+    """All the mistakes of a document and its layout, sorted by place.
+
+    Attributes:
+        problems: The mistakes, sorted, without repeats.
+    """
+
+    def __init__(self, problems: Iterable[Problem]):
+        self.problems: tuple[Problem, ...] = tuple(sorted(set(problems)))
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
+    """Return a hint that names the nearest known name, or else lists what exists."""
+    known = sorted(set(names))
+    if not known:
+        return f"there are no {what}"
+    near = difflib.get_close_matches(found, known, n=1, cutoff=0.6)
+    if near:
+        return f'did you mean "{near[0]}"?'
+    return f"known {what}: {listed(known)}"
+
+
+def listed(names: Sequence[str], limit: int = 12) -> str:
+    """Return names joined by commas, the tail counted rather than printed."""
+    shown = ", ".join(names[:limit])
+    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"

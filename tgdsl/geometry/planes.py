@@ -1,0 +1,107 @@
+"""Vectors and rotations as separate component planes.
+
+A vector is a tuple `(x, y, z)` of equally shaped tensors, a rotation a tuple of nine, row by row. Written so, every
+operation is pointwise and a compiler fuses a whole sensor into one loop; a trailing axis of 3 costs several times more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Vec = tuple[Tensor, Tensor, Tensor]
+Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+TINY = 1e-30
+"""Squared lengths up to this [m²] have no direction: it keeps float32 clear of subnormal numbers."""
+
+
+def split(stacked: Tensor) -> Vec:
+    """Return the components of a `(..., 3)` tensor, as views."""
+    return stacked[..., 0], stacked[..., 1], stacked[..., 2]
+
+
+def add(a: Vec, b: Vec) -> Vec:
+    """Return a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def sub(a: Vec, b: Vec) -> Vec:
+    """Return a − b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def scale(factor: Tensor, a: Vec) -> Vec:
+    """Return factor · a."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+def dot(a: Vec, b: Vec) -> Tensor:
+    """Return the inner product of a and b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vec, b: Vec) -> Vec:
+    """Return a × b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def where(condition: Tensor, a: Vec, b: Vec) -> Vec:
+    """Return a where the condition holds, else b."""
+    return (
+        torch.where(condition, a[0], b[0]),
+        torch.where(condition, a[1], b[1]),
+        torch.where(condition, a[2], b[2]),
+    )
+
+
+def each(function: Callable[[Tensor], Tensor], planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Return the function applied to every plane."""
+    return tuple(function(plane) for plane in planes)
+
+
+def rotate(r: Rot, a: Vec) -> Vec:
+    """Return R a."""
+    return (
+        r[0] * a[0] + r[1] * a[1] + r[2] * a[2],
+        r[3] * a[0] + r[4] * a[1] + r[5] * a[2],
+        r[6] * a[0] + r[7] * a[1] + r[8] * a[2],
+    )
+
+
+def rotate_back(r: Rot, a: Vec) -> Vec:
+    """Return Rᵀ a."""
+    return (
+        r[0] * a[0] + r[3] * a[1] + r[6] * a[2],
+        r[1] * a[0] + r[4] * a[1] + r[7] * a[2],
+        r[2] * a[0] + r[5] * a[1] + r[8] * a[2],
+    )
+
+
+def transpose_times(a: Rot, b: Rot) -> Rot:
+    """Return Aᵀ B."""
+    columns = [rotate_back(a, (b[j], b[j + 3], b[j + 6])) for j in range(3)]
+    (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = columns
+    return xx, xy, xz, yx, yy, yz, zx, zy, zz
+
+
+def rotation(quat: Tensor) -> Rot:
+    """Return the rotation of a `(..., 4)` quaternion w, x, y, z, which need not have unit length."""
+    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    two = 2.0 / (w * w + x * x + y * y + z * z)
+    xx, yy, zz = two * x * x, two * y * y, two * z * z
+    xy, xz, yz = two * x * y, two * x * z, two * y * z
+    wx, wy, wz = two * w * x, two * w * y, two * w * z
+    return 1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy
+
+
+def length_and_direction(a: Vec, fixed: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> tuple[Tensor, Vec]:
+    """Return |a| and a/|a|; where a vanishes, 0 and the fixed unit vector. Derivatives are finite everywhere."""
+    squared = dot(a, a)
+    is_null = squared <= TINY
+    length = torch.sqrt(torch.where(is_null, 1.0, squared))
+    inverse = 1.0 / length
+    x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, fixed, strict=True))
+    return torch.where(is_null, 0.0, length), (x, y, z)

@@ -1,0 +1,168 @@
+"""Float64 definition of the contact query, in the world frame and one point at a time: the oracle of `query`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceBody:
+    """A body at one instant, in the world frame.
+
+    Attributes:
+        pos: Position of its frame [m].
+        quat: Orientation, w, x, y, z.
+        linvel: Velocity of the frame's origin [m/s].
+        angvel: Angular velocity [rad/s].
+    """
+
+    pos: Float[Array, "3"]
+    quat: Float[Array, "4"]
+    linvel: Float[Array, "3"]
+    angvel: Float[Array, "3"]
+
+    @property
+    def rotation(self) -> Float[Array, "3 3"]:
+        """Rotates body vectors into the world."""
+        return Rotation.from_quat(self.quat, scalar_first=True).as_matrix()
+
+    def velocity_at(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Velocity [m/s] of the body's material at a world point."""
+        return self.linvel + np.cross(self.angvel, point - self.pos)
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceGeom:
+    """A geom in its body's frame: MuJoCo's type name and size [m], position [m], rotation matrix."""
+
+    shape: str
+    size: Float[Array, "3"]
+    pos: Float[Array, "3"]
+    rotation: Float[Array, "3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What one link's probes feel, in the link's frame: the fields of `query.Felt`, one row per taxel."""
+
+    depth: Float[Array, " taxel"]
+    normal: Float[Array, "taxel 3"]
+    velocity: Float[Array, "taxel 3"]
+    angular: Float[Array, "taxel 3"]
+
+
+def touch(
+    link: ReferenceBody,
+    pos: Float[Array, "taxel 3"],
+    radius: Float[Array, " taxel"],
+    objects: Sequence[tuple[ReferenceBody, Sequence[ReferenceGeom]]],
+) -> Touch:
+    """Query the probes of one link against the objects that it may feel.
+
+    The paper's equations word for word: q = p_L + R_L x, d = max(0, max_g (R − φ_g(q))), m = ∇φ at the deepest geom,
+    v = R_Lᵀ (v_C(q) − v_L(q)). A probe of zero radius is inactive.
+    """
+    felt = Touch(np.zeros(len(pos)), np.zeros((len(pos), 3)), np.zeros((len(pos), 3)), np.zeros((len(pos), 3)))
+    into_link = link.rotation.T
+    for j, x in enumerate(pos):
+        q = link.pos + link.rotation @ x
+        for body, geoms in objects:
+            for geom in geoms:
+                rotation = body.rotation @ geom.rotation
+                local = rotation.T @ (q - body.pos - body.rotation @ geom.pos)
+                distance, gradient = signed_distance(geom.shape, geom.size, local)
+                depth = radius[j] - distance
+                if radius[j] > 0 and depth > felt.depth[j]:
+                    felt.depth[j] = depth
+                    felt.normal[j] = into_link @ rotation @ gradient
+                    felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
+                    felt.angular[j] = into_link @ (body.angvel - link.angvel)
+    return felt
+
+
+def signed_distance(
+    shape: str, size: Float[Array, "3"], point: Float[Array, "3"]
+) -> tuple[float, Float[Array, "3"]]:
+    """Return the signed distance [m] of a point to a primitive, and the outward gradient, both in the geom's frame.
+
+    Found by way of the nearest surface point, which the module's own `shapes` never form. Where that is not unique, the
+    convention is: +x at a centre or on an axis; x before y before z among equally near faces, a wall before a cap; the
+    positive side on a plane of symmetry.
+    """
+    if shape == "plane":
+        return float(point[2]), np.array([0.0, 0.0, 1.0])
+    if shape in ("sphere", "capsule"):
+        half = size[1] if shape == "capsule" else 0.0
+        core = np.array([0.0, 0.0, np.clip(point[2], -half, half)])
+        length = float(np.linalg.norm(point - core))
+        return length - size[0], (point - core) / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    nearest, is_inside, outward = {"box": _box, "cylinder": _cylinder, "ellipsoid": _ellipsoid}[shape](size, point)
+    length = float(np.linalg.norm(point - nearest))
+    if length == 0.0 or is_inside:
+        return -length, outward
+    return length, (point - nearest) / length
+
+
+def _box(size: Array, point: Array) -> tuple[Array, bool, Array]:
+    inside = bool(np.all(np.abs(point) <= size))
+    axis = int(np.argmin(size - np.abs(point)))
+    sign = -1.0 if point[axis] < 0 else 1.0
+    nearest = np.clip(point, -size, size)
+    if inside:
+        nearest[axis] = sign * size[axis]
+    outward = np.zeros(3)
+    outward[axis] = sign
+    return nearest, inside, outward
+
+
+def _cylinder(size: Array, point: Array) -> tuple[Array, bool, Array]:
+    radius, half = size[0], size[1]
+    radial = float(np.hypot(point[0], point[1]))
+    along = point[:2] / radial if radial > 0 else np.array([1.0, 0.0])
+    sign = -1.0 if point[2] < 0 else 1.0
+    to_wall, to_cap = radius - radial, half - abs(point[2])
+    if to_wall < 0 or to_cap < 0:
+        nearest = np.array([*(along * min(radial, radius)), np.clip(point[2], -half, half)])
+        return nearest, False, np.zeros(3)
+    if to_wall <= to_cap:
+        return np.array([*(along * radius), point[2]]), True, np.array([*along, 0.0])
+    return np.array([point[0], point[1], sign * half]), True, np.array([0.0, 0.0, sign])
+
+
+def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
+    """Nearest point by bisection on the Lagrange multiplier t: X_i = e_i² p_i / (t + e_i²), ‖X/e‖ = 1.
+
+    If no t above the pole −e² of the least axis solves it, the point is on that axis' plane of symmetry and the nearest
+    points are a mirrored pair, of which the positive is taken.
+    """
+    square = size**2
+    least = int(np.argmin(size))
+    sign = np.where(point < 0, -1.0, 1.0)
+    y = np.abs(point)
+
+    def excess(t: float) -> float:
+        return float(np.sum((size * y / (t + square)) ** 2)) - 1.0
+
+    others = np.arange(3) != least
+    flat = others & (square > square[least])
+    at_pole = np.sum((size[flat] * y[flat] / (square[flat] - square[least])) ** 2)
+    if not np.any(y[square == square[least]] > 0) and at_pole <= 1.0:
+        nearest = np.zeros(3)
+        nearest[flat] = square[flat] * y[flat] / (square[flat] - square[least])
+        nearest[least] = size[least] * np.sqrt(1.0 - at_pole)
+    else:
+        low, high = -square[least] + size[least] * y[least], float(np.linalg.norm(size * y))
+        for _ in range(200):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+        nearest = square * y / (0.5 * (low + high) + square)
+    inside = bool(np.sum((point / size) ** 2) < 1.0)
+    outward = nearest / square
+    return sign * nearest, inside, sign * outward / np.linalg.norm(outward)

@@ -1,0 +1,68 @@
+"""Triangle surfaces of links, as NumPy arrays in the frame of the body they belong to.
+
+Shapes: `v` vertices, `f` faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of one or several geoms of a body.
+
+    Attributes:
+        vertices: Positions in the body frame [m].
+        faces: Vertex indices, counter-clockwise seen from outside.
+        face_geom: Index into `geoms` of the geom that each face belongs to.
+        geoms: Names of the geoms: their own name and, if any, their mesh's.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    face_geom: Int[np.ndarray, " f"]
+    geoms: tuple[tuple[str, ...], ...]
+
+    @cached_property
+    def corners(self) -> Float[np.ndarray, "f 3 3"]:
+        """Corner positions of each face [m]."""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def _cross(self) -> Float[np.ndarray, "f 3"]:
+        corners = self.corners
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    @cached_property
+    def face_areas(self) -> Float[np.ndarray, " f"]:
+        """Area of each face [m²]."""
+        return 0.5 * np.linalg.norm(self._cross, axis=1)
+
+    @cached_property
+    def face_normals(self) -> Float[np.ndarray, "f 3"]:
+        """Outward unit normal of each face; zero for a face without area."""
+        length = np.linalg.norm(self._cross, axis=1, keepdims=True)
+        return np.divide(self._cross, length, out=np.zeros_like(self._cross), where=length > 0)
+
+    def keep(self, faces: Bool[np.ndarray, " f"]) -> Surface:
+        """Return the surface of some of the faces; vertices and geoms stay."""
+        return Surface(self.vertices, self.faces[faces], self.face_geom[faces], self.geoms)
+
+    @staticmethod
+    def joined(parts: Sequence[Surface]) -> Surface:
+        """Return one surface that holds all faces of the parts, in order."""
+        vertices, faces, face_geom, geoms = [], [], [], []
+        num_vertices = 0
+        for part in parts:
+            faces.append(part.faces + num_vertices)
+            face_geom.append(part.face_geom + len(geoms))
+            vertices.append(part.vertices)
+            geoms.extend(part.geoms)
+            num_vertices += len(part.vertices)
+        return Surface(np.concatenate(vertices), np.concatenate(faces), np.concatenate(face_geom), tuple(geoms))

@@ -1,0 +1,84 @@
+"""The Layout: what a spec means on one robot at one resolution. NumPy, float64, one row per taxel.
+
+Shapes: `taxel` rows, sorted by link; every position and direction is in the frame of the taxel's body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class Link:
+    """A part of the robot that carries taxels.
+
+    Attributes:
+        name: Name that the layout gave it: a body's, a geom's or a mesh's.
+        body: The body whose frame the taxels are in.
+    """
+
+    name: str
+    body: str
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Taxels of all links.
+
+    Attributes:
+        links: The links, in the robot's body order.
+        groups: Names of the links in each link group.
+        link_id: Index into `links` of each taxel; ascending.
+        pos: Position in the body frame [m].
+        normal: Outward unit normal in the body frame.
+        tangent: Unit tangent in the body frame, perpendicular to the normal.
+        radius: Sensing radius [m]; 0 marks an inactive filler.
+        area: Surface that the taxel stands for [m²].
+        cell: Row and column in the link's grid; −1 where it has none.
+    """
+
+    links: tuple[Link, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    link_id: Int[np.ndarray, " taxel"]
+    pos: Float[np.ndarray, "taxel 3"]
+    normal: Float[np.ndarray, "taxel 3"]
+    tangent: Float[np.ndarray, "taxel 3"]
+    radius: Float[np.ndarray, " taxel"]
+    area: Float[np.ndarray, " taxel"]
+    cell: Int[np.ndarray, "taxel 2"]
+
+    @property
+    def num_taxels(self) -> int:
+        """Number of taxels on all links."""
+        return len(self.link_id)
+
+    def taxels_of(self, names: tuple[str, ...]) -> Int[np.ndarray, " chosen"]:
+        """Return the taxel indices of some links, ascending."""
+        wanted = np.array([link.name in set(names) for link in self.links], dtype=bool)
+        return np.flatnonzero(wanted[self.link_id]).astype(np.int64)
+
+    def take(self, taxels: Int[np.ndarray, " chosen"]) -> Layout:
+        """Return the layout of some taxels, with only the links that carry them."""
+        used = np.unique(self.link_id[taxels])
+        renumbered = np.full(len(self.links), -1, dtype=np.int64)
+        renumbered[used] = np.arange(len(used))
+        names = {self.links[i].name for i in used}
+        return Layout(
+            links=tuple(self.links[i] for i in used),
+            groups={group: kept for group, members in self.groups.items() if (kept := _only(members, names))},
+            link_id=renumbered[self.link_id[taxels]],
+            pos=self.pos[taxels],
+            normal=self.normal[taxels],
+            tangent=self.tangent[taxels],
+            radius=self.radius[taxels],
+            area=self.area[taxels],
+            cell=self.cell[taxels],
+        )
+
+
+def _only(members: tuple[str, ...], names: set[str]) -> tuple[str, ...]:
+    return tuple(name for name in members if name in names)

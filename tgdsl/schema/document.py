@@ -1,0 +1,90 @@
+"""The document a user writes: robot, scene, objects, sensors, noise profiles, observations."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import Field, StringConstraints, create_model
+
+from tgdsl.fields import SpecModel, text_or
+from tgdsl.observations import ObservationSpec
+from tgdsl.schema.placement import LayoutSpec
+from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors.base import ProbeSpec
+from tgdsl.sensors.noise import NoiseSpec
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
+
+
+class RobotSpec(SpecModel):
+    """The robot and where its taxels sit."""
+
+    model: str
+    """MJCF or URDF file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
+    layout: text_or(LayoutSpec) | None = None
+    """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name."""
+
+
+class SceneSpec(SpecModel):
+    """The scene that is simulated."""
+
+    model: str
+    """MJCF file that holds the robot, its body names unchanged, and the objects."""
+
+
+class ObjectSpec(SpecModel):
+    """Something that taxels can feel."""
+
+    body: str
+    """Name of its body in the scene (or in the robot's file, if there is no scene)."""
+
+
+class Spec(SpecModel):
+    """What is felt: robot, scene, objects, sensors, noise and observations."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    robot: RobotSpec
+    """The robot and its layout."""
+    scene: SceneSpec | None = None
+    """Robot and objects in one MuJoCo scene; default: the robot's own file."""
+    objects: dict[Name, ObjectSpec] = {}
+    """What taxels can feel; nothing else is modelled."""
+    resolution: str | None = None
+    """One of the layout's resolutions; may be left out where it has only one."""
+    sensors: Annotated[dict[Name, ProbeSpec], Field(min_length=1)]
+    """Sensors by name."""
+    noise: dict[Name, NoiseSpec] = {}
+    """Named noise profiles, beside the built-in `clean` and `noisy`."""
+    observations: dict[Name, Annotated[tuple[ObservationSpec, ...], Field(min_length=1)]] = {}
+    """What policies read: groups of observation terms, concatenated in order."""
+
+
+@cache
+def document_model(kinds: tuple[Kind, ...] = KINDS) -> type[Spec]:
+    """Return the document model whose sensors are of the given kinds."""
+    specs = tuple(kind.spec for kind in kinds)
+    union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # noqa: UP007
+    sensors = (dict[Name, union], Field(min_length=1, description="Sensors by name."))
+    return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors)
+
+
+def json_schema(kinds: tuple[Kind, ...] = KINDS) -> dict[str, Any]:
+    """Return the JSON Schema of documents and of layout files, for editors."""
+    document = document_model(kinds).model_json_schema(ref_template="#/$defs/{model}")
+    layout = LayoutSpec.model_json_schema(ref_template="#/$defs/{model}")
+    layout["required"] = sorted({*layout["required"], "tgdsl"})
+    definitions = {**layout.pop("$defs", {}), **document.pop("$defs", {})}
+    document.pop("title", None)
+    layout.pop("title", None)
+    definitions |= {"Document": document, "Layout": layout}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "tgdsl document or layout",
+        "type": "object",
+        "if": {"required": ["resolutions"]},
+        "then": {"$ref": "#/$defs/Layout"},
+        "else": {"$ref": "#/$defs/Document"},
+        "$defs": dict(sorted(definitions.items())),
+    }

@@ -1,0 +1,34 @@
+"""Where files are: those a document names, and the robots that come with tgdsl."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tgdsl
+
+_PACKAGE = Path(tgdsl.__file__).parent
+
+
+def robots_folder() -> Path:
+    """Return the folder of the robots that come with tgdsl: in the installed package, or at the top of a checkout."""
+    installed = _PACKAGE / "_robots"
+    return installed if installed.is_dir() else _PACKAGE.parent / "robots"
+
+
+def robot_names() -> dict[str, Path]:
+    """Return the model file of each robot known by name; a folder's own name means its right hand."""
+    names: dict[str, Path] = {}
+    for folder in sorted(path for path in robots_folder().iterdir() if path.is_dir()):
+        for model in sorted(folder.glob("*.xml")):
+            names[model.stem] = model
+        if (folder / f"{folder.name}_right.xml").is_file():
+            names.setdefault(folder.name, folder / f"{folder.name}_right.xml")
+    return names
+
+
+def robot_file(model: str, folder: Path) -> Path | None:
+    """Return the file of a robot given by name or by a path relative to the document's folder; None if there is none."""
+    if model in (known := robot_names()):
+        return known[model]
+    path = folder / model
+    return path if path.is_file() else None

@@ -1,0 +1,312 @@
+"""From a document's text to its Spec: every mistake is found in one run and reported at its place."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path as FilePath
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from tgdsl.errors import Problem, SpecError, did_you_mean
+from tgdsl.schema import files, yaml
+from tgdsl.schema.document import Spec, document_model
+from tgdsl.schema.placement import LayoutSpec
+from tgdsl.schema.yaml import Path, Source
+from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
+
+ENTRY_DEPTH = {"sensors": 2, "objects": 2, "noise": 2, "groups": 2, "observations": 3, "resolutions": 3}
+"""How deep an entry sits under each of these keys: a faulty entry is left out, and the rest is still checked."""
+
+
+@dataclass
+class LoadedLayout:
+    """A layout, as found and as read. The paths of its problems start at `prefix`, which is not empty if it is in line."""
+
+    spec: LayoutSpec
+    source: Source
+    prefix: Path
+    folder: FilePath
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path of the layout."""
+        return self.source.problem((*self.prefix, *path), what, hint, on_key)
+
+
+@dataclass
+class Loaded:
+    """A document, as found and as read. With `problems`, faulty entries are left out of `spec`.
+
+    Attributes:
+        spec: The document.
+        source: Its text's values and places.
+        folder: Folder that file names in it are relative to.
+        layout: Its layout; None if that could not be read.
+        problems: Mistakes found so far; later stages add theirs.
+    """
+
+    spec: Spec
+    source: Source
+    folder: FilePath
+    layout: LoadedLayout | None
+    problems: list[Problem]
+
+    @property
+    def robot_file(self) -> FilePath | None:
+        """The robot's model file, if it exists."""
+        return files.robot_file(self.spec.robot.model, self.folder)
+
+    @property
+    def resolution(self) -> str | None:
+        """The resolution that is compiled: the one named, or the only one."""
+        if self.spec.resolution is not None or self.layout is None:
+            return self.spec.resolution
+        names = list(self.layout.spec.resolutions)
+        return names[0] if len(names) == 1 else None
+
+    def raise_problems(self) -> None:
+        """Raise all mistakes found so far, if any."""
+        if self.problems:
+            raise SpecError(self.problems)
+
+
+def load(
+    document: str | PathLike[str] | Mapping[str, Any],
+    overrides: Mapping[str, str] | None = None,
+    kinds: tuple[Kind, ...] = KINDS,
+) -> Loaded:
+    """Read a document and its layout.
+
+    Args:
+        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
+        overrides: Values to set first, YAML text by dotted path, such as `{"resolution": "high"}`.
+        kinds: The sensor kinds that the document may use.
+
+    Returns:
+        The document with the problems found so far: call `raise_problems` when all stages have added theirs.
+
+    Raises:
+        SpecError: If so much is wrong that no further stage can look at it.
+    """
+    if isinstance(document, Mapping):
+        source, folder = yaml.from_mapping(document, "<mapping>"), FilePath.cwd()
+    else:
+        source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
+    for dotted, text in (overrides or {}).items():
+        source.set(dotted, text)
+    model = document_model(kinds)
+    problems = list(source.problems)
+    spec = _validate(source, (), model, problems, required=("tgdsl", "robot", "sensors"))
+    if spec is None:
+        raise SpecError(problems)
+    loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
+    loaded.layout = _layout(loaded)
+    problems += _name_problems(loaded)
+    return loaded
+
+
+def _read_file(path: FilePath, name: str) -> Source:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
+    except UnicodeDecodeError as error:
+        raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
+    source = yaml.parse(text, name)
+    if source.value is None:
+        raise SpecError(source.problems)
+    return source
+
+
+def _layout(loaded: Loaded) -> LoadedLayout | None:
+    wanted = loaded.spec.robot.layout
+    source, prefix, folder = loaded.source, ("robot", "layout"), loaded.folder
+    if wanted is None or isinstance(wanted, str):
+        path = _layout_file(loaded, wanted)
+        if path is None:
+            return None
+        try:
+            source, prefix, folder = _read_file(path, _shown(path, loaded, wanted)), (), path.parent
+        except SpecError as error:
+            loaded.problems += error.problems
+            return None
+        loaded.problems += source.problems
+    spec = _validate(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
+    return LoadedLayout(spec, source, prefix, folder) if isinstance(spec, LayoutSpec) else None
+
+
+def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
+    if wanted is not None:
+        path = loaded.folder / wanted
+        if path.is_file():
+            return path
+        loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', "paths are relative to this document"))
+        return None
+    known = files.robot_names().get(loaded.spec.robot.model)
+    if known is not None and (known.parent / "layout.yaml").is_file():
+        return known.parent / "layout.yaml"
+    loaded.problems.append(
+        loaded.source.problem(("robot",), 'missing key "layout"', "only robots given by name bring their own layout")
+    )
+    return None
+
+
+def _shown(path: FilePath, loaded: Loaded, wanted: str | None) -> str:
+    """Return the name a layout file has in messages: as the user would type it from where the document's name counts."""
+    return str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
+
+
+def _validate(
+    source: Source, prefix: Path, model: type[BaseModel], problems: list[Problem], required: tuple[str, ...]
+) -> BaseModel | None:
+    """Read a mapping as a model; note every mistake, leave faulty entries out, and read what is left."""
+    value = source.get(prefix) if prefix else source.value
+    known: dict[int, type[BaseModel]] = {}
+    try:
+        return model.model_validate(value, context=known)
+    except ValidationError as error:
+        faults = error.errors()
+    entries: set[Path] = set()
+    for fault in faults:
+        path = _raw_path(value, fault["loc"])
+        problems.append(_translated(source, prefix, value, path, fault, known))
+        entries.add(path if fault["type"] == "extra_forbidden" else _entry(path))
+    if not isinstance(value, dict):
+        return None
+    rest = copy.deepcopy(value)
+    for entry in sorted(entries, key=lambda path: [f"{part:>9}" for part in path], reverse=True):
+        _remove(rest, entry)
+    for key in required:
+        if key not in rest:
+            return None
+    try:
+        return model.model_validate(rest)
+    except ValidationError:
+        return None
+
+
+def _raw_path(value: Any, location: Iterable[str | int]) -> Path:
+    """Return pydantic's location as a path through the plain value: the tags of unions, which are no keys, are left out."""
+    path: list[str | int] = []
+    location = list(location)
+    for i, part in enumerate(location):
+        if isinstance(value, dict) and part in value:
+            value = value[part]
+        elif isinstance(value, list) and isinstance(part, int) and part < len(value):
+            value = value[part]
+        elif i < len(location) - 1 or not isinstance(value, dict):
+            continue
+        path.append(part)
+    return tuple(path)
+
+
+def _entry(path: Path) -> Path:
+    """Return the path of the entry that a path is in: what is left out so that the rest can be checked."""
+    for i, part in enumerate(path):
+        if part in ENTRY_DEPTH:
+            return path[: i + ENTRY_DEPTH[str(part)]]
+    return path[:1]
+
+
+def _remove(value: Any, path: Path) -> None:
+    """Remove an entry, and its list with it if that becomes empty."""
+    if not path:
+        return
+    try:
+        for part in path[:-1]:
+            parent, key, value = value, part, value[part]
+        del value[path[-1]]
+    except (KeyError, IndexError, TypeError):
+        return
+    if value == [] and len(path) > 1:
+        del parent[key]
+
+
+def _translated(
+    source: Source, prefix: Path, value: Any, path: Path, fault: Any, known: Mapping[int, type[BaseModel]]
+) -> Problem:
+    """Return one of pydantic's errors in the words of the document."""
+    kind, context, found = fault["type"], fault.get("ctx", {}), fault["input"]
+    full = (*prefix, *path)
+    if kind == "extra_forbidden":
+        parent = value
+        for part in path[:-1]:
+            parent = parent[part]
+        fields = known[id(parent)].model_fields if id(parent) in known else {}
+        return source.problem(full, f'unknown key "{path[-1]}"', did_you_mean(str(path[-1]), fields, "keys"), on_key=True)
+    if kind == "missing":
+        return source.problem(full[:-1], f'missing key "{path[-1]}"', on_key=True)
+    if kind == "union_tag_not_found":
+        return source.problem(full, f"missing key {context['discriminator']}".replace("'", '"'), on_key=True)
+    if kind == "union_tag_invalid":
+        key = context["discriminator"].strip("'")
+        tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
+        return source.problem((*full, key), f'unknown {key} "{context["tag"]}"', did_you_mean(context["tag"], tags, f"{key}s"))
+    if kind == "literal_error":
+        return source.problem(full, f"found {_brief(found)}, expected {context['expected']}")
+    if kind == "value_error":
+        return source.problem(full, str(context["error"]))
+    if kind == "region":
+        return source.problem(full, fault["msg"])
+    message = fault["msg"][0].lower() + fault["msg"][1:]
+    return source.problem(full, f"found {_brief(found)}: {message}")
+
+
+def _brief(found: Any) -> str:
+    if isinstance(found, (dict, list, tuple)):
+        return f"a {'mapping' if isinstance(found, dict) else 'list'} of {len(found)}"
+    return f'"{found}"' if isinstance(found, str) else "nothing" if found is None else str(found)
+
+
+def _name_problems(loaded: Loaded) -> list[Problem]:
+    """Return references within the document that lead nowhere, and what it asks for that cannot be had yet."""
+    spec, source = loaded.spec, loaded.source
+    problems: list[Problem] = []
+
+    def names(key: str) -> list[str]:
+        return list(source.get((key,)) or {})
+
+    for name, sensor in spec.sensors.items():
+        path: Path = ("sensors", name)
+        for i, target in enumerate(sensor.feels):
+            if target not in names("objects"):
+                hint = did_you_mean(target, names("objects"), "objects")
+                problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
+        problems += _noise_problems(loaded, path, sensor.noise, getattr(sensor, "kind", ""), names("noise"))
+    for group, terms in (source.get(("observations",)) or {}).items():
+        for i, term in enumerate(terms if isinstance(terms, list) else []):
+            target = term.get("of") if isinstance(term, dict) else None
+            if isinstance(target, str) and target.removesuffix("/clean") not in names("sensors"):
+                hint = did_you_mean(target, names("sensors"), "sensors")
+                problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
+    if loaded.layout is not None:
+        resolutions = list((loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {}))
+        if loaded.resolution is None:
+            hint = f"the layout has {', '.join(resolutions)}"
+            problems.append(source.problem((), 'missing key "resolution"', hint, on_key=True))
+        elif loaded.resolution not in resolutions:
+            hint = did_you_mean(loaded.resolution, resolutions, "resolutions")
+            problems.append(source.problem(("resolution",), f'unknown resolution "{loaded.resolution}"', hint))
+    return problems
+
+
+def _noise_problems(
+    loaded: Loaded, path: Path, noise: str | NoiseSpec, kind: str, profiles: Iterable[str]
+) -> list[Problem]:
+    """Return the knobs that are turned: the grammar has them, but no sensor obeys them yet, so none may pass unnoticed."""
+    path = (*path, "noise")
+    if isinstance(noise, str) and noise not in loaded.spec.noise and noise not in PROFILES:
+        if noise in profiles:
+            return []  # the profile itself has a mistake, which is reported there
+        hint = did_you_mean(noise, [*profiles, *PROFILES], "noise profiles")
+        return [loaded.source.problem(path, f'unknown noise profile "{noise}"', hint)]
+    knobs = resolve_noise(noise, kind, loaded.spec.noise).active_knobs()
+    if not knobs:
+        return []
+    what = f"this version of tgdsl cannot disturb readings yet, but {', '.join(knobs)} would"
+    knob_path = (*path, knobs[0]) if isinstance(noise, NoiseSpec) else path
+    return [loaded.source.problem(knob_path, what, 'leave the knob at its neutral value, or use "clean"')]

@@ -1,0 +1,188 @@
+"""Where taxels sit: link groups and, per resolution and link, how its surface is sampled."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, model_validator
+
+from tgdsl.fields import Angle, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, text_or
+
+Count = Annotated[StrictInt, Field(ge=1, le=1_000_000)]
+
+
+class Facing(SpecModel):
+    """The part of a surface whose outward normal points along a direction."""
+
+    facing: Direction
+    """Direction in the link frame; need not have unit length."""
+    within: Angle
+    """Largest angle between normal and direction [rad, or a string such as `60 deg`]."""
+
+
+class BoxBounds(SpecModel):
+    """An axis-aligned box in the link frame."""
+
+    min: Position
+    """Lower corner [m]."""
+    max: Position
+    """Upper corner [m]."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> BoxBounds:
+        if not all(low < high for low, high in zip(self.min, self.max, strict=True)):
+            raise ValueError(f"min {list(self.min)} is not below max {list(self.max)} on every axis")
+        return self
+
+
+class InBox(SpecModel):
+    """The part of a surface inside a box."""
+
+    box: BoxBounds
+    """The box, in the link frame."""
+
+
+class SphereBounds(SpecModel):
+    """A sphere in the link frame."""
+
+    center: Position
+    """Centre [m]."""
+    radius: PositiveLength
+    """Radius [m]."""
+
+
+class InSphere(SpecModel):
+    """The part of a surface inside a sphere."""
+
+    sphere: SphereBounds
+    """The sphere, in the link frame."""
+
+
+class OnGeoms(SpecModel):
+    """The part of a link's surface that belongs to some of its geoms."""
+
+    geoms: Selector
+    """Geom or mesh names, with shell wildcards."""
+
+
+Region = Facing | InBox | InSphere | OnGeoms
+_REGIONS: dict[str, type[SpecModel]] = {"facing": Facing, "box": InBox, "sphere": InSphere, "geoms": OnGeoms}
+
+
+def _region_tag(value: object) -> str | None:
+    if isinstance(value, dict):
+        return next((key for key in _REGIONS if key in value), None)
+    return next((key for key, model in _REGIONS.items() if isinstance(value, model)), None)
+
+
+_TaggedRegion = Annotated[
+    Annotated[Facing, Tag("facing")]
+    | Annotated[InBox, Tag("box")]
+    | Annotated[InSphere, Tag("sphere")]
+    | Annotated[OnGeoms, Tag("geoms")],
+    Discriminator(
+        _region_tag,
+        custom_error_type="region",
+        custom_error_message="not a region, expected a mapping with one of the keys facing, box, sphere, geoms",
+    ),
+]
+
+
+def _as_list(value: object) -> object:
+    return (value,) if isinstance(value, dict) else value
+
+
+class _Sampled(SpecModel):
+    radius: Radius
+    """Sensing radius of each probe [m]; 0 makes it an inactive filler."""
+    region: Annotated[tuple[_TaggedRegion, ...], BeforeValidator(_as_list)] = ()
+    """Part of the surface to sample: a region, or a list of regions that means their intersection; default: all of it."""
+
+
+class Grid(_Sampled):
+    """Rows × columns projected along a direction onto the surface; cells that miss it are dropped."""
+
+    method: Literal["grid"]
+    """Regular cells projected along a direction."""
+    rows: Count
+    """Cells across `columns_along`."""
+    columns: Count
+    """Cells along `columns_along`."""
+    direction: Direction
+    """Direction of projection in the link frame, into the surface: `[-1, 0, 0]` samples the side that faces +x."""
+    columns_along: Direction | None = None
+    """Axis along which the columns follow one another, link frame; default: the first of the link's z, y, x axes that is
+    not near parallel (|cos| < 0.7) to `direction`."""
+    count: Count | None = None
+    """Keep this many of the cells that hit the surface, those nearest the centre of the grid; default: all that hit."""
+
+    @model_validator(mode="after")
+    def _enough_cells(self) -> Grid:
+        if self.count is not None and self.count > self.rows * self.columns:
+            raise ValueError(f"count {self.count} is more than the {self.rows} × {self.columns} cells of the grid")
+        return self
+
+
+class Poisson(_Sampled):
+    """Blue-noise samples of the surface: an exact count, or as many as fit at a spacing."""
+
+    method: Literal["poisson"]
+    """Irregular, evenly spread samples."""
+    count: Count | None = None
+    """Exact number of samples."""
+    spacing: PositiveLength | None = None
+    """Least distance between samples [m], instead of `count`."""
+    seed: Annotated[StrictInt, Field(ge=0)] = 0
+    """Seed of the sampling."""
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Poisson:
+        if (self.count is None) == (self.spacing is None):
+            raise ValueError("expected exactly one of `count` and `spacing`")
+        return self
+
+
+class Point(SpecModel):
+    """One probe, given by hand."""
+
+    pos: Position
+    """Position in the link frame [m]."""
+    normal: Direction
+    """Outward normal in the link frame; is made unit."""
+    radius: Radius | None = None
+    """Sensing radius [m]; default: the `radius` of the list."""
+    area: Area | None = None
+    """Surface that the probe stands for [m²]; default: the disc of its radius."""
+
+
+class Points(SpecModel):
+    """Probes given one by one, or in a CSV file with the header `x,y,z,nx,ny,nz` and optionally `radius` and `area`."""
+
+    method: Literal["points"]
+    """Explicit probes."""
+    points: text_or(Annotated[tuple[Point, ...], Field(min_length=1)])
+    """The probes, or the name of a CSV file beside the layout (SI units)."""
+    radius: Radius | None = None
+    """Sensing radius of the points that name none [m]."""
+
+    @model_validator(mode="after")
+    def _has_radii(self) -> Points:
+        if self.radius is None and not isinstance(self.points, str):
+            bare = [i for i, point in enumerate(self.points) if point.radius is None]
+            if bare:
+                raise ValueError(f"points[{bare[0]}] has no radius, and the list gives none for all")
+        return self
+
+
+Placement = Annotated[Grid | Poisson | Points, Field(discriminator="method")]
+
+
+class LayoutSpec(SpecModel):
+    """Link groups, and at each resolution how each link is sampled."""
+
+    tgdsl: Literal[1] = 1
+    """Version of the grammar."""
+    groups: dict[str, Selector] = {}
+    """Named sets of links: wildcards over link names, or other groups."""
+    resolutions: Annotated[dict[str, dict[str, Placement]], Field(min_length=1)]
+    """Per resolution, per link (a body, geom or mesh name, or a shell wildcard): how its surface is sampled."""

@@ -1,0 +1,173 @@
+"""YAML text to plain values, with the place of every value kept. YAML 1.2: `no` is a string, `1e-3` a number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from tgdsl.errors import Problem
+
+Path = tuple[str | int, ...]
+
+
+class Mark(NamedTuple):
+    """A place in a file; line and column from 1, or 0 where there is none."""
+
+    file: str
+    line: int
+    column: int
+
+
+@dataclass
+class Source:
+    """A document as found: its plain value, where each part of it stands, and what is wrong with it as YAML.
+
+    Attributes:
+        file: Name of the file.
+        value: Mappings, lists and scalars.
+        keys: Place of the key of each mapping entry, by its path.
+        values: Place of each value, by its path.
+        problems: Mistakes found while reading.
+    """
+
+    file: str
+    value: Any = None
+    keys: dict[Path, Mark] = field(default_factory=dict)
+    values: dict[Path, Mark] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path, placed at the nearest part of it that the document holds."""
+        first, second = (self.keys, self.values) if on_key else (self.values, self.keys)
+        near = path
+        while near and near not in first and near not in second:
+            near = near[:-1]
+        mark = first.get(near) or second.get(near) or Mark(self.file, 1 if self.values else 0, 1)
+        return Problem(*mark, path=spelled(path), what=what, hint=hint)
+
+    def get(self, path: Path) -> Any:
+        """Return the plain value at a path, or None."""
+        value = self.value
+        for part in path:
+            try:
+                value = value[part]
+            except (KeyError, IndexError, TypeError):
+                return None
+        return value
+
+    def set(self, dotted: str, text: str) -> None:
+        """Override one value, as the command line's `--set key.key=value` does; the value is YAML."""
+        path: Path = tuple(dotted.split("."))
+        parsed = parse(text, f"--set {dotted}={text}")
+        self.problems += parsed.problems
+        parent = self.value
+        for part in path[:-1]:
+            parent = parent.setdefault(part, {}) if isinstance(parent, dict) else None
+        if not isinstance(parent, dict):
+            self.problems.append(Problem(parsed.file, 0, 0, dotted, "does not lead to a key of a mapping"))
+            return
+        for marks in (self.keys, self.values):
+            for stale in [known for known in marks if known[: len(path)] == path]:
+                del marks[stale]
+        parent[path[-1]] = parsed.value
+        self.values[path] = Mark(parsed.file, 0, 0)
+
+
+def spelled(path: Path) -> str:
+    """Return a path as users write it: `observations.policy[0].of`."""
+    text = ""
+    for part in path:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    return text
+
+
+def parse(text: str, file: str) -> Source:
+    """Read one YAML document; mistakes are noted in the result, not raised."""
+    source = Source(file)
+    yaml = YAML(typ="safe", pure=True)
+    try:
+        node = yaml.compose(text)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+        source.problems.append(Problem(file, line, column, "", f"not YAML: {error.problem or error.context}"))
+        return source
+    except YAMLError as error:
+        source.problems.append(Problem(file, 1, 1, "", f"not YAML: {' '.join(str(error).split())}"))
+        return source
+    if node is None:
+        source.problems.append(Problem(file, 1, 1, "", "the document is empty"))
+        return source
+    source.value = _Reader(source, yaml).read(node, (), ())
+    return source
+
+
+def from_mapping(value: Mapping[str, Any], file: str) -> Source:
+    """Return a document that was built in Python; its mistakes have paths but no lines."""
+    return Source(file, _plain(value))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
+        return [_plain(part) for part in value]
+    return value
+
+
+class _Reader:
+    def __init__(self, source: Source, yaml: YAML):
+        self.source = source
+        self.constructor = yaml.constructor
+
+    def mark(self, node: Node) -> Mark:
+        return Mark(self.source.file, node.start_mark.line + 1, node.start_mark.column + 1)
+
+    def note(self, node: Node, path: Path, what: str) -> None:
+        self.source.problems.append(Problem(*self.mark(node), path=spelled(path), what=what))
+
+    def read(self, node: Node, path: Path, inside: tuple[int, ...]) -> Any:
+        self.source.values[path] = self.mark(node)
+        if id(node) in inside:
+            self.note(node, path, "this alias contains itself")
+            return None
+        if isinstance(node, MappingNode):
+            return self.mapping(node, path, (*inside, id(node)))
+        if isinstance(node, SequenceNode):
+            return [self.read(part, (*path, i), (*inside, id(node))) for i, part in enumerate(node.value)]
+        try:
+            return self.constructor.construct_object(node)
+        except (YAMLError, ValueError) as error:
+            self.note(node, path, f"cannot read this value: {getattr(error, 'problem', None) or error}")
+            return None
+
+    def mapping(self, node: MappingNode, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        merged: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, ScalarNode):
+                self.note(key_node, path, "a key must be a plain name")
+                continue
+            if key_node.tag == "tag:yaml.org,2002:merge" or key_node.value == "<<":
+                parts = value_node.value if isinstance(value_node, SequenceNode) else [value_node]
+                for part in parts:
+                    found = self.read(part, path, inside)
+                    if isinstance(found, dict):
+                        merged = {**found, **merged}
+                    else:
+                        self.note(part, path, "only a mapping can be merged in")
+                self.source.values[path] = self.mark(node)
+                continue
+            key = str(key_node.value)
+            if key in result:
+                first = self.source.keys[(*path, key)].line
+                self.note(key_node, (*path, key), f"this key stands twice, first in line {first}")
+                continue
+            self.source.keys[(*path, key)] = self.mark(key_node)
+            result[key] = self.read(value_node, (*path, key), inside)
+        return {**merged, **result}

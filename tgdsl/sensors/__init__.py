@@ -1,0 +1,11 @@
+"""Sensor kinds, one file each: equation, spec, float64 reference, batched forward."""
+
+from tgdsl.sensors.base import Kind
+from tgdsl.sensors.contact import CONTACT
+from tgdsl.sensors.contact_depth import CONTACT_DEPTH
+from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
+
+KINDS: tuple[Kind, ...] = (CONTACT_DEPTH, CONTACT, KINEMATIC_TAXEL)
+"""The kinds that come with tgdsl."""
+
+__all__ = ["CONTACT", "CONTACT_DEPTH", "KINDS", "KINEMATIC_TAXEL", "Kind"]

@@ -1,0 +1,85 @@
+"""Contact: one bit per taxel, with a threshold to switch on and a lower one to switch off (a Schmitt trigger).
+
+    y_j(t) = 1  if  d_j(t) > η_on  or  (y_j(t−1) = 1 and d_j(t) > η_off),  else 0             [1]
+
+with d_j the contact depth [m] (see `contact_depth`) and η_off ≤ η_on the release threshold [m]. With η_off = η_on there is
+no memory and no state. After a reset y = 0.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: none.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import model_validator
+from torch import Tensor
+
+from tgdsl.fields import Radius
+from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, scalar
+
+
+class ContactSpec(ProbeSpec):
+    """Contact bit of each probe."""
+
+    kind: Literal["contact"]
+    """Whether each probe is in contact: 1 or 0."""
+    threshold: Radius = 5e-4
+    """Depth above which a taxel switches on, η_on [m]."""
+    release_threshold: Radius | None = None
+    """Depth below which it switches off again, η_off [m]; default: `threshold`."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ContactSpec:
+        if self.release_threshold is not None and self.release_threshold > self.threshold:
+            raise ValueError(
+                f"release_threshold {self.release_threshold:g} m is above threshold {self.threshold:g} m, "
+                "expected at most that"
+            )
+        return self
+
+    @property
+    def release(self) -> float:
+        """Depth below which a taxel switches off [m]."""
+        return self.threshold if self.release_threshold is None else self.release_threshold
+
+
+def reference(
+    spec: ContactSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return y (taxel, 1), and the new bit where there is memory."""
+    bit = touch.depth > spec.threshold
+    if spec.release == spec.threshold:
+        return bit[:, None].astype(np.float64), {}
+    bit |= (state["bit"] == 1.0) & (touch.depth > spec.release)
+    return bit[:, None].astype(np.float64), {"bit": bit.astype(np.float64)}
+
+
+def lower(spec: ContactSpec, layout: Layout) -> Lowered:
+    """The bit is state only where the two thresholds differ."""
+    constants = {"threshold": scalar(spec.threshold)}
+    if spec.release == spec.threshold:
+        return Lowered(channels=(Channel("contact", "1"),), constants=constants)
+    return Lowered(
+        channels=(Channel("contact", "1"),),
+        constants={**constants, "release_threshold": scalar(spec.release)},
+        state={"bit": 0.0},
+    )
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the bit plane, 0 or 1 in the module's dtype."""
+    threshold = constants["threshold"]
+    if "bit" in state:
+        threshold = torch.where(state["bit"] > 0.5, constants["release_threshold"], threshold)
+    bit = (felt.depth > threshold).to(felt.depth.dtype)
+    bit = torch.where(felt.depth.isnan(), felt.depth, bit)  # a broken pose must not look like no contact
+    return {"contact": bit}, ({"bit": bit} if "bit" in state else {})
+
+
+CONTACT = Kind(ContactSpec, lower, forward, reference)

@@ -1,0 +1,53 @@
+"""Contact depth: how far each probe's sphere reaches into what it touches.
+
+    d_j = max_g max(0, R_j − φ_g(q_j))                                                        [m]
+
+with q_j = p_L + R_L x_j the probe's place in the world, R_j its radius [m], and φ_g the signed distance to geom g of the
+objects felt [m]. Inactive probes (R_j = 0) read 0.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Probe geometry and contact-depth query" (the `sdf` backend) and
+"ContactDepthProbe".
+
+Departures: distances are exact for every MuJoCo primitive, where the paper's implementation interpolates boxes, cylinders
+and capsules on a grid. The gate is an option; the paper's is `contact_pair`. Under that gate a probe of radius R reads up to
+R as soon as any point of its link touches the object: depth is measured from the sphere, not from the skin.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State
+
+
+class ContactDepthSpec(ProbeSpec):
+    """Penetration depth of each probe [m]."""
+
+    kind: Literal["contact_depth"]
+    """How far each probe's sphere reaches into what it touches [m]."""
+
+
+def reference(
+    spec: ContactDepthSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return d (taxel, 1) [m]."""
+    return touch.depth[:, None], {}
+
+
+def lower(spec: ContactDepthSpec, layout: Layout) -> Lowered:
+    """Depth needs neither normals nor constants."""
+    return Lowered(channels=(Channel("depth", "m"),))
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the depth plane [m]."""
+    return {"depth": felt.depth}, {}
+
+
+CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference)

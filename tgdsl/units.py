@@ -1,0 +1,45 @@
+"""Quantities with units, read once at the door: inside tgdsl everything is SI and radians."""
+
+from __future__ import annotations
+
+import math
+import re
+
+UNITS: dict[str, dict[str, float]] = {
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
+    "area": {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6},
+    "angle": {"rad": 1.0, "deg": math.pi / 180.0},
+    "force": {"N": 1.0, "mN": 1e-3},
+    "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "number": {},
+}
+"""Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""
+
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zµ][\w*/µ]*)?\s*\Z")
+
+
+def parse(value: object, dimension: str) -> float:
+    """Return a quantity in SI units.
+
+    Args:
+        value: A number (taken as SI) or a string such as `"4 mm"`.
+        dimension: A key of `UNITS`.
+
+    Raises:
+        ValueError: If the value is no finite number, or its unit is not one of the dimension.
+    """
+    known = UNITS[dimension]
+    wanted = f'a number in {next(iter(known))} or a string such as "4 {list(known)[-1]}"' if known else "a number"
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise ValueError(f"{value!r} is not a quantity, expected {wanted}")
+    if isinstance(value, str):
+        match = _QUANTITY.match(value)
+        if not match or (match[2] and not known):
+            raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
+        if match[2] and match[2] not in known:
+            raise ValueError(f'"{match[2]}" is not a unit of {dimension}, expected one of {", ".join(known)}')
+        value = float(match[1]) * known.get(match[2] or "", 1.0)
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is not finite, expected {wanted}")
+    return float(value)
