@@ -43,9 +43,9 @@ class Region:
     """
 
     is_geom: Bool[np.ndarray, " geom"] | None
-    facings: tuple[tuple[Float[np.ndarray, "3"], float], ...]
-    boxes: tuple[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]], ...]
-    spheres: tuple[tuple[Float[np.ndarray, "3"], float], ...]
+    facings: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
+    boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]
+    spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
 
     @property
     def is_everything(self) -> bool:
@@ -69,6 +69,19 @@ class Region:
             is_in &= np.linalg.norm(pos - center, axis=-1) <= radius + LENGTH_TOLERANCE
         return is_in
 
+    def clipped(self, corners: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "k m 3"], Int[np.ndarray, " k"]]:
+        """Return what boxes, and the boxes around spheres, leave of faces: convex polygons and the face of each.
+
+        Polygons with fewer than `m` corners repeat their last.
+        """
+        polygons, owner = corners, np.arange(len(corners))
+        for bounds in (*self.boxes, *((center - radius, center + radius) for center, radius in self.spheres)):
+            for side, bound in zip((-1.0, 1.0), bounds, strict=True):
+                for axis in range(3):
+                    polygons, kept = _clipped(polygons, axis, side, bound[axis])
+                    owner = owner[kept]
+        return polygons, owner
+
     def extremes(
         self, corners: Float[np.ndarray, "n 3 3"], normals: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "2 3"]
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
@@ -82,12 +95,7 @@ class Region:
         Returns:
             The points, and for each a point within its face, both in the body frame [m].
         """
-        polygons, owner = corners, np.arange(len(corners))
-        for bounds in self.boxes:
-            for side, bound in zip((-1.0, 1.0), bounds, strict=True):
-                for axis in range(3):
-                    polygons, kept = _clipped(polygons, axis, side, bound[axis])
-                    owner = owner[kept]
+        polygons, owner = self.clipped(corners)
         found = [polygons]
         for center, radius in self.spheres:
             found.append(_rim(polygons, center, radius))
@@ -121,7 +129,7 @@ def _clipped(
     return np.take_along_axis(points, np.take_along_axis(order, slot, 1)[..., None], 1)[kept], kept
 
 
-def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, "3"], radius: float) -> Float[np.ndarray, "n k 3"]:
+def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, " 3"], radius: float) -> Float[np.ndarray, "n k 3"]:
     """Return where the edges of polygons pass through a sphere; NaN where they do not."""
     start, along = polygons - center, np.roll(polygons, -1, axis=1) - polygons
     a, b = (along**2).sum(-1), (start * along).sum(-1)
@@ -136,14 +144,15 @@ def _disc(
     corners: Float[np.ndarray, "n 3 3"],
     normals: Float[np.ndarray, "n 3"],
     axes: Float[np.ndarray, "2 3"],
-    center: Float[np.ndarray, "3"],
+    center: Float[np.ndarray, " 3"],
     radius: float,
 ) -> Float[np.ndarray, "n 4 3"]:
     """Return where the disc that a sphere cuts out of a face's plane reaches farthest along ±axes; NaN off the face."""
     height = ((corners[:, 0] - center) * normals).sum(-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         disc_radius = np.sqrt(radius**2 - height**2)
-        toward = np.concatenate([axes, -axes]) - (normals @ np.concatenate([axes, -axes]).T)[..., None] * normals[:, None]
+        axes = np.concatenate([axes, -axes])
+        toward = axes - (normals @ axes.T)[..., None] * normals[:, None]
         toward /= np.linalg.norm(toward, axis=-1, keepdims=True)
     points = (center + height[:, None] * normals)[:, None] + disc_radius[:, None, None] * toward
     along = np.roll(corners, -1, axis=1) - corners
@@ -182,7 +191,7 @@ class View:
         is_front = cosine[face_id] < 0
         # A face that looks against the rays turns clockwise in (u, v), because t points away from its viewer.
         corners = np.where(is_front[:, None, None], corners[:, ::-1], corners)
-        normals = np.where(is_front[:, None], 1.0, -1.0) * surface.face_normals[face_id]
+        normals = np.where(is_front[:, None], 1.0, -1.0) * surface.face_normals[face_id] + 0.0  # no −0
         extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max()) if len(face_id) else 0.0
         return View(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
 
@@ -234,8 +243,7 @@ def _hits(
     for i in range(3):
         start, end = view.corners[:, i, :2], view.corners[:, (i + 1) % 3, :2]
         along = end - start
-        length = np.linalg.norm(along, axis=1)
-        inward = np.divide(np.stack([-along[:, 1], along[:, 0]], -1), length[:, None], where=length[:, None] > 0)
+        inward = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=1, keepdims=True)
         is_hit &= inward[face, 0] * (u - start[face, 0]) + inward[face, 1] * (v - start[face, 1]) >= -view.rounding
     face, ray = face[is_hit], ray[is_hit]
     corners = view.corners[face]
@@ -246,10 +254,8 @@ def _hits(
     return face, ray, np.clip(t, corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1))
 
 
-def _pairs(
-    view: View, uv: Float[np.ndarray, "ray 2"]
-) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
-    """Yield (face, ray) pairs whose bounding boxes meet, in chunks: rays are sorted into the squares of a coarse mesh."""
+def _pairs(view: View, uv: Float[np.ndarray, "ray 2"]) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
+    """Yield (face, ray) pairs whose bounding boxes meet, in chunks; rays are sorted into coarse squares."""
     if not len(uv):
         return
     low, high = uv.min(axis=0), uv.max(axis=0)
@@ -290,7 +296,7 @@ def _runs(sorted_ids: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " run"], I
     return np.concatenate([[0], cuts]), np.concatenate([cuts, [len(sorted_ids)]])
 
 
-def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
+def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
     """Return the bounding rectangle, in (u, v), of all first hits in the region; None if there is no such hit.
 
     Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
@@ -321,7 +327,7 @@ def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, "2"], 
 
 
 def _raster_hits(
-    view: View, region: Region, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"]
+    view: View, region: Region, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
 ) -> Float[np.ndarray, "hit 2"]:
     """Return the rays of a fine raster over a rectangle whose first hit is in the region."""
     size = np.maximum(high - low, view.rounding)

@@ -36,6 +36,10 @@ class LoadedLayout:
         """Return a mistake at a path of the layout."""
         return self.source.problem((*self.prefix, *path), what, hint, on_key)
 
+    def raw(self, path: Path) -> Any:
+        """Return the plain value at a path of the layout, or None."""
+        return self.source.get((*self.prefix, *path))
+
 
 @dataclass
 class Loaded:
@@ -67,6 +71,14 @@ class Loaded:
             return self.spec.resolution
         names = list(self.layout.spec.resolutions)
         return names[0] if len(names) == 1 else None
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path of the document."""
+        return self.source.problem(path, what, hint, on_key)
+
+    def raw(self, path: Path) -> Any:
+        """Return the plain value at a path of the document, or None."""
+        return self.source.get(path)
 
     def raise_problems(self) -> None:
         """Raise all mistakes found so far, if any."""

@@ -1,0 +1,61 @@
+"""Compiled artefacts: one `.safetensors` file with the Plan's arrays, and the Plan itself as sorted JSON in its metadata."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from tgdsl.errors import ArtifactError
+from tgdsl.plan import Plan
+
+METADATA_KEY = "tgdsl"
+
+
+def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
+    """Write a plan; the same plan gives the same bytes. The file appears whole or not at all.
+
+    Returns:
+        Bytes written.
+    """
+    content = save({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
+    target = Path(path)
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return len(content)
+
+
+def load_plan(path: str | PathLike[str]) -> Plan:
+    """Read a plan.
+
+    Raises:
+        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+    """
+    try:
+        with safe_open(str(path), framework="numpy") as file:
+            metadata = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
+    except (SafetensorError, OSError) as error:
+        raise ArtifactError(f"{path}: cannot read this artefact: {error}") from error
+    if METADATA_KEY not in metadata:
+        raise ArtifactError(f"{path}: this safetensors file was not written by tgdsl")
+    for array in arrays.values():
+        array.flags.writeable = False
+    try:
+        return Plan.from_json(metadata[METADATA_KEY], arrays)
+    except ArtifactError as error:
+        raise ArtifactError(f"{path}: {error}") from error

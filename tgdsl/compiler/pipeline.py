@@ -1,0 +1,108 @@
+"""The whole way from a document to a module: load, resolve, lower, freeze the scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from os import PathLike
+from typing import Any
+
+import mujoco
+import torch
+
+from tgdsl.artifact import load_plan
+from tgdsl.compiler import lower
+from tgdsl.compiler.resolve import resolve
+from tgdsl.compiler.robot import xml_files
+from tgdsl.compiler.scene import portable, scene_file
+from tgdsl.module import TactileModule
+from tgdsl.plan import Origin, Plan
+from tgdsl.schema.load import Loaded, load
+from tgdsl.sensors import KINDS, Kind
+
+Document = str | PathLike[str] | Mapping[str, Any]
+
+
+def compile_plan(document: Document, overrides: Mapping[str, str] | None = None, kinds: Sequence[Kind] = ()) -> Plan:
+    """Return the Plan of a document.
+
+    Args:
+        document: A YAML file, or the same as a mapping.
+        overrides: YAML text by dotted path, set before anything is read: `{"resolution": "high"}`.
+        kinds: Sensor kinds of your own, beside those of tgdsl.
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+    """
+    known = (*KINDS, *kinds)
+    loaded = load(document, overrides, known)
+    resolved = resolve(loaded)
+    plan = lower.plan(loaded, resolved, known, _origin(loaded))
+    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs))
+
+
+def compile(  # noqa: A001 - the word users say
+    document: Document,
+    *,
+    resolution: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    kinds: Sequence[Kind] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> TactileModule:
+    """Compile a document to a module.
+
+    Args:
+        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
+        resolution: Instead of the document's own.
+        overrides: YAML text by dotted path, such as `{"sensors.touch.normal_stiffness": "400"}`.
+        kinds: Sensor kinds of your own, beside those of tgdsl.
+        dtype: Dtype of the readings, float32 or float64.
+        device: Where the module lives.
+
+    Returns:
+        The module, not yet compiled by torch: call its `compile()` for fused kernels.
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+    """
+    chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
+    plan = compile_plan(document, chosen, kinds)
+    return TactileModule(plan, (*KINDS, *kinds), dtype).to(device)
+
+
+def load_module(
+    path: str | PathLike[str],
+    *,
+    kinds: Sequence[Kind] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> TactileModule:
+    """Return the module of a compiled artefact.
+
+    Raises:
+        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+    """
+    return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
+
+
+def _origin(loaded: Loaded) -> Origin:
+    robot = loaded.robot_file
+    assert robot is not None
+    digest = hashlib.sha256()
+    for path in xml_files(robot):
+        digest.update(path.read_bytes())
+    parts = [loaded.source.value, loaded.layout.source.value if loaded.layout else None]
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return Origin(
+        document_sha256=hashlib.sha256(text.encode()).hexdigest(),
+        robot=portable(robot.resolve()),
+        robot_sha256=digest.hexdigest(),
+        resolution=str(loaded.resolution),
+        versions={"tgdsl": version("tgdsl"), "mujoco": mujoco.__version__},
+    )

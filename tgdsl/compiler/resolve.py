@@ -1,0 +1,255 @@
+"""From a Spec and a robot to a Layout: which links carry taxels, where these sit, and what they can feel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tgdsl.compiler.robot import Geom, Model, load_model
+from tgdsl.compiler.sample import SampleError, Samples, sample
+from tgdsl.errors import Problem, did_you_mean, listed
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.layout import Layout, Link
+from tgdsl.schema.files import robot_names
+from tgdsl.schema.load import Loaded, LoadedLayout
+from tgdsl.schema.placement import Placement
+from tgdsl.schema.select import Report, matching, select
+from tgdsl.schema.yaml import Path
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A link that the layout gives taxels: its name and body, the geoms that are sampled, and how."""
+
+    link: Link
+    geoms: tuple[Geom, ...]
+    placement: Placement
+    path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Resolved:
+    """A spec's meaning on one robot.
+
+    Attributes:
+        layout: Taxels of the links that some sensor has.
+        links: Names of each sensor's links.
+        objects: The geoms that can be felt of each object that is felt.
+        scene: The model that holds robot and objects.
+        robot: The robot's own model.
+        unused: What has taxels or can be felt but is not needed, and why.
+    """
+
+    layout: Layout
+    links: dict[str, tuple[str, ...]]
+    objects: dict[str, tuple[Geom, ...]]
+    scene: Model
+    robot: Model
+    unused: tuple[tuple[str, str], ...]
+
+
+def resolve(loaded: Loaded) -> Resolved:
+    """Place a document's sensors on its robot.
+
+    Raises:
+        SpecError: All mistakes found so far, those of reading included.
+        RobotError: If a model file cannot be read.
+    """
+    robot, scene = _models(loaded)
+    patches: list[Patch] = []
+    links: dict[str, tuple[str, ...]] = {}
+    objects: dict[str, tuple[Geom, ...]] = {}
+    if robot is not None and loaded.layout is not None:
+        _check_groups(loaded.layout, robot, loaded.problems)
+        placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
+        if placements is not None:
+            patches = _patches(loaded, loaded.layout, robot, placements)
+            links = _sensor_links(loaded, loaded.layout, robot, patches)
+    if robot is not None and scene is not None:
+        _check_bodies(loaded, robot, scene, patches)
+        objects = _objects(loaded, scene)
+    loaded.raise_problems()
+    assert robot is not None and scene is not None and loaded.layout is not None
+    needed = {name for names in links.values() for name in names}
+    layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed])
+    loaded.raise_problems()
+    unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
+    unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
+    return Resolved(layout, links, objects, scene, robot, tuple(unused))
+
+
+def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
+    """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document."""
+    wanted = loaded.spec.robot.model
+    robot = scene = None
+    if loaded.robot_file is None:
+        hint = did_you_mean(wanted, robot_names(), "robots") if "/" not in wanted else "paths are relative to this document"
+        loaded.problems.append(loaded.problem(("robot", "model"), f'there is no file or robot "{wanted}"', hint))
+    else:
+        robot = load_model(loaded.robot_file)
+    if loaded.spec.scene is None:
+        return robot, robot
+    scene_file = loaded.folder / loaded.spec.scene.model
+    if scene_file.is_file():
+        scene = load_model(scene_file)
+    else:
+        what = f'there is no file "{loaded.spec.scene.model}"'
+        loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
+    return robot, scene
+
+
+def _names(robot: Model) -> list[list[str]]:
+    """Return the names that selectors know: of bodies, geoms and meshes, each with those of what it belongs to."""
+    return [[body] for body in robot.bodies] + [[*geom.names, geom.body] for geom in robot.geoms if geom.names]
+
+
+def _check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -> None:
+    for group, selection in layout.spec.groups.items():
+        path: Path = ("groups", group)
+        select(selection, _names(robot), layout.spec.groups, _reporter(layout, path, problems))
+
+
+def _reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
+    """Return a function that notes a pattern which finds nothing, at the place where the pattern stands."""
+
+    def report(pattern: str, what: str, hint: str) -> None:
+        for inner in ((*path, "include"), path):
+            raw = owner.raw(inner)
+            if isinstance(raw, list) and pattern in raw:
+                problems.append(owner.problem((*inner, raw.index(pattern)), what, hint))
+                return
+        problems.append(owner.problem(path, what, hint))
+
+    return report
+
+
+def _patches(
+    loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]
+) -> list[Patch]:
+    """Return the links that carry taxels, in the robot's body order."""
+    found: dict[str, Patch] = {}
+    for pattern, placement in placements.items():
+        path: Path = ("resolutions", str(loaded.resolution), pattern)
+        hits = _matched(robot, pattern)
+        if not hits:
+            known = [name for names in _names(robot) for name in names]
+            what = f'no body, geom or mesh matches "{pattern}"'
+            loaded.problems.append(layout.problem(path, what, did_you_mean(pattern, known, "links"), on_key=True))
+        for link, geoms in hits:
+            if link.name in found:
+                what = f'link "{link.name}" already has a layout, by "{found[link.name].path[-1]}"'
+                loaded.problems.append(layout.problem(path, what, "give each link one", on_key=True))
+            elif not geoms:
+                loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
+            else:
+                found[link.name] = Patch(link, geoms, placement, path)
+    order = {body: i for i, body in enumerate(robot.bodies)}
+    return sorted(found.values(), key=lambda patch: (order[patch.link.body], patch.geoms[0].id))
+
+
+def _matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
+    """Return the links that a layout's key names: bodies, else geoms by name, else the geoms of a mesh."""
+    bodies = matching(pattern, [body for body in robot.bodies if body != "world"])
+    if bodies:
+        return [(Link(body, body), robot.touchable(body)) for body in bodies]
+    geoms = [geom for geom in robot.geoms if geom.name and matching(pattern, [geom.name])]
+    if geoms:
+        return [(Link(geom.name, geom.body), (geom,)) for geom in geoms]
+    of_mesh: dict[tuple[str, str], list[Geom]] = {}
+    for geom in robot.geoms:
+        if geom.mesh and matching(pattern, [geom.mesh]):
+            of_mesh.setdefault((geom.mesh, geom.body), []).append(geom)
+    meshes = [mesh for mesh, _ in of_mesh]
+    links = []
+    for (mesh, body), own in of_mesh.items():
+        name = mesh if meshes.count(mesh) == 1 else f"{body}/{mesh}"
+        links.append((Link(name, body), tuple(geom for geom in own if geom.is_colliding) or tuple(own)))
+    return links
+
+
+def _sensor_links(
+    loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]
+) -> dict[str, tuple[str, ...]]:
+    candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
+    on_robot = _names(robot)
+    links: dict[str, tuple[str, ...]] = {}
+    for name, sensor in loaded.spec.sensors.items():
+        path: Path = ("sensors", name, "links")
+        missing: list[Problem] = []
+        chosen = select(sensor.links, candidates, layout.spec.groups, _reporter(loaded, path, missing))
+        if missing:
+            # A name that the robot has but the layout does not is another mistake than a name nobody has.
+            unknown: list[Problem] = []
+            select(sensor.links, on_robot, layout.spec.groups, _reporter(loaded, path, unknown))
+            what = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
+            hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
+            loaded.problems += unknown or [loaded.problem(path, what, hint)]
+        elif not chosen:
+            loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
+        links[name] = tuple(patches[i].link.name for i in chosen)
+    return links
+
+
+def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patch]) -> None:
+    missing = [patch.link.body for patch in patches if patch.link.body not in scene.bodies]
+    if missing:
+        what = f'the scene has no body "{missing[0]}", which the robot has'
+        hint = did_you_mean(missing[0], scene.bodies, "bodies")
+        loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
+
+
+def _objects(loaded: Loaded, scene: Model) -> dict[str, tuple[Geom, ...]]:
+    """Return the geoms of the objects that some sensor feels."""
+    felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.feels}
+    objects: dict[str, tuple[Geom, ...]] = {}
+    for name, target in loaded.spec.objects.items():
+        path: Path = ("objects", name, "body")
+        if target.body not in scene.bodies:
+            hint = did_you_mean(target.body, scene.bodies, "bodies")
+            loaded.problems.append(loaded.problem(path, f'no body is named "{target.body}"', hint))
+            continue
+        geoms = scene.touchable(target.body)
+        if not geoms:
+            loaded.problems.append(loaded.problem(path, f'body "{target.body}" has no geoms to feel'))
+        for geom in geoms:
+            if geom.shape not in SHAPES:
+                what = f'{geom.shown} of body "{target.body}" is of type {geom.shape}, which cannot be felt yet'
+                hint = f"types that can: {', '.join(SHAPES)}"
+                loaded.problems.append(loaded.problem(path, what, hint))
+        if name in felt:
+            objects[name] = geoms
+    return objects
+
+
+def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> Layout:
+    parts: list[Samples] = []
+    for patch in patches:
+        try:
+            parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder))
+        except SampleError as error:
+            what = f'link "{patch.link.name}": {error.what}'
+            loaded.problems.append(layout.problem(patch.path, what, error.hint))
+    loaded.raise_problems()
+    counts = [len(part.pos) for part in parts]
+    return Layout(
+        links=tuple(patch.link for patch in patches),
+        groups=_groups(layout, patches),
+        link_id=np.repeat(np.arange(len(patches)), counts),
+        pos=np.concatenate([part.pos for part in parts]),
+        normal=np.concatenate([part.normal for part in parts]),
+        tangent=np.concatenate([part.tangent for part in parts]),
+        radius=np.concatenate([part.radius for part in parts]),
+        area=np.concatenate([part.area for part in parts]),
+        cell=np.concatenate([part.cell for part in parts]),
+    )
+
+
+def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
+    candidates = [[patch.link.name, patch.link.body] for patch in patches]
+    groups: dict[str, tuple[str, ...]] = {}
+    for group, selection in sorted(layout.spec.groups.items()):
+        chosen = select(selection, candidates, layout.spec.groups, lambda pattern, what, hint: None)
+        if chosen:
+            groups[group] = tuple(patches[i].link.name for i in chosen)
+    return groups

@@ -1,0 +1,248 @@
+"""Robots and scenes in: MJCF and URDF through `mujoco.MjSpec`, geoms as triangles in their body's frame."""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.compiler.urdf import as_mujoco_text
+from tgdsl.errors import RobotError
+from tgdsl.geometry.surface import Surface
+
+SHAPE_NAMES: dict[int, str] = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+    mujoco.mjtGeom.mjGEOM_SDF: "sdf",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Geom:
+    """A compiled geom, in its body's frame.
+
+    Attributes:
+        id: MuJoCo's index.
+        name: Its name, or empty.
+        mesh: Name of its mesh, or empty.
+        body: Name of its body.
+        shape: MuJoCo's name of its type.
+        size: Its size as MuJoCo defines it [m].
+        pos: Its frame's origin [m].
+        rotation: Rotates geom vectors into the body frame.
+        is_colliding: Whether it can collide at all.
+    """
+
+    id: int
+    name: str
+    mesh: str
+    body: str
+    shape: str
+    size: Float[np.ndarray, "3"]
+    pos: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    is_colliding: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that a selector can find it by."""
+        return tuple(name for name in (self.name, self.mesh) if name)
+
+    @property
+    def shown(self) -> str:
+        """How a message names it."""
+        return f'geom "{self.name or self.mesh}"' if self.names else f"unnamed {self.shape} geom {self.id}"
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot or scene file, compiled.
+
+    Attributes:
+        file: The file it came from.
+        spec: MuJoCo's editable model.
+        compiled: MuJoCo's compiled model.
+    """
+
+    file: Path
+    spec: mujoco.MjSpec
+    compiled: mujoco.MjModel
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of all named bodies, in MuJoCo's (depth-first) order; the first is `world`."""
+        names = (self.compiled.body(i).name for i in range(self.compiled.nbody))
+        return tuple(name for name in names if name)
+
+    @cached_property
+    def geoms(self) -> tuple[Geom, ...]:
+        """All geoms of named bodies."""
+        model = self.compiled
+        found = []
+        for i in range(model.ngeom):
+            body = model.body(model.geom_bodyid[i]).name
+            shape = SHAPE_NAMES.get(int(model.geom_type[i]), "unknown")
+            if not body:
+                continue
+            found.append(
+                Geom(
+                    id=i,
+                    name=model.geom(i).name,
+                    mesh=model.mesh(model.geom_dataid[i]).name if shape in ("mesh", "sdf") else "",
+                    body=body,
+                    shape=shape,
+                    size=model.geom_size[i].copy(),
+                    pos=model.geom_pos[i].copy(),
+                    rotation=Rotation.from_quat(model.geom_quat[i], scalar_first=True).as_matrix(),
+                    is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i]),
+                )
+            )
+        return tuple(found)
+
+    def touchable(self, body: str) -> tuple[Geom, ...]:
+        """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
+        own = tuple(geom for geom in self.geoms if geom.body == body)
+        return tuple(geom for geom in own if geom.is_colliding) or own
+
+    def can_meet(self, first: str, second: str) -> bool:
+        """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
+        model = self.compiled
+        one, two = model.body(first).id, model.body(second).id
+        signature = (min(one, two) << 16) + max(one, two)
+        pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+        for a in self.touchable(first):
+            for b in self.touchable(second):
+                if frozenset((a.id, b.id)) in pairs:
+                    return True
+                masks = model.geom_contype[a.id] & model.geom_conaffinity[b.id]
+                masks |= model.geom_contype[b.id] & model.geom_conaffinity[a.id]
+                if masks and signature not in model.exclude_signature and not self._welded(one, two):
+                    return True
+        return False
+
+    def _welded(self, one: int, two: int) -> bool:
+        """MuJoCo collides no two geoms of one rigid cluster, nor (by default) of parent and child clusters."""
+        model = self.compiled
+        one, two = model.body_weldid[one], model.body_weldid[two]
+        if one == two:
+            return True
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT or not one or not two:
+            return False
+        parent_one, parent_two = (model.body_weldid[model.body_parentid[i]] for i in (one, two))
+        return bool(one == parent_two or two == parent_one)
+
+    def surface(self, geoms: tuple[Geom, ...]) -> Surface:
+        """Return the triangles of some geoms of one body, in that body's frame.
+
+        Raises:
+            RobotError: If a geom has no bounded surface.
+        """
+        return Surface.joined([self._triangles(geom) for geom in geoms])
+
+    def _triangles(self, geom: Geom) -> Surface:
+        if geom.shape == "mesh":
+            model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
+            first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+            vertices = model.mesh_vert[first : first + count].astype(np.float64)
+            first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+            faces = model.mesh_face[first : first + count].astype(np.int64)
+        else:
+            vertices, faces = self._tessellated(geom)
+        vertices = vertices @ geom.rotation.T + geom.pos
+        return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
+
+    def _tessellated(self, geom: Geom) -> tuple[np.ndarray, np.ndarray]:
+        if geom.shape == "box":
+            mesh = trimesh.creation.box(2 * geom.size)
+        elif geom.shape == "sphere":
+            mesh = trimesh.creation.icosphere(subdivisions=4, radius=geom.size[0])
+        elif geom.shape == "ellipsoid":
+            mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(geom.size)
+        elif geom.shape == "cylinder":
+            mesh = trimesh.creation.cylinder(geom.size[0], 2 * geom.size[1], sections=96)
+        elif geom.shape == "capsule":
+            mesh = trimesh.creation.capsule(2 * geom.size[1], geom.size[0], count=[64, 64])
+            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+        else:
+            raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
+        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def load_model(path: Path) -> Model:
+    """Read and compile an MJCF or URDF file.
+
+    Raises:
+        RobotError: If MuJoCo cannot read or compile it, with MuJoCo's own account of the element at fault.
+    """
+    try:
+        with muted_mujoco():
+            if _is_urdf(path):
+                spec = mujoco.MjSpec.from_string(as_mujoco_text(path))
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
+            return Model(path, spec, spec.compile())
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+@contextmanager
+def muted_mujoco() -> Iterator[None]:
+    """Turn what MuJoCo would print and log into Python warnings.
+
+    One is left out: a robot attached under its own names, with no prefix, is just what a scene of ours wants, and whether it
+    is saved correctly is checked when it is saved.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: warnings.warn(f"MuJoCo: {message}", stacklevel=2))
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*Attaching a spec with an empty prefix")
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _is_urdf(path: Path) -> bool:
+    if path.suffix.lower() == ".urdf":
+        return True
+    try:
+        for _, element in ET.iterparse(path, events=("start",)):
+            return element.tag == "robot"
+    except (ET.ParseError, OSError):
+        return False
+    return False
+
+
+def xml_files(path: Path) -> Iterator[Path]:
+    """Yield a model file and all the files that it includes or attaches, each once."""
+    seen: list[Path] = []
+    waiting = [path.resolve()]
+    while waiting:
+        current = waiting.pop(0)
+        if current in seen or not current.is_file():
+            continue
+        seen.append(current)
+        yield current
+        try:
+            root = ET.parse(current).getroot()
+        except ET.ParseError:
+            continue
+        for element in root.iter():
+            if element.tag in ("include", "model") and element.get("file"):
+                waiting.append((current.parent / element.get("file", "")).resolve())

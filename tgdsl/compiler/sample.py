@@ -1,0 +1,319 @@
+"""Taxels on a link's surface: grids, even samples and points given by hand, each with normal, tangent and area.
+
+Shapes: `taxel` samples, `f` faces, `cell` cells of a grid, `point` rows of a list. Everything is in the body frame.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tgdsl.compiler import meshlab
+from tgdsl.compiler.rays import Region, View, first_hits, seen_rectangle
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.fields import Selection
+from tgdsl.geometry.surface import Surface
+from tgdsl.schema.placement import Facing, Grid, InBox, InSphere, OnGeoms, Placement, Points, Poisson
+
+NEAR_PARALLEL = 0.7
+"""A link axis with a larger |cosine| to a direction is not used to orient what is perpendicular to that direction."""
+MIN_COSINE = 0.1
+"""A grid cell on a steep face counts at most 1/0.1 times its projected area."""
+MAX_DENSITY = meshlab.MAX_POOL / meshlab.PER_SAMPLE
+"""Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
+_COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
+_OPTIONAL = ("radius", "area")
+
+
+class SampleError(TgdslError):
+    """A placement that a surface cannot satisfy.
+
+    Attributes:
+        what: What was found and what was expected.
+        hint: What would be right, or empty.
+    """
+
+    def __init__(self, what: str, hint: str = ""):
+        self.what = what
+        self.hint = hint
+        super().__init__(f"{what}; {hint}" if hint else what)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Taxels of one link.
+
+    Attributes:
+        pos: Position in the body frame [m].
+        normal: Outward unit normal in the body frame.
+        tangent: Unit tangent in the body frame, perpendicular to the normal.
+        radius: Sensing radius [m].
+        area: Surface that the taxel stands for [m²].
+        cell: Row and column in the grid; −1 where there is none.
+    """
+
+    pos: Float[np.ndarray, "taxel 3"]
+    normal: Float[np.ndarray, "taxel 3"]
+    tangent: Float[np.ndarray, "taxel 3"]
+    radius: Float[np.ndarray, " taxel"]
+    area: Float[np.ndarray, " taxel"]
+    cell: Int[np.ndarray, "taxel 2"]
+
+
+def sample(surface: Surface, placement: Placement, folder: Path) -> Samples:
+    """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
+
+    Args:
+        surface: The link's triangles, in the body frame.
+        placement: How to sample them.
+        folder: Where a file of points is looked up.
+
+    Raises:
+        SampleError: If the surface, or the file of points, cannot satisfy the placement.
+    """
+    if isinstance(placement, Grid):
+        return _grid(surface, placement)
+    if isinstance(placement, Poisson):
+        return _poisson(surface, placement)
+    return _points(placement, folder)
+
+
+def _grid(surface: Surface, placement: Grid) -> Samples:
+    """Project rows × columns onto the surface.
+
+    Columns, rows and direction are a right-handed frame (rows run along direction × columns): seen from where the rays
+    start, columns run to the right and rows run down, as on a page. The side that a ray comes from is outside, so the
+    normal is the hit face's, turned against the ray should the mesh be inside out.
+    """
+    view = View.of(surface, _grid_axes(placement))
+    region = _region(surface, placement)
+    rectangle = seen_rectangle(view, region)
+    if rectangle is None:
+        what = "the link's surface" if region.is_everything else "the region"
+        raise SampleError(f"no part of {what} is seen along {_shown(placement.direction)}", "turn `direction`")
+    cell = np.stack(np.divmod(np.arange(placement.rows * placement.columns), placement.columns), axis=-1)
+    num = np.array([placement.columns, placement.rows])
+    low, high = rectangle
+    pitch = (high - low) / num
+    uv = low + (cell[:, ::-1] + 0.5) * pitch
+    hits = first_hits(view, uv)
+    chosen = np.flatnonzero(hits.face >= 0)
+    pos = np.column_stack([uv[chosen], hits.depth[chosen]]) @ view.axes
+    face = hits.face[chosen]
+    is_in = region.has_faces(view.normals[face], view.geom[face]) & region.has_points(pos)
+    kept = np.flatnonzero(is_in)[_central(placement, cell[chosen[is_in]], pitch)]
+    normal = view.normals[face[kept]]
+    cosine = np.abs(normal @ view.axes[2])
+    return Samples(
+        pos=pos[kept],
+        normal=normal,
+        tangent=_tangent(normal, view.axes[0], view.axes[1]),
+        radius=np.full(len(kept), placement.radius),
+        area=pitch.prod() / np.maximum(cosine, MIN_COSINE),
+        cell=cell[chosen[kept]],
+    )
+
+
+def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
+    """Return the unit vectors along columns, rows and rays."""
+    direction = _unit(np.array(placement.direction))
+    wanted = placement.columns_along
+    columns = _reference_axis(direction[None])[0] if wanted is None else _unit(np.array(wanted))
+    columns = columns - (columns @ direction) * direction
+    if np.linalg.norm(columns) < 1e-6:
+        what = f"`columns_along` {_shown(wanted)} is parallel to `direction` {_shown(placement.direction)}"
+        raise SampleError(what, "choose an axis across it")
+    columns = _unit(columns)
+    return np.stack([columns, np.cross(direction, columns), direction]) + 0.0  # no −0
+
+
+def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]) -> Int[np.ndarray, " kept"]:
+    """Return which of the cells that hit are kept, ascending: all, or the `count` nearest the rectangle's centre."""
+    total = placement.rows * placement.columns
+    if not len(cell):
+        raise SampleError(f"none of the grid's {total} cells hits the surface", "give more `rows` and `columns`")
+    if placement.count is None:
+        return np.arange(len(cell))
+    if placement.count > len(cell):
+        what = f"only {len(cell)} of the grid's {total} cells hit the surface, expected `count` {placement.count}"
+        raise SampleError(what, "lower `count`, or give more `rows` and `columns`")
+    from_center = (cell + 0.5 - np.array([placement.rows, placement.columns]) / 2) * pitch[::-1]
+    distance = np.linalg.norm(from_center, axis=1)
+    order = np.argsort(distance, kind="stable")
+    # Distances that differ by rounding are ties; which cell wins must not hang on the last bit of a mesh.
+    steps = np.diff(distance[order], prepend=distance[order[0]]) > 1e-4 * pitch[pitch > 0].min(initial=np.inf)
+    tier = np.empty(len(cell), dtype=np.int64)
+    tier[order] = np.cumsum(steps)
+    return np.sort(np.lexsort((cell[:, 1], cell[:, 0], tier))[: placement.count])
+
+
+def _poisson(surface: Surface, placement: Poisson) -> Samples:
+    """Spread samples evenly: an exact count by sample elimination, or as many as fit at a spacing."""
+    try:
+        shell = meshlab.outer_shell(surface)
+    except ImportError as error:
+        raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
+    region = _region(surface, placement)
+    pool = meshlab.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    if pool is None:
+        raise SampleError("no part of the link's outer surface is in the region", "widen `region`")
+    if placement.count is not None and len(pool.pos) < placement.count:
+        what = f"the region holds too little of the link's outer surface for `count` {placement.count}"
+        raise SampleError(what, "widen `region`")
+    if placement.spacing is not None and pool.area / placement.spacing**2 > MAX_DENSITY:
+        least = np.sqrt(pool.area / MAX_DENSITY)
+        what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
+        raise SampleError(what, f"expected at least {least:.2g} m")
+    chosen = meshlab.spread(pool, placement.count, placement.spacing, placement.seed)
+    normal = pool.normal[chosen]
+    return Samples(
+        pos=pool.pos[chosen],
+        normal=normal,
+        tangent=_tangent(normal, _reference_axis(normal)),
+        radius=np.full(len(chosen), placement.radius),
+        area=meshlab.shares(pool, chosen),
+        cell=np.full((len(chosen), 2), -1),
+    )
+
+
+def _points(placement: Points, folder: Path) -> Samples:
+    """Take points as they are: nothing is projected."""
+    if isinstance(placement.points, str):
+        rows = list(_read_points(folder, placement.points, placement.radius))
+        if not rows:
+            raise SampleError(f"{placement.points} has no points")
+    else:
+        rows = [
+            (
+                *point.pos,
+                *point.normal,
+                placement.radius if point.radius is None else point.radius,  # the schema sees to it that one is there
+                np.nan if point.area is None else point.area,
+            )
+            for point in placement.points
+        ]
+    table = np.array(rows, dtype=np.float64)
+    pos, radius, area = table[:, :3], table[:, 6], table[:, 7]
+    normal = _unit(table[:, 3:6])
+    return Samples(
+        pos=pos.copy(),
+        normal=normal,
+        tangent=_tangent(normal, _reference_axis(normal)),
+        radius=radius.copy(),
+        area=np.where(np.isnan(area), np.pi * radius**2, area),
+        cell=np.full((len(rows), 2), -1),
+    )
+
+
+def _read_points(folder: Path, name: str, default_radius: float | None) -> Iterator[tuple[float, ...]]:
+    """Yield x, y, z, nx, ny, nz, radius and area of each row of a CSV file; an area that is not given is NaN."""
+    try:
+        text = (folder / name).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise SampleError(f"cannot read the points of {name}: {reason}") from error
+    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    header = [column.strip() for column in reader.fieldnames or ()]
+    reader.fieldnames = header
+    for column in header:
+        if column not in _COLUMNS + _OPTIONAL:
+            raise SampleError(f'{name}:1: unknown column "{column}"', did_you_mean(column, _COLUMNS + _OPTIONAL))
+    missing = [column for column in _COLUMNS if column not in header]
+    if missing:
+        raise SampleError(f"{name}:1: no column {', '.join(missing)}", f"expected the header {','.join(_COLUMNS)}")
+    for row in reader:
+        place = f"{name}:{reader.line_num}"
+        if None in row:
+            raise SampleError(f"{place}: more values than the header has columns")
+        values = {column: _number(place, column, text) for column, text in row.items() if (text or "").strip()}
+        if "radius" not in values and default_radius is None:
+            hint = "add a column `radius`, or give one `radius` for the whole file"
+            raise SampleError(f"{place}: the point has no radius", hint)
+        for column in _COLUMNS:
+            if column not in values:
+                raise SampleError(f"{place}: {column} is empty, expected a number")
+        if not any(values[column] for column in _COLUMNS[3:]):
+            raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
+        yield *(values[column] for column in _COLUMNS), values.get("radius", default_radius), values.get("area", np.nan)
+
+
+def _number(place: str, column: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise SampleError(f'{place}: {column} is "{text.strip()}", expected a number')
+    if (column == "radius" and value < 0) or (column == "area" and value <= 0):
+        bound = "at least 0" if column == "radius" else "more than 0"
+        raise SampleError(f"{place}: {column} {value:g} is out of range, expected {bound}")
+    return value
+
+
+def _region(surface: Surface, placement: Grid | Poisson) -> Region:
+    parts = placement.region if isinstance(placement.region, tuple) else (placement.region,)
+    is_geom = None
+    for part in parts:
+        if isinstance(part, OnGeoms):
+            chosen = _chosen_geoms(surface, part.geoms)
+            is_geom = chosen if is_geom is None else is_geom & chosen
+    return Region(
+        is_geom=is_geom,
+        facings=tuple((_unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
+        boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
+        spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
+    )
+
+
+def _chosen_geoms(surface: Surface, selection: Selection) -> Bool[np.ndarray, " geom"]:
+    """Return which geoms a selection takes, by any of their names."""
+
+    def matching(patterns: tuple[str, ...]) -> Bool[np.ndarray, " geom"]:
+        return np.array(
+            [any(fnmatchcase(name, pattern) for name in names for pattern in patterns) for names in surface.geoms],
+            dtype=bool,
+        )
+
+    included = matching(selection.include)
+    if not included.any():
+        wanted = ", ".join(f'"{pattern}"' for pattern in selection.include)
+        names = [name for names in surface.geoms for name in names]
+        hint = did_you_mean(selection.include[0], names, "named geoms on this link")
+        raise SampleError(f"no geom or mesh of this link matches {wanted}", hint)
+    chosen = included & ~matching(selection.exclude)
+    if not chosen.any():
+        raise SampleError("`exclude` leaves none of the geoms that `include` takes", "exclude less")
+    return chosen
+
+
+def _shown(vector: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{component:g}" for component in vector) + "]"
+
+
+def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    # The largest component first: the square of a tiny or huge one is not representable.
+    scaled = vectors / np.abs(vectors).max(axis=-1, keepdims=True)
+    return scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+
+
+def _reference_axis(direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the first of the link's z, y and x axes that is not near parallel to each direction."""
+    is_across = np.abs(direction[:, ::-1]) < NEAR_PARALLEL
+    return np.eye(3)[2 - np.argmax(is_across, axis=1)]
+
+
+def _tangent(
+    normal: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "*n 3"], otherwise: Float[np.ndarray, " 3"] | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Return `along` projected onto the tangent planes, unit; `otherwise` projected where it is near the normal."""
+    along = np.broadcast_to(along, normal.shape)
+    if otherwise is not None:
+        is_normal = np.linalg.norm(np.cross(normal, along), axis=1) < 1e-3
+        along = np.where(is_normal[:, None], otherwise, along)
+    return _unit(along - (along * normal).sum(axis=1, keepdims=True) * normal)

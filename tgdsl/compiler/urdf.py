@@ -1,0 +1,74 @@
+"""URDF made fit for MuJoCo: paths found, fixed links kept, broken inertias mended and named in a warning."""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from tgdsl.errors import RobotError, listed
+
+LEAST_INERTIA = 1e-9
+"""Principal moment given to a link whose inertia is not one of any real body [kg·m²]."""
+
+
+def as_mujoco_text(path: Path) -> str:
+    """Return a URDF's text with what MuJoCo needs to read it.
+
+    Mesh paths become absolute (`package://` is looked up in the folders above the file), links on fixed joints keep their
+    own bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size.
+
+    Raises:
+        RobotError: If the file is not XML, or a mesh cannot be found.
+    """
+    try:
+        tree = ET.parse(path)
+    except ET.ParseError as error:
+        raise RobotError(f"{path}: not XML: {error}") from error
+    robot = tree.getroot()
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), path)))
+    mended = [link.get("name", "") for link in robot.iter("link") if _mend(link)]
+    if mended:
+        warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=4)
+    settings = robot.find("mujoco")
+    settings = ET.SubElement(robot, "mujoco") if settings is None else settings
+    compiler = settings.find("compiler")
+    compiler = ET.SubElement(settings, "compiler") if compiler is None else compiler
+    compiler.attrib |= {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "meshdir": ""}
+    return ET.tostring(robot, encoding="unicode")
+
+
+def _mesh_file(name: str, urdf: Path) -> Path:
+    if name.startswith("package://"):
+        inside = name.removeprefix("package://")
+        package, _, rest = inside.partition("/")
+        for folder in urdf.resolve().parents:
+            if folder.name == package and (folder / rest).is_file():
+                return folder / rest
+            if (folder / inside).is_file():
+                return folder / inside
+        raise RobotError(f'{urdf}: mesh "{name}": no folder above the file holds "{inside}"')
+    found = urdf.resolve().parent / name.removeprefix("file://")
+    if not found.is_file():
+        raise RobotError(f'{urdf}: mesh "{name}": there is no file {found}')
+    return found
+
+
+def _mend(link: ET.Element) -> bool:
+    """Replace the link's inertia if its principal moments are not positive or break the triangle inequality."""
+    inertia = link.find("inertial/inertia")
+    if inertia is None:
+        return False
+    xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", "0")) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if low > 0 and low + middle >= high * (1 - 1e-9):
+        return False
+    moment = max((xx + yy + zz) / 3.0, LEAST_INERTIA)
+    for axes in ("xx", "yy", "zz"):
+        inertia.set(f"i{axes}", repr(moment))
+    for axes in ("xy", "xz", "yz"):
+        inertia.set(f"i{axes}", "0")
+    return True

@@ -1,0 +1,411 @@
+"""The compiled sensor: tensors in, tensors out.
+
+Shapes: `env` environments, `body` bodies of `inputs.bodies`, `pair` pairs of `inputs.pairs`, `slot` contacts per pair, `object`
+felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `feature` numbers of an observation.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from tgdsl import observations
+from tgdsl.errors import StateError, TgdslError, did_you_mean
+from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, relate
+from tgdsl.plan import Inputs, Plan, PlannedQuery, PlannedSensor
+from tgdsl.sensors import KINDS, Kind
+
+SHAPES: dict[str, tuple[str | int, ...]] = {
+    "body_pos": ("body", 3),
+    "body_quat": ("body", 4),
+    "body_linvel": ("body", 3),
+    "body_angvel": ("body", 3),
+    "contact_found": ("pair",),
+    "contact_pos": ("pair", "slot", 3),
+    "contact_force": ("pair", "slot", 3),
+    "contact_torque": ("pair", "slot", 3),
+    "contact_normal": ("pair", "slot", 3),
+    "contact_netforce": ("pair", 3),
+}
+"""Shape of each tensor of a `SceneState`, after the leading `env`."""
+
+
+@dataclass
+class SceneState:
+    """What a simulator (or hardware) says of all environments at one instant. Only what `inputs.fields` names is read.
+
+    All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
+    dtype and then cast, so that far from the origin nothing is lost.
+
+    Attributes:
+        body_pos: Position of each body's frame [m].
+        body_quat: Orientation of each body, w, x, y, z.
+        body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
+        body_angvel: Angular velocity of the body [rad/s].
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive.
+        contact_pos: Contact points [m].
+        contact_force: Force on the link at each point [N].
+        contact_torque: Torque on the link at each point [N·m].
+        contact_normal: Unit normal out of the object at each point.
+        contact_netforce: The pair's whole force on the link [N].
+        dt: Time since the last state [s].
+    """
+
+    body_pos: Float[Tensor, "env body 3"] | None = None
+    body_quat: Float[Tensor, "env body 4"] | None = None
+    body_linvel: Float[Tensor, "env body 3"] | None = None
+    body_angvel: Float[Tensor, "env body 3"] | None = None
+    contact_found: Tensor | None = None
+    contact_pos: Float[Tensor, "env pair slot 3"] | None = None
+    contact_force: Float[Tensor, "env pair slot 3"] | None = None
+    contact_torque: Float[Tensor, "env pair slot 3"] | None = None
+    contact_normal: Float[Tensor, "env pair slot 3"] | None = None
+    contact_netforce: Float[Tensor, "env pair 3"] | None = None
+    dt: float | None = None
+
+    def to(self, *args: Any, **kwargs: Any) -> SceneState:
+        """Return the state with `torch.Tensor.to` applied to every tensor."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return SceneState(**{name: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for name, v in values.items()})
+
+
+@dataclass(frozen=True)
+class Output:
+    """One entry of a reading: its name, its shape after `env`, and the name and unit of each channel."""
+
+    name: str
+    kind: str
+    shape: tuple[int, int]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+class _Constants(nn.Module):
+    """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
+        super().__init__()
+        self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        for name, exact in self._exact.items():
+            self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._buffers[name]  # type: ignore[return-value]
+
+    def under(self, prefix: str, names: Sequence[str]) -> dict[str, Tensor]:
+        return {name: self[f"{prefix}/{name}"] for name in names}
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> _Constants:
+        before = dict(self._buffers)
+        super()._apply(fn, recurse)
+        for name, exact in self._exact.items():
+            old, new = before[name], self._buffers[name]
+            assert old is not None and new is not None
+            is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
+            if is_untouched:
+                self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
+        return self
+
+
+class TactileModule(nn.Module):
+    """All sensors of a document, for any number of environments at once.
+
+    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel). `observe` makes the
+    observations of them. A module whose sensors carry state (see `num_envs`) takes the batch size of its first call, or of
+    the state dict that it loads, and keeps it; one without state takes any.
+    """
+
+    def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):
+        """Build a module.
+
+        Args:
+            plan: What to compute.
+            kinds: The kinds that the plan's sensors are of.
+            dtype: Dtype of constants, state and readings.
+
+        Raises:
+            TgdslError: If the plan uses a kind that is not given.
+        """
+        super().__init__()
+        self.plan = plan
+        known = {kind.name: kind for kind in kinds}
+        for sensor in plan.sensors:
+            if sensor.kind not in known:
+                hint = did_you_mean(sensor.kind, known, "kinds")
+                raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
+        self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
+        self.constants = _Constants({k: v for k, v in plan.arrays.items() if not k.startswith("layout/")}, dtype)
+        self.memory = nn.Module()
+        self._compiled_core: Callable[..., Any] | None = None
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the module reads of a scene, and in which order."""
+        return self.plan.inputs
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Name, shape, channels and units of each reading."""
+        return tuple(
+            Output(reading, s.kind, (self.plan.queries[s.query].num_taxels, len(s.channels)), s.channels, s.units)
+            for s in self.plan.sensors
+            for reading in s.readings
+        )
+
+    @property
+    def taxels(self) -> dict[str, np.ndarray]:
+        """The taxels of each sensor, in the order of its readings, as tables (NumPy structured arrays).
+
+        Columns: `link`, `body`, `pos` and `normal` and `tangent` (body frame), `radius` [m], `area` [m²], `row`, `column`
+        (−1 where there is no grid), `groups` (names joined by commas).
+        """
+        return {sensor.name: _table(self.plan, sensor) for sensor in self.plan.sensors}
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the readings."""
+        return next((b.dtype for b in self.constants.buffers() if b.is_floating_point()), torch.float32)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the readings."""
+        return next(self.constants.buffers()).device
+
+    @property
+    def has_state(self) -> bool:
+        """Whether any sensor carries something from one call to the next."""
+        return any(sensor.state for sensor in self.plan.sensors)
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments whose state is held; None before the first call, or if there is no state."""
+        return next((buffer.shape[0] for buffer in self.memory.buffers()), None)
+
+    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env taxel channel"]]:
+        """Read all sensors.
+
+        Args:
+            state: The scene, at one instant.
+
+        Returns:
+            Readings by name, as `outputs` lists them, in the module's dtype.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+        """
+        tensors = self._checked(state)
+        num_envs = tensors["body_pos"].shape[0]
+        memory = self._memory_for(num_envs)
+        readings, updated = (self._compiled_core or self.core)(tensors, memory)
+        with torch.no_grad():
+            for name, value in updated.items():
+                memory[name].copy_(value)
+        return readings
+
+    def core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Compute readings and the new state: a pure function of its arguments, traceable in one graph.
+
+        Args:
+            tensors: The fields of `SceneState` that `inputs` names.
+            memory: State by `sensor:plane`, each (env, taxel).
+
+        Returns:
+            Readings by name, and the new state.
+        """
+        pairs = self._pairs(tensors)
+        answers = [self._query(i, query, pairs) for i, query in enumerate(self.plan.queries)]
+        readings: dict[str, Tensor] = {}
+        updated: dict[str, Tensor] = {}
+        for sensor in self.plan.sensors:
+            felt, probes = answers[sensor.query]
+            own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
+            constants = self.constants.under(f"sensors/{sensor.name}", sensor.constants)
+            result, new = self._kinds[sensor.name].forward(felt, probes, constants, own)
+            reading = torch.stack([result[channel] for channel in sensor.channels], dim=1).transpose(1, 2)
+            readings |= {name: reading for name in sensor.readings}
+            updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
+        return readings, updated
+
+    def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the observation groups, each the concatenation of its terms, every term flattened channel-major."""
+        groups: dict[str, list[Tensor]] = {}
+        for term in self.plan.observations:
+            constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
+            features = observations.observe(term.type, readings[term.reading], term.channels, constants)
+            groups.setdefault(term.group, []).append(features)
+        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+
+    def reset(self, env_ids: Tensor | Sequence[int] | None = None) -> None:
+        """Bring the state of some environments (default: all) back to rest; the others are left untouched.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments.
+        """
+        for sensor in self.plan.sensors:
+            for name, rest in sensor.state.items():
+                buffer = self.memory._buffers.get(f"{sensor.name}:{name}")
+                if buffer is not None:
+                    with torch.no_grad():
+                        buffer[slice(None) if env_ids is None else torch.as_tensor(env_ids, device=buffer.device)] = rest
+
+    def compile(self, **options: Any) -> TactileModule:
+        """Compile the core with `torch.compile` into fused kernels, in place; the first call then takes longer.
+
+        Args:
+            **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`: one graph for every batch ≥ 2.
+
+        Returns:
+            The module.
+        """
+        if self.device.type == "cpu" and not _has_cpp_compiler():
+            warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
+            return self
+        self._compiled_core = torch.compile(self.core, **{"fullgraph": True, "dynamic": True, **options})
+        return self
+
+    def example_state(
+        self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
+    ) -> SceneState:
+        """Return a valid random state of all wanted fields, with bodies close enough to touch.
+
+        Args:
+            num_envs: Number of environments.
+            seed: Seed of the draw.
+            dtype: Dtype of the tensors.
+            spread: Standard deviation of the bodies' positions [m].
+        """
+        generator = torch.Generator().manual_seed(seed)
+        sizes = {"body": len(self.inputs.bodies), "pair": len(self.inputs.pairs), "slot": self.inputs.slots}
+        values: dict[str, Any] = {}
+        for name in (name for name in self.inputs.fields if name in SHAPES):
+            shape = [num_envs, *(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])]
+            value = torch.randn(shape, generator=generator, dtype=dtype)
+            if name == "body_pos":
+                value = spread * value
+            elif name == "body_quat":
+                value = value / value.norm(dim=-1, keepdim=True)
+            elif name == "contact_found":
+                value = value > -1.0
+            values[name] = value.to(self.device)
+        if "dt" in self.inputs.fields:
+            values["dt"] = 0.01
+        return SceneState(**values)
+
+    def explain(self) -> str:
+        """Return an account of what is computed, what was dropped and why, and what it costs."""
+        from tgdsl.explain import explain
+
+        return explain(self)
+
+    def _pairs(self, tensors: dict[str, Tensor]) -> Pairs:
+        gate = None
+        if "contact_found" in tensors:
+            found = tensors["contact_found"][:, self.constants["pairs/gate"]] > 0
+            gate = torch.where(found, 0.0, -torch.inf).to(self.dtype)
+        return relate(
+            tensors["body_pos"],
+            tensors["body_quat"],
+            self.constants["pairs/link"],
+            self.constants["pairs/object"],
+            self.dtype,
+            tensors.get("body_linvel"),
+            tensors.get("body_angvel"),
+            gate,
+        )
+
+    def _query(self, i: int, query: PlannedQuery, pairs: Pairs) -> tuple[Felt, Probes]:
+        constants = self.constants.under(f"queries/{i}", ("pos", "reach", "pair"))
+        x, y, z = constants["pos"]
+        probes = Probes((x, y, z), constants["reach"], constants["pair"])
+        objects = [self._object(index) for index in query.objects]
+        if not query.is_gated:
+            pairs = pairs._replace(gate=None)
+        return feel(pairs, probes, objects, "normal" in query.needs, "motion" in query.needs), probes
+
+    def _object(self, index: int) -> FeltObject:
+        target = self.plan.objects[index]
+        tensors = self.constants.under(f"objects/{target.name}", ("size", "pos", "rotation"))
+        return FeltObject(target.first_pair, target.num_pairs, target.shapes, target.is_centred, **tensors)
+
+    def _checked(self, state: SceneState) -> dict[str, Tensor]:
+        """Return the wanted fields, after a look at their shapes."""
+        sizes: dict[str, int] = {"body": len(self.inputs.bodies), "pair": len(self.inputs.pairs), "slot": self.inputs.slots}
+        tensors: dict[str, Tensor] = {}
+        num_envs = None
+        for name in self.inputs.fields:
+            value = getattr(state, name)
+            if value is None:
+                raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(self.inputs.fields)}")
+            if name == "dt":
+                continue
+            want = tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
+            if not isinstance(value, Tensor):
+                raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
+            if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
+                raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {', '.join(map(str, want))})")
+            if num_envs is not None and value.shape[0] != num_envs:
+                raise StateError(f"SceneState.{name} holds {value.shape[0]} environments, body_pos {num_envs}")
+            if value.device != self.device:
+                raise StateError(f"SceneState.{name} is on {value.device}, the module on {self.device}")
+            if name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
+                raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
+            num_envs = value.shape[0]
+            tensors[name] = value
+        return tensors
+
+    def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
+        """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""
+        if self.has_state and self.num_envs is None:
+            with torch.inference_mode(False):
+                for sensor in self.plan.sensors:
+                    for name, rest in sensor.state.items():
+                        shape = (num_envs, self.plan.queries[sensor.query].num_taxels)
+                        buffer = torch.full(shape, rest, dtype=self.dtype, device=self.device)
+                        self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
+        if self.has_state and self.num_envs != num_envs:
+            raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
+        return dict(self.memory.named_buffers())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Make room for the state that is loaded: before the first call there is none."""
+        for sensor in self.plan.sensors:
+            for name in sensor.state:
+                value = state_dict.get(f"{prefix}memory.{sensor.name}:{name}")
+                if isinstance(value, Tensor):
+                    buffer = torch.zeros_like(value, dtype=self.dtype, device=self.device)
+                    self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _has_cpp_compiler() -> bool:
+    return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
+
+
+def _table(plan: Plan, sensor: PlannedSensor) -> np.ndarray:
+    layout = plan.layout_of(sensor)
+    groups = [",".join(g for g, members in layout.groups.items() if link.name in members) for link in layout.links]
+    columns: list[tuple[str, Any]] = [
+        ("link", np.array([link.name for link in layout.links])[layout.link_id]),
+        ("body", np.array([link.body for link in layout.links])[layout.link_id]),
+        ("pos", layout.pos),
+        ("normal", layout.normal),
+        ("tangent", layout.tangent),
+        ("radius", layout.radius),
+        ("area", layout.area),
+        ("row", layout.cell[:, 0]),
+        ("column", layout.cell[:, 1]),
+        ("groups", np.array(groups)[layout.link_id]),
+    ]
+    table = np.empty(layout.num_taxels, dtype=[(name, column.dtype, column.shape[1:]) for name, column in columns])
+    for name, column in columns:
+        table[name] = column
+    return table

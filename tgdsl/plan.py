@@ -1,0 +1,227 @@
+"""The Plan: what to compute, with nothing left to decide. Plain values and NumPy arrays; the same input gives the same Plan.
+
+It knows no text, no robot file and no simulator. Its arrays are float64 or int64 and named by path:
+
+| array | shape | holds |
+|---|---|---|
+| `layout/{link_id,pos,normal,tangent,radius,area,cell}` | (taxel, …) | the taxels that some sensor has, see `layout.Layout` |
+| `pairs/{link,object}` | (pair,) | body indices of each pair's link and object |
+| `pairs/gate` | (pair,) | index of each pair among `inputs.pairs`; 0 where no query asks |
+| `objects/<name>/{size,pos,rotation}` | (geom, 3 or 9) | geoms in the object's body frame |
+| `queries/<i>/{taxels,pos,reach,pair}` | (taxel,), (3, taxel), (object, taxel) ×2 | probes, see `geometry.query.Probes` |
+| `sensors/<name>/<constant>` | () or (…, taxel) | what the kind's `lower` folded |
+| `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, get_type_hints
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from tgdsl.errors import ArtifactError
+from tgdsl.layout import Layout, Link
+
+FORMAT = 1
+"""Version of the Plan; a reader refuses any other."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A link's body and an object that its taxels may feel."""
+
+    link: str
+    object: str
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a module wants of a scene, and in which order.
+
+    Attributes:
+        fields: Fields of `SceneState` that are read.
+        bodies: Bodies whose poses (and velocities) are read.
+        pairs: Pairs whose contacts are read.
+        bodies_of: Body of each object named in `pairs`.
+        slots: Contacts per pair of the slotted contact fields; 0 if none is read.
+    """
+
+    fields: tuple[str, ...]
+    bodies: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    bodies_of: Mapping[str, str]
+    slots: int
+
+
+@dataclass(frozen=True)
+class PlannedObject:
+    """An object: its body, the types of its geoms, and which of them share the body's frame."""
+
+    name: str
+    body: str
+    shapes: tuple[str, ...]
+    is_centred: tuple[bool, ...]
+    first_pair: int
+    num_pairs: int
+
+
+@dataclass(frozen=True)
+class PlannedQuery:
+    """One geometry query, shared by all sensors with the same probes, objects and gate."""
+
+    objects: tuple[int, ...]
+    is_gated: bool
+    needs: tuple[str, ...]
+    num_taxels: int
+
+
+@dataclass(frozen=True)
+class PlannedSensor:
+    """One sensor: its kind, its query, the channels of its reading and the state it carries."""
+
+    name: str
+    kind: str
+    query: int
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    constants: tuple[str, ...]
+    state: Mapping[str, float]
+    readings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlannedObservation:
+    """One term of an observation group."""
+
+    group: str
+    index: int
+    type: str
+    reading: str
+    channels: tuple[int, ...]
+    constants: tuple[str, ...]
+    num_features: int
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A file that the scene needs: its name in the MJCF, where it was found, and what it held."""
+
+    key: str
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """The instrumented scene, as text, for whoever simulates it.
+
+    Attributes:
+        mjcf: The scene as MJCF, with the contact sensors that the module wants.
+        assets: The files that it names.
+    """
+
+    mjcf: str
+    assets: tuple[Asset, ...]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a plan was made from."""
+
+    document_sha256: str
+    robot: str
+    robot_sha256: str
+    resolution: str
+    versions: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All a module is built from.
+
+    Attributes:
+        origin: What it was made from.
+        inputs: What it reads.
+        links: Links that carry taxels.
+        groups: Links of each link group.
+        objects: What taxels feel.
+        queries: Geometry queries.
+        sensors: Sensors, in the document's order.
+        observations: Observation terms, in the document's order.
+        dropped: What the scene or the document has and the module does not need, and why.
+        arrays: Constants by path.
+        scene: The instrumented scene.
+    """
+
+    origin: Origin
+    inputs: Inputs
+    links: tuple[Link, ...]
+    groups: Mapping[str, tuple[str, ...]]
+    objects: tuple[PlannedObject, ...]
+    queries: tuple[PlannedQuery, ...]
+    sensors: tuple[PlannedSensor, ...]
+    observations: tuple[PlannedObservation, ...]
+    dropped: tuple[tuple[str, str], ...]
+    arrays: Mapping[str, np.ndarray]
+    scene: SceneFile
+
+    def layout(self) -> Layout:
+        """Return the taxels of all sensors."""
+        fields = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
+        return Layout(self.links, self.groups, **{name: self.arrays[f"layout/{name}"] for name in fields})
+
+    def layout_of(self, sensor: PlannedSensor) -> Layout:
+        """Return the taxels of one sensor."""
+        return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"])
+
+    def to_json(self) -> str:
+        """Return everything but the arrays, with sorted keys."""
+        plain: dict[str, Any] = {
+            field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.name != "arrays"
+        }
+        return json.dumps({"format": FORMAT, **plain}, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+
+    @staticmethod
+    def from_json(text: str, arrays: Mapping[str, np.ndarray]) -> Plan:
+        """Return the plan that `to_json` wrote.
+
+        Raises:
+            ArtifactError: If the text is not a plan of this version.
+        """
+        try:
+            plain = json.loads(text)
+            version = plain.pop("format", None)
+            if version != FORMAT:
+                raise ArtifactError(f"plan format {version} is not {FORMAT}, which this version of tgdsl reads; compile again")
+            types = _field_types()
+            if plain.keys() != types.keys():
+                raise ArtifactError(f"a plan has the parts {sorted(types)}, found {sorted(plain)}")
+            values = {name: TypeAdapter(kind).validate_python(plain[name]) for name, kind in types.items()}
+        except (ValidationError, ValueError, AttributeError) as error:
+            raise ArtifactError(f"not a plan: {error}") from error
+        return Plan(**values, arrays=arrays)
+
+
+def _field_types() -> dict[str, Any]:
+    hints = get_type_hints(Plan)
+    return {field.name: hints[field.name] for field in dataclasses.fields(Plan) if field.name != "arrays"}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(part) for part in value]
+    return value
+
+
+def contact_sensor_names(pair: Pair) -> tuple[str, str]:
+    """Return the names of the contact sensors of a pair: its point slots, and its net force."""
+    return f"tgdsl/contact/{pair.link}/{pair.object}", f"tgdsl/netforce/{pair.link}/{pair.object}"
