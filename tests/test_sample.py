@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from pydantic import TypeAdapter
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from tgdsl.compiler import meshlab
 from tgdsl.compiler.rays import Region, View, first_hits
@@ -229,17 +229,17 @@ def test_poisson_gives_the_exact_count_evenly_on_the_surface(count):
     np.testing.assert_allclose(found.area.sum(), mesh.area, rtol=1e-9)
     assert (found.area > 0).all()
     np.testing.assert_array_equal(found.cell, np.full((count, 2), -1))
-    _, face = cKDTree(mesh.triangles_center).query(found.pos, k=8)
+    _, face = KDTree(mesh.triangles_center).query(found.pos, k=8)
     height = ((found.pos[:, None] - mesh.triangles_center[face]) * mesh.face_normals[face]).sum(-1)
     own = np.abs((found.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
     assert np.abs(height[np.arange(count), own]).max() < 1e-9  # in the plane of the face whose normal it has
     if count >= 50:
         ideal = np.sqrt(2 * mesh.area / (np.sqrt(3) * count))  # hexagonal packing
-        nearest = cKDTree(found.pos).query(found.pos, k=2)[0][:, 1]
+        nearest = KDTree(found.pos).query(found.pos, k=2)[0][:, 1]
         assert nearest.min() > 0.7 * ideal
         random = np.random.default_rng(0).normal(size=(count, 3))
         random *= radius / np.linalg.norm(random, axis=1, keepdims=True)
-        uniform = cKDTree(random).query(random, k=2)[0][:, 1]
+        uniform = KDTree(random).query(random, k=2)[0][:, 1]
         assert nearest.mean() > 1.4 * uniform.mean()  # bluer: uniform points have 1/2√density
         assert nearest.std() / nearest.mean() < 0.12
         assert found.area.std() / found.area.mean() < 0.25
@@ -260,9 +260,9 @@ def test_spacing_is_kept_and_leaves_no_gap(spacing):
     surface = surface_of(box((0.02, 0.02, 0.01)))
     found = sample(surface, placement("poisson", spacing=spacing), HERE)
     if len(found.pos) > 1:
-        assert cKDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() >= spacing
+        assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() >= spacing
     pool = meshlab.pool(meshlab.outer_shell(surface), Region(None, (), (), ()), 0, None, spacing)
-    assert cKDTree(found.pos).query(pool.pos)[0].max() <= spacing
+    assert KDTree(found.pos).query(pool.pos)[0].max() <= spacing
     np.testing.assert_allclose(found.area.sum(), 2 * (0.0004 + 0.0002 + 0.0002), rtol=1e-9)
 
 
@@ -288,7 +288,24 @@ def test_poisson_samples_the_union_of_overlapping_boxes():
 def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, area):
     found = sample(surface_of(box((2, 2, 2)), box(size, shift)), placement("poisson", count=300), HERE)
     np.testing.assert_allclose(found.area.sum(), area, rtol=0.01)
-    assert cKDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
+    assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
+
+
+def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
+    inner, outer = ball(0.008), ball(0.01)
+    inner.faces = inner.faces[:, ::-1]
+    hole = [mesh.faces[np.argmax(mesh.triangles_center[:, 2])] for mesh in (inner, outer)]
+    joined = trimesh.util.concatenate([inner, outer])
+    rim = [hole[0][::-1], hole[1] + len(inner.vertices)]
+    corner = [np.argmin(np.linalg.norm(joined.vertices[rim[0]] * 1.25 - joined.vertices[i], axis=1)) for i in rim[1]]
+    a, b = rim[0][corner], rim[1]
+    tunnel = [f for i in range(3) for f in ([b[i], a[i], b[i - 2]], [a[i], a[i - 2], b[i - 2]])]
+    faces = [f for f in joined.faces.tolist() if set(f) not in (set(rim[0]), set(rim[1]))]
+    mesh = trimesh.Trimesh(joined.vertices, faces + tunnel, process=False)
+    assert mesh.is_watertight
+    assert mesh.body_count == 1
+    found = sample(surface_of(mesh), placement("poisson", count=300), HERE)
+    assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 3
 
 
 def test_poisson_on_open_meshes():
@@ -297,7 +314,7 @@ def test_poisson_on_open_meshes():
     marble = ball(0.002)
     found = sample(surface_of(bowl, marble), placement("poisson", count=200), HERE)
     assert (np.linalg.norm(found.pos, axis=1) < 0.0021).any()  # a bowl encloses nothing
-    np.testing.assert_allclose(found.area.sum(), bowl.area + marble.area, rtol=1e-9)
+    np.testing.assert_allclose(found.area.sum(), bowl.area + marble.area, rtol=0.01)
     punctured = trimesh.Trimesh((shell := ball(0.01)).vertices, shell.faces[3:], process=False)
     found = sample(surface_of(punctured, marble), placement("poisson", count=200), HERE)
     assert np.linalg.norm(found.pos, axis=1).min() > 0.0098  # a few missing triangles do not make a bowl

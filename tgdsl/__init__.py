@@ -1,0 +1,64 @@
+"""Touch for robot learning: a scene and sensor language compiled to one batched PyTorch module.
+
+    touch = tgdsl.compile("hand.yaml")
+    sim = tgdsl.simulate(touch, num_envs=1024)
+    sim.step(control)
+    readings = touch(sim.state())
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tgdsl.artifact import save as save
+    from tgdsl.compiler.pipeline import compile as compile
+    from tgdsl.compiler.pipeline import load_module as load
+    from tgdsl.compiler.scene import instrument as instrument
+    from tgdsl.errors import ArtifactError, RobotError, SimulationError, SpecError, StateError, TgdslError
+    from tgdsl.module import SceneState, TactileModule
+    from tgdsl.runtime.batch import BatchSimulation
+    from tgdsl.runtime.batch import simulate as simulate
+
+_PLACES = {
+    "ArtifactError": "errors",
+    "BatchSimulation": "runtime.batch",
+    "RobotError": "errors",
+    "SceneState": "module",
+    "SimulationError": "errors",
+    "SpecError": "errors",
+    "StateError": "errors",
+    "TactileModule": "module",
+    "TgdslError": "errors",
+    "compile": "compiler.pipeline",
+    "instrument": "compiler.scene",
+    "load": "compiler.pipeline:load_module",
+    "save": "artifact",
+    "simulate": "runtime.batch",
+}
+
+__all__ = [
+    "ArtifactError",
+    "BatchSimulation",
+    "RobotError",
+    "SceneState",
+    "SimulationError",
+    "SpecError",
+    "StateError",
+    "TactileModule",
+    "TgdslError",
+    "compile",
+    "instrument",
+    "load",
+    "save",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that no command waits for what it does not need."""
+    if name not in _PLACES:
+        raise AttributeError(f"module 'tgdsl' has no attribute {name!r}")
+    module, _, attribute = _PLACES[name].partition(":")
+    return getattr(import_module(f"tgdsl.{module}"), attribute or name)

@@ -9,21 +9,29 @@ from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError
+from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
 
 METADATA_KEY = "tgdsl"
 
 
-def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
-    """Write a plan; the same plan gives the same bytes. The file appears whole or not at all.
+def save(touch: TactileModule, path: str | PathLike[str]) -> int:
+    """Write what a module was built from; `tgdsl.load` makes the module again. Its state is not part of it: see `state_dict`.
+
+    The same document gives the same bytes. The file appears whole or not at all.
 
     Returns:
         Bytes written.
     """
-    content = save({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
+    return save_plan(touch.plan, path)
+
+
+def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
+    """Write a plan, as `save` does; return the bytes written."""
+    content = serialized({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
     target = Path(path)
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
     try:

@@ -12,7 +12,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
@@ -27,7 +26,7 @@ class SpecModel(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _note_model(cls, value: object, info: ValidationInfo) -> object:
+    def _note_model(cls, value: object, info: Any) -> object:
         """Note which model a mapping was read as, so that an error can name the keys that it knows."""
         if isinstance(info.context, dict):
             info.context[id(value)] = cls

@@ -1,12 +1,16 @@
 """Even samples of a link's outer surface: clean its meshes, drop what lies inside, draw a dense pool, choose from it.
 
+A point is on the outer surface if it is in no solid part (by winding numbers) and can be seen from far away: real
+meshes hold screws and magnets as parts of their own, and pockets that are joined to the outside by a pinhole.
+
 The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned: compiled modules run without it. Its
 own samplers are unseeded and miss the asked count, so the pool is drawn by NumPy: seeded, area-weighted and
 stratified over the faces. An exact count is chosen from the pool by weighted sample elimination (Yuksel, "Sample
 Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015), a spacing by dart throwing.
 Distances are straight lines, not paths along the surface.
 
-Shapes: `f` faces, `part` connected parts of the mesh, `pool` points of the pool. Everything is in the body frame.
+Shapes: `f` faces, `edge` three per face, `part` connected parts of the mesh, `piece` triangles cut from faces, `pool`
+points of the pool. Everything is in the body frame.
 """
 
 from __future__ import annotations
@@ -15,14 +19,15 @@ import heapq
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
-from tgdsl.compiler.rays import LENGTH_TOLERANCE, Region
+from tgdsl.compiler.rays import LENGTH_TOLERANCE, Region, View, first_hits, frame
 from tgdsl.geometry.surface import Surface
 
 MAX_HOLE = 0.05
@@ -30,6 +35,8 @@ MAX_HOLE = 0.05
 area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
 CANDIDATES = 10
 """Points per sample from which an exact count is chosen."""
+DIRECTIONS = 100
+"""Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch."""
 PER_SAMPLE = 50
 """Points per sample by which the area of each sample is measured; also the density of the pool for a spacing."""
 MIN_POOL, MAX_POOL = 10_000, 400_000
@@ -106,8 +113,9 @@ def outer_shell(surface: Surface) -> Shell:
 
 def _clean(surface: Surface) -> Surface:
     """Weld vertices, drop faces without area or that repeat another, make windings agree; each geom by itself."""
-    import pymeshlab
+    import pymeshlab as untyped
 
+    pymeshlab: Any = untyped
     parts = []
     for geom in range(len(surface.geoms)):
         faces = surface.faces[surface.face_geom == geom]
@@ -133,7 +141,7 @@ def _clean(surface: Surface) -> Surface:
     return Surface(joined.vertices, joined.faces, joined.face_geom, surface.geoms)
 
 
-def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "3*f 2"]:
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "edge 2"]:
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
@@ -192,7 +200,7 @@ def _enclosed(shell: Shell) -> Bool[np.ndarray, " part"]:
     owner[shell.surface.faces] = shell.part[:, None]
     vertices, owner = shell.surface.vertices[owner >= 0], owner[owner >= 0]
     is_enclosed = np.zeros(num, dtype=bool)
-    for part in np.flatnonzero(shell.is_solid):
+    for part in np.flatnonzero(shell.is_solid).tolist():
         other = owner != part
         # Not 1/2: a vertex on the other's surface, even in a notch of it, shall not count.
         is_out = _winding(shell, part, vertices[other]) < 0.9
@@ -216,19 +224,23 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
     """
     face, corners = _pieces(shell.surface, region)
     limit = 4 * max(MAX_POOL, CANDIDATES * (count or 0))
-    num, drawn = MIN_POOL // 2, None
+    num, drawn = int(_wanted(0.0, count, spacing)), None
     while len(face):
         drawn = _drawn(shell, region, face, corners, num, seed)
-        if spacing is not None:
-            wanted = max(PER_SAMPLE * drawn.area / spacing**2, MIN_POOL)
-            if wanted > MAX_POOL:
-                break
-        else:
-            wanted = max(min(PER_SAMPLE * count, MAX_POOL), CANDIDATES * count, MIN_POOL)
-        if len(drawn.pos) >= wanted or num == limit or (num >= 10 * MIN_POOL and not len(drawn.pos)):
+        found, wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
+        is_hopeless = num == limit or (count is None and wanted > MAX_POOL) or (not found and num >= 10 * MIN_POOL)
+        if found > 0.7 * wanted or is_hopeless:
             break
-        num = min(int(1.1 * wanted * num / len(drawn.pos)) + 1 if len(drawn.pos) > 100 else 10 * num, limit)
+        num = min(int(wanted * num / found) + 1 if found > 100 else 10 * num, limit)
     return drawn if drawn is not None and len(drawn.pos) else None
+
+
+def _wanted(area: float, count: int | None, spacing: float | None) -> float:
+    """Return how many points the pool of a region of some area [m²] should have."""
+    if count is None:
+        assert spacing is not None
+        return max(PER_SAMPLE * area / spacing**2, float(MIN_POOL))
+    return float(max(min(PER_SAMPLE * count, MAX_POOL), 2 * CANDIDATES * count, MIN_POOL))
 
 
 def _pieces(surface: Surface, region: Region) -> tuple[Int[np.ndarray, " piece"], Float[np.ndarray, "piece 3 3"]]:
@@ -281,18 +293,39 @@ def _outside(
     part = shell.part[face]
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
-    for solid in np.flatnonzero(shell.is_solid):
+    for solid in np.flatnonzero(shell.is_solid).tolist():
         is_out &= _winding(shell, solid, above) < 0.5
         if is_geom[shell.surface.face_geom[shell.part == solid]].any():
             later = np.flatnonzero(is_out & (part > solid))
             is_out[later] = _winding(shell, solid, below[later]) < 0.5
+    is_out[is_out] = _seen(shell, above[is_out], normal[is_out])
     return is_out
+
+
+def _seen(shell: Shell, above: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return which points just above faces are seen from far away."""
+    is_seen = np.zeros(len(above), dtype=bool)
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(DIRECTIONS)
+    # A Fibonacci lattice covers the sphere evenly; walking it in steps of 37 meets every side early.
+    height = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
+    ring = np.sqrt(1.0 - height**2)
+    lattice = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
+    for direction in lattice[37 * np.arange(DIRECTIONS) % DIRECTIONS]:
+        left = np.flatnonzero(~is_seen)
+        left = left[normal[left] @ direction < -0.05]
+        if not len(left):
+            continue
+        view = View.of(shell.surface, frame(direction))
+        uvt = above[left] @ view.axes.T
+        is_seen[left] = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2]
+    return is_seen
 
 
 def spread(pool: Pool, count: int | None, spacing: float | None, seed: int) -> Int[np.ndarray, " taxel"]:
     """Return the chosen points of a pool, ascending: exactly `count`, or as many as fit at `spacing` [m]."""
     order = np.random.default_rng([seed, 1]).permutation(len(pool.pos))
-    if spacing is not None:
+    if count is None:
+        assert spacing is not None
         return _thrown(pool.pos, order, spacing)
     candidates = np.sort(order[: CANDIDATES * count])
     return candidates[_eliminated(pool.pos[candidates], count, pool.area)]
@@ -300,7 +333,7 @@ def spread(pool: Pool, count: int | None, spacing: float | None, seed: int) -> I
 
 def _thrown(pos: Float[np.ndarray, "pool 3"], order: Int[np.ndarray, " pool"], spacing: float) -> Int[np.ndarray, " n"]:
     """Take points in some order, each unless it is within `spacing` of one taken before."""
-    tree = cKDTree(pos)
+    tree = KDTree(pos)
     is_free = np.ones(len(pos), dtype=bool)
     taken = []
     for point in order:
@@ -314,7 +347,7 @@ def _eliminated(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[n
     """Remove the most crowded point until `count` are left (Yuksel 2015, with its α = 8, β = 0.65, γ = 1.5)."""
     reach = 2.0 * np.sqrt(area / (2.0 * np.sqrt(3.0) * count))
     floor = reach * (1.0 - (count / len(pos)) ** 1.5) * 0.65
-    pairs = cKDTree(pos).query_pairs(reach, output_type="ndarray")
+    pairs = KDTree(pos).query_pairs(reach, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
     distance = np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1)
@@ -337,5 +370,5 @@ def _eliminated(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[n
 
 def shares(pool: Pool, chosen: Int[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
     """Return the area of the pool's points that are nearest to each chosen one [m²]."""
-    _, nearest = cKDTree(pool.pos[chosen]).query(pool.pos)
+    _, nearest = KDTree(pool.pos[chosen]).query(pool.pos)
     return pool.point_area * np.bincount(nearest, minlength=len(chosen))

@@ -18,10 +18,12 @@ from jaxtyping import Bool, Float, Int
 
 from tgdsl.geometry.surface import Surface
 
+NEAR_PARALLEL = 0.7
+"""An axis with a larger |cosine| to a direction is not used to orient what is perpendicular to that direction."""
 EDGE_ON = 1e-6
 """Faces with a smaller |cosine| between normal and rays are left out: their neighbours cover the same rays."""
 ROUNDING = 1e-9
-"""Widening of faces, relative to the surface's extent, so that no ray slips between two faces that share an edge."""
+"""Widening of faces, relative to the largest coordinate, so that no ray slips between two faces that share an edge."""
 RASTER = 256
 """Rays along the longer side of the raster that looks for the visible part of a region."""
 LENGTH_TOLERANCE = 1e-7
@@ -192,8 +194,27 @@ class View:
         # A face that looks against the rays turns clockwise in (u, v), because t points away from its viewer.
         corners = np.where(is_front[:, None, None], corners[:, ::-1], corners)
         normals = np.where(is_front[:, None], 1.0, -1.0) * surface.face_normals[face_id] + 0.0  # no −0
-        extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max()) if len(face_id) else 0.0
+        extent = float(np.abs(corners).max(initial=0.0))
         return View(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
+
+
+def reference_axes(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return the first of the z, y and x axes that is not near parallel to each unit vector."""
+    is_across = np.abs(directions[:, ::-1]) < NEAR_PARALLEL
+    return np.eye(3)[2 - np.argmax(is_across, axis=1)]
+
+
+def frame(direction: Float[np.ndarray, " 3"], columns: Float[np.ndarray, " 3"] | None = None) -> Float[np.ndarray, "3 3"]:
+    """Return unit vectors along columns, rows and rays, right-handed; rows run along direction × columns.
+
+    Args:
+        direction: Unit vector along the rays.
+        columns: A vector that is not parallel to it; default: its reference axis.
+    """
+    along = reference_axes(direction[None])[0] if columns is None else columns
+    across = np.cross(direction, along)
+    across /= np.linalg.norm(across)
+    return np.stack([np.cross(across, direction), across, direction]) + 0.0  # no −0
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,8 +289,9 @@ def _pairs(view: View, uv: Float[np.ndarray, "ray 2"]) -> Iterator[tuple[Int[np.
     of_ray = squares(uv) @ [side, 1]
     order = np.argsort(of_ray, kind="stable")
     starts = np.searchsorted(of_ray[order], np.arange(side * side + 1))
-    face_low = view.corners[:, :, :2].min(axis=1) - view.rounding
-    face_high = view.corners[:, :, :2].max(axis=1) + view.rounding
+    a, b, c = view.corners[:, 0, :2], view.corners[:, 1, :2], view.corners[:, 2, :2]
+    face_low = np.minimum(np.minimum(a, b), c) - view.rounding  # three times as fast as a reduction over so short an axis
+    face_high = np.maximum(np.maximum(a, b), c) + view.rounding
     near = np.flatnonzero(((face_low <= high) & (face_high >= low)).all(axis=1))
     first, last = squares(face_low[near]), squares(face_high[near])
     # Squares of one u are contiguous, so that each (face, u) pair is one slice of the sorted rays.

@@ -15,14 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tgdsl.compiler import meshlab
-from tgdsl.compiler.rays import Region, View, first_hits, seen_rectangle
+from tgdsl.compiler.rays import Region, View, first_hits, frame, reference_axes, seen_rectangle
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.fields import Selection
 from tgdsl.geometry.surface import Surface
 from tgdsl.schema.placement import Facing, Grid, InBox, InSphere, OnGeoms, Placement, Points, Poisson
 
-NEAR_PARALLEL = 0.7
-"""A link axis with a larger |cosine| to a direction is not used to orient what is perpendicular to that direction."""
 MIN_COSINE = 0.1
 """A grid cell on a steep face counts at most 1/0.1 times its projected area."""
 MAX_DENSITY = meshlab.MAX_POOL / meshlab.PER_SAMPLE
@@ -123,14 +121,13 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
 def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
     """Return the unit vectors along columns, rows and rays."""
     direction = _unit(np.array(placement.direction))
-    wanted = placement.columns_along
-    columns = _reference_axis(direction[None])[0] if wanted is None else _unit(np.array(wanted))
-    columns = columns - (columns @ direction) * direction
-    if np.linalg.norm(columns) < 1e-6:
-        what = f"`columns_along` {_shown(wanted)} is parallel to `direction` {_shown(placement.direction)}"
-        raise SampleError(what, "choose an axis across it")
-    columns = _unit(columns)
-    return np.stack([columns, np.cross(direction, columns), direction]) + 0.0  # no −0
+    if placement.columns_along is None:
+        return frame(direction)
+    columns = _unit(np.array(placement.columns_along))
+    if np.linalg.norm(np.cross(direction, columns)) < 1e-6:
+        what = f"`columns_along` {_shown(placement.columns_along)} is parallel to `direction`"
+        raise SampleError(f"{what} {_shown(placement.direction)}", "choose an axis across it")
+    return frame(direction, columns)
 
 
 def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]) -> Int[np.ndarray, " kept"]:
@@ -175,7 +172,7 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
     return Samples(
         pos=pool.pos[chosen],
         normal=normal,
-        tangent=_tangent(normal, _reference_axis(normal)),
+        tangent=_tangent(normal, reference_axes(normal)),
         radius=np.full(len(chosen), placement.radius),
         area=meshlab.shares(pool, chosen),
         cell=np.full((len(chosen), 2), -1),
@@ -204,7 +201,7 @@ def _points(placement: Points, folder: Path) -> Samples:
     return Samples(
         pos=pos.copy(),
         normal=normal,
-        tangent=_tangent(normal, _reference_axis(normal)),
+        tangent=_tangent(normal, reference_axes(normal)),
         radius=radius.copy(),
         area=np.where(np.isnan(area), np.pi * radius**2, area),
         cell=np.full((len(rows), 2), -1),
@@ -232,7 +229,8 @@ def _read_points(folder: Path, name: str, default_radius: float | None) -> Itera
         if None in row:
             raise SampleError(f"{place}: more values than the header has columns")
         values = {column: _number(place, column, text) for column, text in row.items() if (text or "").strip()}
-        if "radius" not in values and default_radius is None:
+        radius = values.get("radius", default_radius)
+        if radius is None:
             hint = "add a column `radius`, or give one `radius` for the whole file"
             raise SampleError(f"{place}: the point has no radius", hint)
         for column in _COLUMNS:
@@ -240,7 +238,7 @@ def _read_points(folder: Path, name: str, default_radius: float | None) -> Itera
                 raise SampleError(f"{place}: {column} is empty, expected a number")
         if not any(values[column] for column in _COLUMNS[3:]):
             raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
-        yield *(values[column] for column in _COLUMNS), values.get("radius", default_radius), values.get("area", np.nan)
+        yield *(values[column] for column in _COLUMNS), radius, values.get("area", np.nan)
 
 
 def _number(place: str, column: str, text: str) -> float:
@@ -300,12 +298,6 @@ def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     # The largest component first: the square of a tiny or huge one is not representable.
     scaled = vectors / np.abs(vectors).max(axis=-1, keepdims=True)
     return scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
-
-
-def _reference_axis(direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Return the first of the link's z, y and x axes that is not near parallel to each direction."""
-    is_across = np.abs(direction[:, ::-1]) < NEAR_PARALLEL
-    return np.eye(3)[2 - np.argmax(is_across, axis=1)]
 
 
 def _tangent(

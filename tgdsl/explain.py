@@ -1,0 +1,115 @@
+"""An account of a compiled module: what it computes, what it left out and why, and what that costs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from tgdsl.module import TactileModule
+from tgdsl.plan import PlannedSensor
+
+
+class _OperationCounter(TorchDispatchMode):
+    """Counts the elements that pointwise and matrix operations write: what an eager run computes."""
+
+    FREE = frozenset({"view", "select", "slice", "t", "transpose", "unsqueeze", "squeeze", "detach", "alias", "expand", "clone"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.__name__.split(".")[0].lstrip("_")
+        if isinstance(result, torch.Tensor) and name not in self.FREE and not name.startswith(("to_copy", "unbind")):
+            self.elements += result.numel()
+        return result
+
+
+def operations_per_env(touch: TactileModule) -> int:
+    """Return how many elementary operations one environment takes, counted in an eager run."""
+    counts = []
+    for num_envs in (2, 4):
+        state = touch.example_state(num_envs)
+        memory = {
+            f"{s.name}:{plane}": torch.zeros(num_envs, touch.plan.queries[s.query].num_taxels, dtype=touch.dtype)
+            for s in touch.plan.sensors
+            for plane in s.state
+        }
+        tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
+        with torch.no_grad(), _OperationCounter() as counter:
+            touch.core(tensors, memory)
+        counts.append(counter.elements)
+    return (counts[1] - counts[0]) // 2
+
+
+def explain(touch: TactileModule) -> str:
+    """Return the account as text."""
+    plan = touch.plan
+    lines = [f"{plan.origin.robot} at resolution {plan.origin.resolution}, {plan.layout().num_taxels} taxels", ""]
+    lines += _links(touch) + [""]
+    lines += ["sensors"]
+    lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
+    lines += ["", "queries (one geometry query serves all sensors with the same probes, objects and gate)"]
+    for i, query in enumerate(plan.queries):
+        felt = ", ".join(f"{plan.objects[o].name} ({', '.join(plan.objects[o].shapes)})" for o in query.objects)
+        users = ", ".join(sensor.name for sensor in plan.sensors if sensor.query == i)
+        gate = "where MuJoCo has the pair in contact" if query.is_gated else "wherever a probe reaches"
+        extra = " with " + " and ".join(query.needs) if query.needs else ""
+        lines.append(f"  {i}: {query.num_taxels} probes against {felt}: depth{extra}, {gate}; for {users}")
+    lines += [""] + _observations(touch) + _inputs(touch)
+    lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
+    lines += [""] if plan.dropped else []
+    return "\n".join(lines + _costs(touch))
+
+
+def _links(touch: TactileModule) -> list[str]:
+    plan = touch.plan
+    layout = plan.layout()
+    counts = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(layout.links)}
+    lines = ["taxels per link"] + [f"  {name:<34}{count:>6}" for name, count in counts.items()]
+    lines += ["taxels per group"]
+    return lines + [f"  {group:<34}{sum(counts[name] for name in names):>6}" for group, names in plan.groups.items()]
+
+
+def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
+    taxels = touch.plan.queries[sensor.query].num_taxels
+    channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(sensor.channels, sensor.units, strict=True))
+    memory = f"remembers {', '.join(sensor.state)}" if sensor.state else "no state"
+    return [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}", f"  reads {channels}"]
+
+
+def _observations(touch: TactileModule) -> list[str]:
+    groups: dict[str, list[str]] = {}
+    for term in touch.plan.observations:
+        groups.setdefault(term.group, []).append(f"{term.type} of {term.reading} ({term.num_features})")
+    if not groups:
+        return []
+    return ["observations"] + [f"  {group}: {', '.join(terms)}" for group, terms in groups.items()] + [""]
+
+
+def _inputs(touch: TactileModule) -> list[str]:
+    inputs = touch.inputs
+    lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
+    if inputs.pairs:
+        lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
+    return [*lines, ""]
+
+
+def _costs(touch: TactileModule) -> list[str]:
+    size = torch.finfo(touch.dtype).bits // 8
+    outputs = sum(taxels * channels for taxels, channels in {output.name: output.shape for output in touch.outputs}.values())
+    memory = sum(touch.plan.queries[s.query].num_taxels * len(s.state) for s in touch.plan.sensors)
+    state = touch.example_state(1)
+    read = sum(getattr(state, n).numel() * 8 for n in touch.inputs.fields if n != "dt")
+    constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())
+    return [
+        "cost per environment",
+        f"  reads        {read:>10} bytes (float64 state)",
+        f"  writes       {size * outputs:>10} bytes of readings",
+        f"  remembers    {size * memory:>10} bytes",
+        f"  computes     {operations_per_env(touch):>10} elementary operations",
+        f"constants      {constants:>12} bytes, once",
+    ]

@@ -1,0 +1,229 @@
+"""MuJoCo on CPU threads: many environments of the artefact's scene, stepped together.
+
+Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them, `slot` contacts per pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean, listed
+from tgdsl.module import SceneState, TactileModule
+from tgdsl.plan import contact_sensor_names
+from tgdsl.runtime.scene import scene_model
+from tgdsl.runtime.source import EnvIds
+
+Array = np.ndarray
+_SLOT_SIZE = 16
+_DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
+
+
+class BatchSimulation:
+    """Environments in MuJoCo's `Batch`, read by one module.
+
+    Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
+    start of the last substep, and so is the state. After `reset` they are those of the start.
+
+    Attributes:
+        model: The compiled scene, shared by all environments.
+        batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
+        substeps: Physics steps per control step.
+    """
+
+    def __init__(
+        self,
+        touch: TactileModule,
+        num_envs: int,
+        *,
+        substeps: int = 1,
+        threads: int = 0,
+        keyframe: str | None = None,
+        model: mujoco.MjModel | None = None,
+    ):
+        """Start all environments.
+
+        Args:
+            touch: The module that reads them.
+            num_envs: Number of environments.
+            substeps: Physics steps per control step.
+            threads: CPU threads; 0: one per CPU.
+            keyframe: Name of the keyframe to start from; default: the model's own initial state.
+            model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
+                artefact's scene.
+
+        Raises:
+            ArtifactError: If an asset of the scene is missing or has changed.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe.
+        """
+        self.model = scene_model(touch.plan.scene) if model is None else model
+        self.substeps = substeps
+        self._touch = touch
+        self._keyframe = -1 if keyframe is None else self._id("key", keyframe, "keyframe")
+        self._body_ids = np.array([self._id("body", name, "body") for name in touch.inputs.bodies], dtype=np.intp)
+        self._root_ids = self.model.body_rootid[self._body_ids]
+        self._slots = [self._sensor(i, 0) for i in range(len(touch.inputs.pairs))]
+        nets = range(len(touch.inputs.pairs)) if "contact_netforce" in touch.inputs.fields else []
+        self._nets = [self._sensor(i, 1) for i in nets]
+        self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
+        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
+        for name in _DERIVED:
+            self.batch.bind(name)  # an array is filled only by calls that come after its first use
+        self.reset()
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self.batch.nsim
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        return self.substeps * float(self.model.opt.timestep)
+
+    def step(self, control: Tensor | Array | None = None) -> None:
+        """Advance all environments by one control step.
+
+        Args:
+            control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were.
+
+        Raises:
+            SimulationError: If the controls are not finite or do not fit, or MuJoCo reports an environment as failed.
+        """
+        if control is not None:
+            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control, dtype=np.float64)
+            if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
+                raise SimulationError(
+                    f"control has shape {values.shape}, expected ({self.num_envs}, {self.model.nu}) or ({self.model.nu},)"
+                )
+            if not np.isfinite(values).all():
+                raise SimulationError(f"control is not finite in environments {_bad_rows(values)}")
+            self.batch.ctrl[...] = values
+        self._run(lambda: self.batch.step(nstep=self.substeps))
+
+    def state(self) -> SceneState:
+        """Return what the module wants, of one instant, in float64 on the module's device."""
+        values: dict[str, Any] = {}
+        for name, reader in self._readers.items():
+            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
+        if "dt" in self._touch.inputs.fields:
+            values["dt"] = self.control_step
+        return SceneState(**values)
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Start some environments anew (default: all), in the simulator and in the module."""
+        ids = None if env_ids is None else np.asarray(torch.as_tensor(env_ids).cpu())
+        if ids is not None and ids.dtype == bool:
+            ids = np.flatnonzero(ids)
+        if ids is None or len(ids):
+            self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
+            self._touch.reset(None if ids is None else torch.from_numpy(ids.astype(np.int64)))
+
+    def _run(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except mujoco.batch.SimulationError as error:
+            raise SimulationError(f"MuJoCo: {error}") from error
+
+    def _id(self, kind: str, name: str, what: str) -> int:
+        try:
+            return getattr(self.model, kind)(name).id
+        except KeyError as error:
+            count = {"key": self.model.nkey, "body": self.model.nbody}[kind]
+            known = [getattr(self.model, kind)(i).name for i in range(count)]
+            raise SimulationError(f'the scene has no {what} "{name}"; {did_you_mean(name, known, what + "s")}') from error
+
+    def _sensor(self, pair: int, which: int) -> slice:
+        """Return where a pair's contact sensor (0: slots, 1: net force) stands in `sensordata`."""
+        name = contact_sensor_names(self._touch.inputs.pairs[pair])[which]
+        try:
+            sensor = self.model.sensor(name)
+        except KeyError as error:
+            what = f'the scene has no contact sensor "{name}", which the module wants'
+            raise SimulationError(f"{what}; add them with tgdsl.instrument(spec, touch) before compiling") from error
+        return slice(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
+
+    def _body_pos(self) -> Float[Array, "env body 3"]:
+        return self.batch.xpos[:, self._body_ids]
+
+    def _body_quat(self) -> Float[Array, "env body 4"]:
+        return self.batch.xquat[:, self._body_ids]
+
+    def _body_angvel(self) -> Float[Array, "env body 3"]:
+        return self.batch.cvel[:, self._body_ids, :3]
+
+    def _body_linvel(self) -> Float[Array, "env body 3"]:
+        """Move MuJoCo's spatial velocity from the centre of mass of the kinematic tree to the body frame's origin."""
+        angular, linear = self._body_angvel(), self.batch.cvel[:, self._body_ids, 3:]
+        return linear + np.cross(angular, self._body_pos() - self.batch.subtree_com[:, self._root_ids])
+
+    def _contact_found(self) -> Float[Array, "env pair"]:
+        return self.batch.sensordata[:, [part.start for part in self._slots]]
+
+    def _slot_part(self, first: int) -> Float[Array, "env pair slot 3"]:
+        """Return three numbers of each slot: 1 force, 4 torque, 7 position, 10 normal, 13 tangent."""
+        slots = np.stack([self.batch.sensordata[:, part] for part in self._slots], axis=1)
+        return slots.reshape(*slots.shape[:2], -1, _SLOT_SIZE)[..., first : first + 3]
+
+    def _in_world(self, first: int) -> Float[Array, "env pair slot 3"]:
+        """Rotate a vector from the contact's frame (normal, tangent, their cross product) to the world."""
+        normal, tangent = self._slot_part(10), self._slot_part(13)
+        axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=-2)
+        return np.einsum("...i,...ij->...j", self._slot_part(first), axes)
+
+    def _contact_netforce(self) -> Float[Array, "env pair 3"]:
+        return np.stack([self.batch.sensordata[:, part.start + 1 : part.start + 4] for part in self._nets], axis=1)
+
+
+_READERS: dict[str, Callable[[BatchSimulation], Array]] = {
+    "body_pos": BatchSimulation._body_pos,
+    "body_quat": BatchSimulation._body_quat,
+    "body_linvel": BatchSimulation._body_linvel,
+    "body_angvel": BatchSimulation._body_angvel,
+    "contact_found": BatchSimulation._contact_found,
+    "contact_pos": lambda sim: sim._slot_part(7),
+    "contact_force": lambda sim: sim._in_world(1),
+    "contact_torque": lambda sim: sim._in_world(4),
+    "contact_normal": lambda sim: sim._slot_part(10),
+    "contact_netforce": BatchSimulation._contact_netforce,
+}
+
+
+def _bad_rows(values: Array) -> str:
+    rows = np.flatnonzero(~np.isfinite(np.atleast_2d(values)).all(axis=1))
+    return listed([str(row) for row in rows])
+
+
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: str = "cpu",
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+) -> BatchSimulation:
+    """Simulate the scene that a module was compiled for.
+
+    Args:
+        touch: The module.
+        num_envs: Number of environments.
+        device: Where physics runs; `cpu` is MuJoCo's Batch. The state is handed out on the module's device.
+        substeps: Physics steps per control step.
+        threads: CPU threads; 0: one per CPU.
+        keyframe: Name of the keyframe to start from.
+
+    Raises:
+        ArtifactError: If an asset of the scene is missing or has changed.
+        SimulationError: If the device is not supported, or the scene lacks what the module wants.
+    """
+    if device != "cpu":
+        raise SimulationError(f'physics on "{device}" is not supported by this version of tgdsl, expected "cpu"')
+    return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe)

@@ -1,0 +1,375 @@
+"""The conformance suite: what every sensor kind must do, for its own tests and for those of plug-in authors to inherit.
+
+    class TestMyKind(KindConformance):
+        kind = MY_KIND
+        parameters = {"stiffness": 100.0}
+
+gives a kind all the tests below for its float64 `reference`. Its author adds the closed-form cases.
+
+Shapes: `env` environments, `taxel` taxels, `channel` numbers per taxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from tgdsl.artifact import load_plan, save_plan
+from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.geometry.reference import ReferenceBody, ReferenceGeom, Touch, touch
+from tgdsl.module import SHAPES, SceneState, TactileModule
+from tgdsl.plan import Plan
+from tgdsl.schema.load import load
+from tgdsl.sensors.base import Kind, SensorSpec
+
+FLOAT32_TOLERANCE = 1e-5
+"""Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""
+FLOAT64_TOLERANCE = 1e-12
+"""The same for float64: room for the 1e-15 of its rounding, times the conditioning of a thin depth."""
+FAR_TOLERANCE = 1e-9
+"""The same at 1 km from the origin, where a float64 position is known to 1e-13 m."""
+TIE_SHIFT = 1e-7
+"""Shift of an object [m] that covers float32 rounding: on which side of a tie a reading falls is not defined closer."""
+
+SCENE = """
+<mujoco model="conformance">
+  <worldbody>
+    <body name="palm"><freejoint/><geom name="palm" type="box" size=".03 .02 .01"/></body>
+    <body name="tip"><freejoint/><geom name="tip" type="sphere" size=".012"/></body>
+    <body name="item"><freejoint/>
+      <geom type="box" size=".02 .015 .025"/>
+      <geom type="sphere" size=".015" pos=".02 .01 .03"/>
+      <geom type="capsule" size=".008 .02" pos="-.02 0 -.02" euler="40 10 0"/>
+    </body>
+    <body name="tool"><freejoint/>
+      <geom type="cylinder" size=".012 .03"/>
+      <geom type="ellipsoid" size=".02 .012 .016" pos="0 0 .035" euler="0 25 70"/>
+    </body>
+    <body name="floor" pos="0 0 -.02"><geom type="plane" size="1 1 .1"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""Two links, and objects of every primitive: on and off the body's frame, alone and compound."""
+
+
+def conformance_points(num: int, seed: int) -> list[dict[str, Any]]:
+    """Return probes all over a link-sized ball, some of them inactive."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(num, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return [
+        {"pos": (0.02 * d * rng.uniform(0.2, 1)).tolist(), "normal": d.tolist(), "radius": 0.0 if i % 7 == 3 else 0.004}
+        for i, d in enumerate(directions)
+    ]
+
+
+def conformance_document(scene: Path, sensor: Mapping[str, Any], palm: list[Any], tip: list[Any]) -> dict[str, Any]:
+    """Return a document with one sensor, `s`, on both links of the conformance scene."""
+    layout = {"palm": {"method": "points", "points": palm}, "tip": {"method": "points", "points": tip}}
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(scene), "layout": {"resolutions": {"test": layout}}},
+        "objects": {name: {"body": name} for name in ("item", "tool", "floor")},
+        "sensors": {"s": {"links": ["palm", "tip"], "feels": ["item", "tool", "floor"], **sensor}},
+    }
+
+
+class ReferenceModule:
+    """A plan's first sensor, computed by the kind's float64 reference, environment by environment."""
+
+    def __init__(self, plan: Plan, kind: Kind, spec: SensorSpec):
+        self.plan = plan
+        self.kind = kind
+        self.spec = spec
+        self.sensor = plan.sensors[0]
+        self.layout = plan.layout_of(self.sensor)
+        self.memory: dict[int, dict[str, np.ndarray]] = {}
+
+    def __call__(self, state: SceneState, shift: np.ndarray | None = None, remember: bool = True) -> np.ndarray:
+        """Return readings (env, taxel, channel); with a shift [m], of a scene whose objects are moved by it."""
+        assert state.body_pos is not None
+        readings = []
+        for env in range(state.body_pos.shape[0]):
+            rest = {name: np.full(self.layout.num_taxels, value) for name, value in self.sensor.state.items()}
+            felt = self._touch(state, env, np.zeros(3) if shift is None else shift)
+            reading, memory = self.kind.reference(self.spec, self.layout, felt, self.memory.get(env, rest))
+            readings.append(reading)
+            if remember:
+                self.memory[env] = memory
+        return np.stack(readings)
+
+    def _touch(self, state: SceneState, env: int, shift: np.ndarray) -> Touch:
+        inputs, query = self.plan.inputs, self.plan.queries[self.sensor.query]
+        gated = {(pair.link, pair.object): i for i, pair in enumerate(inputs.pairs)}
+        parts = []
+        for i, link in enumerate(self.layout.links):
+            own = self.layout.link_id == i
+            objects = []
+            for target in (self.plan.objects[o] for o in query.objects):
+                pair = gated.get((link.body, target.name))
+                is_found = pair is not None and state.contact_found is not None and state.contact_found[env, pair] > 0
+                if target.body != link.body and (is_found or not query.is_gated):
+                    objects.append((self._body(state, env, target.body, shift), self._geoms(target.name, target.shapes)))
+            body = self._body(state, env, link.body, np.zeros(3))
+            parts.append(touch(body, self.layout.pos[own], self.layout.radius[own], objects))
+        return Touch(*(np.concatenate([getattr(part, name) for part in parts]) for name in Touch.__dataclass_fields__))
+
+    def _body(self, state: SceneState, env: int, name: str, shift: np.ndarray) -> ReferenceBody:
+        i = self.plan.inputs.bodies.index(name)
+        fields = ("body_pos", "body_quat", "body_linvel", "body_angvel")
+        pos, quat, linvel, angvel = (
+            np.zeros(3) if getattr(state, field) is None else getattr(state, field)[env, i].double().numpy() for field in fields
+        )
+        return ReferenceBody(pos + shift, quat, linvel, angvel)
+
+    def _geoms(self, name: str, shapes: tuple[str, ...]) -> list[ReferenceGeom]:
+        size, pos, rotation = (self.plan.arrays[f"objects/{name}/{part}"] for part in ("size", "pos", "rotation"))
+        return [ReferenceGeom(shape, size[g], pos[g], rotation[g].reshape(3, 3)) for g, shape in enumerate(shapes)]
+
+
+def full_scale_error(found: Tensor, expected: np.ndarray) -> np.ndarray:
+    """Return |found − expected| over the largest magnitude of each channel in the batch (env, taxel, channel)."""
+    scale = np.abs(expected).max(axis=(0, 1), keepdims=True)
+    error = np.abs(found.detach().double().numpy() - expected)
+    return error / np.where(scale > 0, scale, 1.0)
+
+
+def assert_agrees(found: Tensor, reference: ReferenceModule, state: SceneState, tolerance: float) -> None:
+    """Assert that readings equal the reference's, at ties that of one side; the reference then remembers this state."""
+    shifts = [np.zeros(3)] + [sign * TIE_SHIFT * axis for axis in np.eye(3) for sign in (1, -1)]
+    worst = np.full(tuple(found.shape[:2]), np.inf)
+    for shift in shifts:
+        expected = reference(state, shift, remember=False)
+        worst = np.minimum(worst, full_scale_error(found, expected).max(axis=2))
+        if worst.max() <= tolerance:
+            break
+    reference(state)
+    env, taxel = np.unravel_index(int(worst.argmax()), worst.shape)
+    assert worst.max() <= tolerance, f"error {worst.max():.2e} of full scale in environment {env}, taxel {taxel}"
+
+
+def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
+    """Return the whole scene, rotated about the origin and then shifted [m]; float64."""
+    rotation = torch.from_numpy(turn.as_matrix())
+    values = {name: getattr(state, name) for name in (*SHAPES, "dt")}
+    for name in ("body_pos", "body_linvel", "body_angvel"):
+        if values[name] is not None:
+            values[name] = values[name].double() @ rotation.T
+    values["body_pos"] = values["body_pos"] + torch.from_numpy(offset)
+    quats = Rotation.from_quat(values["body_quat"].reshape(-1, 4).numpy(), scalar_first=True)
+    turned = torch.from_numpy((turn * quats).as_quat(scalar_first=True))
+    values["body_quat"] = turned.reshape(values["body_quat"].shape)
+    return SceneState(**values)
+
+
+def only(state: SceneState, envs: Any) -> SceneState:
+    """Return some of the environments of a state."""
+    values = {name: getattr(state, name) for name in (*SHAPES, "dt")}
+    return SceneState(**{name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()})
+
+
+class KindConformance:
+    """Inherit this in a test class and set `kind`, and `parameters` if its defaults are not what should be tested."""
+
+    kind: ClassVar[Kind]
+    """The kind under test."""
+    parameters: ClassVar[Mapping[str, Any]] = {}
+    """Fields of the sensor, beside `kind`, `links` and `feels`."""
+    num_envs: ClassVar[int] = 12
+    num_steps: ClassVar[int] = 3
+    float32_tolerance: ClassVar[float] = FLOAT32_TOLERANCE
+    is_differentiable: ClassVar[bool] = True
+    """Whether readings follow poses smoothly, away from ties."""
+
+    @pytest.fixture
+    def scene(self, tmp_path: Path) -> Path:
+        """The conformance scene, as a file."""
+        path = tmp_path / "scene.xml"
+        path.write_text(SCENE)
+        return path
+
+    def document(self, scene: Path, **changes: Any) -> dict[str, Any]:
+        """Return the document under test."""
+        palm, tip = conformance_points(18, 1), conformance_points(9, 2)
+        return conformance_document(scene, {"kind": self.kind.name, **self.parameters, **changes}, palm, tip)
+
+    def build(self, document: dict[str, Any], dtype: torch.dtype) -> tuple[TactileModule, ReferenceModule]:
+        """Return a document's module, and its reference."""
+        plan = compile_plan(document, kinds=self._extra())
+        spec = load(document, kinds=self._known()).spec.sensors["s"]
+        return TactileModule(plan, self._known(), dtype), ReferenceModule(plan, self.kind, spec)
+
+    def states(self, module: TactileModule, num_envs: int | None = None) -> Iterator[SceneState]:
+        """Yield the states that tests run through: different poses, one after the other."""
+        for step in range(self.num_steps):
+            yield module.example_state(num_envs or self.num_envs, seed=step)
+
+    def _known(self) -> tuple[Kind, ...]:
+        from tgdsl.sensors import KINDS
+
+        return KINDS if self.kind in KINDS else (*KINDS, self.kind)
+
+    def _extra(self) -> tuple[Kind, ...]:
+        from tgdsl.sensors import KINDS
+
+        return () if self.kind in KINDS else (self.kind,)
+
+    def test_something_is_felt(self, scene: Path) -> None:
+        """The states of this suite are no empty test: some taxels read, some do not."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        share = torch.stack([(module(state)["s"] != 0).any(dim=2).double().mean() for state in self.states(module)])
+        assert 0.05 < share.mean() < 0.95
+
+    @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
+    def test_float64_equals_reference(self, scene: Path, gate: str) -> None:
+        """Readings are the reference's to rounding."""
+        module, reference = self.build(self.document(scene, gate=gate), torch.float64)
+        for state in self.states(module):
+            assert_agrees(module(state)["s"], reference, state, FLOAT64_TOLERANCE)
+
+    @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
+    def test_float32_equals_reference(self, scene: Path, gate: str) -> None:
+        """A float32 module that is given float64 poses loses no more than float32 must."""
+        module, reference = self.build(self.document(scene, gate=gate), torch.float32)
+        for state in self.states(module):
+            readings = module(state)["s"]
+            assert readings.dtype == torch.float32
+            assert_agrees(readings, reference, state, self.float32_tolerance)
+
+    @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, FAR_TOLERANCE), (torch.float32, None)])
+    @pytest.mark.parametrize("distance", [0.0, 1000.0])
+    def test_rigid_motion_changes_nothing(
+        self, scene: Path, dtype: torch.dtype, tolerance: float | None, distance: float
+    ) -> None:
+        """The same scene elsewhere and turned reads the same, also 1 km from the origin."""
+        module, reference = self.build(self.document(scene), dtype)
+        turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
+        for state in self.states(module):
+            readings = module(moved(state, distance * np.array([0.6, -0.8, 0.1]), turn))["s"]
+            assert_agrees(readings, reference, state, tolerance or self.float32_tolerance)
+
+    def test_batch_equals_singles(self, scene: Path) -> None:
+        """An environment does not see the others."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        singles = [self.build(self.document(scene), torch.float64)[0] for _ in range(3)]
+        for state in self.states(module, num_envs=3):
+            together = module(state)["s"]
+            alone = torch.cat([single(only(state, slice(i, i + 1)))["s"] for i, single in enumerate(singles)])
+            torch.testing.assert_close(together, alone, rtol=1e-13, atol=1e-13)
+
+    def test_taxel_permutation_commutes(self, scene: Path) -> None:
+        """The order of taxels is the layout's and has no other effect."""
+        palm, tip = conformance_points(18, 1), conformance_points(9, 2)
+        order = np.random.default_rng(3).permutation(18)
+        sensor = {"kind": self.kind.name, **self.parameters}
+        first, _ = self.build(conformance_document(scene, sensor, palm, tip), torch.float64)
+        second, _ = self.build(conformance_document(scene, sensor, [palm[i] for i in order], tip), torch.float64)
+        for state in self.states(first):
+            expected = first(state)["s"]
+            found = second(state)["s"]
+            torch.testing.assert_close(found[:, :18], expected[:, :18][:, order], rtol=1e-13, atol=1e-13)
+            torch.testing.assert_close(found[:, 18:], expected[:, 18:], rtol=1e-13, atol=1e-13)
+
+    def test_no_contact_gives_the_rest_value(self, scene: Path) -> None:
+        """Without contact pairs nothing is felt, and far away neither; inactive taxels never feel."""
+        for gate in ("contact_pair", "geometric"):
+            module, _ = self.build(self.document(scene, gate=gate), torch.float32)
+            state = module.example_state(4)
+            inactive = torch.from_numpy(module.taxels["s"]["radius"] == 0)
+            assert inactive.any()
+            assert not module(state)["s"][:, inactive].any()
+            if gate == "contact_pair":
+                assert state.contact_found is not None
+                state.contact_found = torch.zeros_like(state.contact_found)
+            else:
+                assert state.body_pos is not None and state.body_quat is not None
+                state.body_quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(state.body_quat)
+                state.body_pos = torch.zeros_like(state.body_pos)
+                state.body_pos[:, [module.inputs.bodies.index(link) for link in ("palm", "tip")], 2] = 5.0
+            module.reset()
+            assert not module(state)["s"].any()
+
+    def test_a_broken_pose_is_seen(self, scene: Path) -> None:
+        """Not-a-number in a pose comes out as not-a-number, not as no contact."""
+        module, _ = self.build(self.document(scene, gate="geometric"), torch.float32)
+        state = module.example_state(2)
+        assert state.body_pos is not None
+        state.body_pos[1, module.inputs.bodies.index("item")] = torch.nan
+        readings = module(state)["s"]
+        assert not readings[0].isnan().any()
+        assert readings[1].isnan().any(dim=1).any()
+
+    def test_gradients_equal_finite_differences(self, scene: Path) -> None:
+        """Derivatives with respect to poses are those of the readings; where readings jump they are finite."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        state = module.example_state(2)
+        names = [name for name in module.inputs.fields if name.startswith("body_")]
+        tensors = [getattr(state, name).clone().requires_grad_() for name in names]
+
+        def readings(*values: Tensor) -> Tensor:
+            module.reset()
+            result = module(SceneState(**{**dict(zip(names, values, strict=True)), "contact_found": state.contact_found}))
+            return result["s"]
+
+        if self.is_differentiable:
+            assert torch.autograd.gradcheck(readings, tensors, eps=1e-7, atol=1e-4, rtol=1e-4)
+        total = readings(*tensors).sum()
+        if total.requires_grad:
+            for gradient in torch.autograd.grad(total, tensors, allow_unused=True):
+                assert gradient is None or torch.isfinite(gradient).all()
+
+    def test_reset_of_one_environment(self, scene: Path) -> None:
+        """Reset starts one environment anew, by index and by mask, and leaves the others untouched."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        other, _ = self.build(self.document(scene), torch.float64)
+        first, second, *_ = self.states(module, num_envs=4)
+        untouched = [module(first), module(second)][1]["s"]
+        for chosen in (torch.tensor([2]), torch.tensor([False, False, True, False])):
+            module.reset()
+            module(first)
+            module.reset(chosen)
+            readings = module(second)["s"]
+            torch.testing.assert_close(readings[[0, 1, 3]], untouched[[0, 1, 3]], rtol=0, atol=0)
+            other.reset()
+            torch.testing.assert_close(readings[2], other(second)["s"][2], rtol=0, atol=0)
+
+    def test_plan_survives_a_file(self, scene: Path, tmp_path: Path) -> None:
+        """Plan to file to plan is the identity, and the same plan is the same bytes."""
+        module, _ = self.build(self.document(scene), torch.float32)
+        save_plan(module.plan, tmp_path / "a.safetensors")
+        again = load_plan(tmp_path / "a.safetensors")
+        save_plan(again, tmp_path / "b.safetensors")
+        assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+        assert again.to_json() == module.plan.to_json()
+        assert all(np.array_equal(again.arrays[name], value) for name, value in module.plan.arrays.items())
+        state = module.example_state(3)
+        torch.testing.assert_close(TactileModule(again, self._known())(state)["s"], module(state)["s"], rtol=0, atol=0)
+
+    def test_state_dict_goes_on_where_it_stopped(self, scene: Path) -> None:
+        """A module that loads another's state dict reads what the other would have read."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        first, second, *_ = self.states(module)
+        module(first)
+        resumed, _ = self.build(self.document(scene), torch.float64)
+        resumed.load_state_dict(module.state_dict())
+        torch.testing.assert_close(resumed(second)["s"], module(second)["s"], rtol=0, atol=0)
+
+    @pytest.mark.slow
+    def test_compiled_equals_eager(self, scene: Path) -> None:
+        """One graph, compiled, gives the eager readings for every batch size, with state."""
+        eager, reference = self.build(self.document(scene), torch.float32)
+        torch.compiler.reset()
+        compiled = TactileModule(eager.plan, self._known()).compile()
+        for state in self.states(eager):
+            assert_agrees(compiled(state)["s"], reference, state, self.float32_tolerance)
+        other_size = eager.example_state(5, seed=9)
+        resized, fresh = TactileModule(eager.plan, self._known()), ReferenceModule(eager.plan, self.kind, reference.spec)
+        resized.compile()
+        assert_agrees(resized(other_size)["s"], fresh, other_size, self.float32_tolerance)
