@@ -65,6 +65,20 @@ class SpecError(TgdslError):
         super().__init__("\n".join(map(str, self.problems)))
 
 
+class SampleError(TgdslError):
+    """A placement that a surface cannot satisfy.
+
+    Attributes:
+        what: What was found and what was expected.
+        hint: What would be right, or empty.
+    """
+
+    def __init__(self, what: str, hint: str = ""):
+        self.what = what
+        self.hint = hint
+        super().__init__(f"{what}; {hint}" if hint else what)
+
+
 def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
     """Return a hint that names the nearest known name, or else lists what exists."""
     known = sorted(set(names))

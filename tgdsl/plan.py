@@ -122,10 +122,12 @@ class SceneFile:
 
     Attributes:
         mjcf: The scene as MJCF, with the contact sensors that the module wants.
-        assets: The files that it names.
+        parts: The MJCF files that it includes or attaches, by the names it has for them.
+        assets: The meshes, textures and other files that they name.
     """
 
     mjcf: str
+    parts: Mapping[str, str]
     assets: tuple[Asset, ...]
 
 

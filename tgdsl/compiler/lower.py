@@ -58,7 +58,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         observations=terms,
         dropped=tuple(work.dropped),
         arrays={name: _frozen(arrays[name]) for name in sorted(arrays)},
-        scene=SceneFile("", ()),
+        scene=SceneFile("", {}, ()),
     )
 
 

@@ -17,9 +17,10 @@ from tgdsl.artifact import load_plan
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.robot import xml_files
-from tgdsl.compiler.scene import portable, scene_file
+from tgdsl.compiler.scene import scene_file
 from tgdsl.module import TactileModule
 from tgdsl.plan import Origin, Plan
+from tgdsl.scene import portable
 from tgdsl.schema.load import Loaded, load
 from tgdsl.sensors import KINDS, Kind
 
@@ -101,7 +102,7 @@ def _origin(loaded: Loaded) -> Origin:
     text = json.dumps(parts, sort_keys=True, default=str)
     return Origin(
         document_sha256=hashlib.sha256(text.encode()).hexdigest(),
-        robot=portable(robot.resolve()),
+        robot=portable(robot),
         robot_sha256=digest.hexdigest(),
         resolution=str(loaded.resolution),
         versions={"tgdsl": version("tgdsl"), "mujoco": mujoco.__version__},

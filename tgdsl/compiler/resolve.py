@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tgdsl.compiler.robot import Geom, Model, load_model
-from tgdsl.compiler.sample import SampleError, Samples, sample
-from tgdsl.errors import Problem, did_you_mean, listed
+from tgdsl.compiler.sample import Samples, sample
+from tgdsl.errors import Problem, SampleError, did_you_mean, listed
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.layout import Layout, Link
 from tgdsl.schema.files import robot_names

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.compiler.urdf import as_mujoco_text
 from tgdsl.errors import RobotError
 from tgdsl.geometry.surface import Surface
+from tgdsl.scene import muted_mujoco
 
 SHAPE_NAMES: dict[int, str] = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -78,11 +77,13 @@ class Model:
         file: The file it came from.
         spec: MuJoCo's editable model.
         compiled: MuJoCo's compiled model.
+        is_urdf: Whether it is URDF rather than MJCF.
     """
 
     file: Path
     spec: mujoco.MjSpec
     compiled: mujoco.MjModel
+    is_urdf: bool
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -192,30 +193,11 @@ def load_model(path: Path) -> Model:
     """
     try:
         with muted_mujoco():
-            if _is_urdf(path):
-                spec = mujoco.MjSpec.from_string(as_mujoco_text(path))
-            else:
-                spec = mujoco.MjSpec.from_file(str(path))
-            return Model(path, spec, spec.compile())
+            is_urdf = _is_urdf(path)
+            spec = mujoco.MjSpec.from_string(as_mujoco_text(path)) if is_urdf else mujoco.MjSpec.from_file(str(path))
+            return Model(path, spec, spec.compile(), is_urdf)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
-
-
-@contextmanager
-def muted_mujoco() -> Iterator[None]:
-    """Turn what MuJoCo would print and log into Python warnings.
-
-    One is left out: a robot attached under its own names, with no prefix, is just what a scene of ours wants, and whether it
-    is saved correctly is checked when it is saved.
-    """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: warnings.warn(f"MuJoCo: {message}", stacklevel=2))
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*Attaching a spec with an empty prefix")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _is_urdf(path: Path) -> bool:

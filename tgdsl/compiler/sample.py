@@ -1,12 +1,10 @@
 """Taxels on a link's surface: grids, even samples and points given by hand, each with normal, tangent and area.
 
-Shapes: `taxel` samples, `f` faces, `cell` cells of a grid, `point` rows of a list. Everything is in the body frame.
+Shapes: `taxel` samples, `f` faces, `cell` cells of a grid. Everything is in the body frame.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,33 +12,19 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tgdsl.compiler import meshlab
-from tgdsl.compiler.rays import Region, View, first_hits, frame, reference_axes, seen_rectangle
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.compiler import meshlab, spread
+from tgdsl.compiler.points import point_table
+from tgdsl.compiler.rays import View, first_hits, frame, reference_axes, seen_rectangle
+from tgdsl.compiler.region import Region
+from tgdsl.errors import SampleError, did_you_mean
 from tgdsl.fields import Selection
 from tgdsl.geometry.surface import Surface
 from tgdsl.schema.placement import Facing, Grid, InBox, InSphere, OnGeoms, Placement, Points, Poisson
 
 MIN_COSINE = 0.1
 """A grid cell on a steep face counts at most 1/0.1 times its projected area."""
-MAX_DENSITY = meshlab.MAX_POOL / meshlab.PER_SAMPLE
+MAX_DENSITY = spread.MAX_POOL / spread.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
-_COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
-_OPTIONAL = ("radius", "area")
-
-
-class SampleError(TgdslError):
-    """A placement that a surface cannot satisfy.
-
-    Attributes:
-        what: What was found and what was expected.
-        hint: What would be right, or empty.
-    """
-
-    def __init__(self, what: str, hint: str = ""):
-        self.what = what
-        self.hint = hint
-        super().__init__(f"{what}; {hint}" if hint else what)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +114,9 @@ def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
     return frame(direction, columns)
 
 
-def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]) -> Int[np.ndarray, " kept"]:
+def _central(
+    placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]
+) -> Int[np.ndarray, " kept"]:
     """Return which of the cells that hit are kept, ascending: all, or the `count` nearest the rectangle's centre."""
     total = placement.rows * placement.columns
     if not len(cell):
@@ -157,7 +143,7 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
     except ImportError as error:
         raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
     region = _region(surface, placement)
-    pool = meshlab.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    pool = spread.pool(shell, region, placement.seed, placement.count, placement.spacing)
     if pool is None:
         raise SampleError("no part of the link's outer surface is in the region", "widen `region`")
     if placement.count is not None and len(pool.pos) < placement.count:
@@ -167,35 +153,21 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
         least = np.sqrt(pool.area / MAX_DENSITY)
         what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
         raise SampleError(what, f"expected at least {least:.2g} m")
-    chosen = meshlab.spread(pool, placement.count, placement.spacing, placement.seed)
+    chosen = spread.spread(pool, placement.count, placement.spacing, placement.seed)
     normal = pool.normal[chosen]
     return Samples(
         pos=pool.pos[chosen],
         normal=normal,
         tangent=_tangent(normal, reference_axes(normal)),
         radius=np.full(len(chosen), placement.radius),
-        area=meshlab.shares(pool, chosen),
+        area=spread.shares(pool, chosen),
         cell=np.full((len(chosen), 2), -1),
     )
 
 
 def _points(placement: Points, folder: Path) -> Samples:
     """Take points as they are: nothing is projected."""
-    if isinstance(placement.points, str):
-        rows = list(_read_points(folder, placement.points, placement.radius))
-        if not rows:
-            raise SampleError(f"{placement.points} has no points")
-    else:
-        rows = [
-            (
-                *point.pos,
-                *point.normal,
-                placement.radius if point.radius is None else point.radius,  # the schema sees to it that one is there
-                np.nan if point.area is None else point.area,
-            )
-            for point in placement.points
-        ]
-    table = np.array(rows, dtype=np.float64)
+    table = point_table(placement, folder)
     pos, radius, area = table[:, :3], table[:, 6], table[:, 7]
     normal = _unit(table[:, 3:6])
     return Samples(
@@ -204,54 +176,8 @@ def _points(placement: Points, folder: Path) -> Samples:
         tangent=_tangent(normal, reference_axes(normal)),
         radius=radius.copy(),
         area=np.where(np.isnan(area), np.pi * radius**2, area),
-        cell=np.full((len(rows), 2), -1),
+        cell=np.full((len(table), 2), -1),
     )
-
-
-def _read_points(folder: Path, name: str, default_radius: float | None) -> Iterator[tuple[float, ...]]:
-    """Yield x, y, z, nx, ny, nz, radius and area of each row of a CSV file; an area that is not given is NaN."""
-    try:
-        text = (folder / name).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise SampleError(f"cannot read the points of {name}: {reason}") from error
-    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
-    header = [column.strip() for column in reader.fieldnames or ()]
-    reader.fieldnames = header
-    for column in header:
-        if column not in _COLUMNS + _OPTIONAL:
-            raise SampleError(f'{name}:1: unknown column "{column}"', did_you_mean(column, _COLUMNS + _OPTIONAL))
-    missing = [column for column in _COLUMNS if column not in header]
-    if missing:
-        raise SampleError(f"{name}:1: no column {', '.join(missing)}", f"expected the header {','.join(_COLUMNS)}")
-    for row in reader:
-        place = f"{name}:{reader.line_num}"
-        if None in row:
-            raise SampleError(f"{place}: more values than the header has columns")
-        values = {column: _number(place, column, text) for column, text in row.items() if (text or "").strip()}
-        radius = values.get("radius", default_radius)
-        if radius is None:
-            hint = "add a column `radius`, or give one `radius` for the whole file"
-            raise SampleError(f"{place}: the point has no radius", hint)
-        for column in _COLUMNS:
-            if column not in values:
-                raise SampleError(f"{place}: {column} is empty, expected a number")
-        if not any(values[column] for column in _COLUMNS[3:]):
-            raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
-        yield *(values[column] for column in _COLUMNS), radius, values.get("area", np.nan)
-
-
-def _number(place: str, column: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise SampleError(f'{place}: {column} is "{text.strip()}", expected a number')
-    if (column == "radius" and value < 0) or (column == "area" and value <= 0):
-        bound = "at least 0" if column == "radius" else "more than 0"
-        raise SampleError(f"{place}: {column} {value:g} is out of range, expected {bound}")
-    return value
 
 
 def _region(surface: Surface, placement: Grid | Poisson) -> Region:
@@ -265,7 +191,9 @@ def _region(surface: Surface, placement: Grid | Poisson) -> Region:
         is_geom=is_geom,
         facings=tuple((_unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
         boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
-        spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
+        spheres=tuple(
+            (np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)
+        ),
     )
 
 

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import hashlib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from tgdsl.compiler.robot import Model, muted_mujoco, xml_files
+from tgdsl.compiler.robot import Model
 from tgdsl.errors import RobotError
 from tgdsl.plan import Asset, Inputs, SceneFile, contact_sensor_names
-from tgdsl.schema.files import robots_folder
+from tgdsl.scene import compiled, portable
 
-_SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
-_FOUND = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
-_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE)
-_SLOT_DATA = _FOUND + _FORCE
-for _part in ("TORQUE", "POS", "NORMAL", "TANGENT"):
-    _SLOT_DATA += 1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{_part}"))
-_REDUCE_NONE, _REDUCE_NETFORCE = 0, 3
-
-ASSET_KINDS = ("meshes", "textures", "hfields", "skins")
+SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
+"""Fields of the state that are read contact by contact."""
+SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
+"""What a contact sensor hands out of each contact, in MuJoCo's order."""
+REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
+"""MuJoCo's ways to reduce contacts, in the order of its numbers."""
+COMPARED = (
+    "body_pos body_quat body_mass body_inertia body_ipos geom_pos geom_quat geom_size geom_friction geom_solref geom_contype "
+    "geom_conaffinity mesh_vert jnt_axis jnt_range jnt_pos dof_damping dof_armature actuator_gainprm actuator_biasprm "
+    "actuator_forcerange actuator_ctrlrange key_qpos key_ctrl exclude_signature eq_data tendon_range"
+).split()
+"""Arrays of the compiled model that a kept scene must reproduce."""
+ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
+"""Elements of an MJCF file's `<asset>` that name a file."""
 
 
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
@@ -42,93 +49,132 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
     """
     bodies = {body.name for body in spec.bodies}
     present = {sensor.name for sensor in spec.sensors}
-    wants_slots = any(name in inputs.fields for name in _SLOT_FIELDS)
-    for pair in inputs.pairs:
-        target = inputs.bodies_of[pair.object]
-        for body in (pair.link, target):
+    for name, target, link, data, reduce, num in _contact_sensors(inputs):
+        for body in (link, target):
             if body not in bodies:
                 raise RobotError(f'this model has no body "{body}", which the module wants contacts of')
-        point, net = contact_sensor_names(pair)
-        wanted = [(point, _SLOT_DATA if wants_slots else _FOUND, _REDUCE_NONE, max(inputs.slots, 1))]
-        if "contact_netforce" in inputs.fields:
-            wanted.append((net, _FOUND + _FORCE, _REDUCE_NETFORCE, 1))
-        for name, data, reduce, num in wanted:
-            if name not in present:
-                spec.add_sensor(
-                    name=name,
-                    type=mujoco.mjtSensor.mjSENS_CONTACT,
-                    objtype=mujoco.mjtObj.mjOBJ_BODY,
-                    objname=target,
-                    reftype=mujoco.mjtObj.mjOBJ_BODY,
-                    refname=pair.link,
-                    intprm=[data, reduce, num],
-                )
+        if name not in present:
+            fields = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part.upper()}")) for part in data)
+            spec.add_sensor(
+                name=name,
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                objname=target,
+                reftype=mujoco.mjtObj.mjOBJ_BODY,
+                refname=link,
+                intprm=[fields, REDUCTIONS.index(reduce), num],
+            )
     return spec
 
 
-def scene_file(model: Model, inputs: Inputs) -> SceneFile:
-    """Return a model with the contact sensors that a module wants, as text.
+def _contact_sensors(inputs: Inputs) -> Iterator[tuple[str, str, str, tuple[str, ...], str, int]]:
+    """Yield name, object's body, link, data fields, reduction and number of contacts of each sensor that is wanted."""
+    data = SLOT_DATA if any(name in inputs.fields for name in SLOT_FIELDS) else ("found",)
+    for pair in inputs.pairs:
+        point, net = contact_sensor_names(pair)
+        yield point, inputs.bodies_of[pair.object], pair.link, data, "none", max(inputs.slots, 1)
+        if "contact_netforce" in inputs.fields:
+            yield net, inputs.bodies_of[pair.object], pair.link, ("found", "force"), "netforce", 1
 
-    Its assets are named by content, so the text does not depend on where they lie; it is read back and compared, so that
-    nothing MuJoCo fails to save goes unnoticed.
+
+def scene_file(model: Model, inputs: Inputs) -> SceneFile:
+    """Return a scene with the contact sensors that a module wants, as text.
+
+    The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
+    the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
 
     Raises:
-        RobotError: If an asset cannot be found, or the saved scene is not the one that was loaded.
+        RobotError: If a file cannot be found, or what is kept is not what was loaded.
     """
-    with muted_mujoco():
-        spec = instrument(model.spec, inputs)
+    kept = _Kept()
+    if model.is_urdf:
+        main = kept.rewritten(ET.fromstring(model.spec.to_xml()), model.file, [model.file.parent])
+    else:
+        main = kept.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
+    sensors = ET.SubElement(main, "sensor")
+    for name, body1, body2, data, reduce, num in _contact_sensors(inputs):
+        attributes = {"name": name, "body1": body1, "body2": body2, "data": " ".join(data), "reduce": reduce, "num": str(num)}
+        ET.SubElement(sensors, "contact", attributes)
+    scene = SceneFile(
+        mjcf=ET.tostring(main, encoding="unicode"),
+        parts=dict(sorted(kept.parts.items())),
+        assets=tuple(sorted(kept.assets.values(), key=lambda asset: asset.key)),
+    )
+    try:
+        again = compiled(scene, kept.contents)
+    except ValueError as error:
+        raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
+    _compare(model, again)
+    return scene
+
+
+class _Kept:
+    """Collects the parts and assets of a scene while its files are rewritten to name them by content."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, str] = {}
+        self.assets: dict[str, Asset] = {}
+        self.contents: dict[str, bytes] = {}
+
+    def rewritten(self, root: ET.Element, file: Path, folders: list[Path]) -> ET.Element:
+        """Rewrite one file.
+
+        Args:
+            root: Its content, changed in place.
+            file: The file, for messages.
+            folders: Where files that it names may lie: an included file's assets are looked up beside the including one.
+        """
+        subfolders = {"mesh": "meshdir", "skin": "meshdir", "hfield": "meshdir", "texture": "texturedir"}
+        settings: dict[str, str] = {}
+        for compiler in root.iter("compiler"):
+            for attribute in ("meshdir", "texturedir", "assetdir"):
+                if attribute in compiler.attrib:
+                    settings[attribute] = compiler.attrib.pop(attribute)
+        for element in root.iter():
+            name = element.get("file")
+            if element.tag in ("include", "model") and name:
+                element.set("file", self._part(_found(name, [""], folders, file), folders, element.tag))
+            elif element.tag in ASSET_TAGS and name:
+                element.set("name", element.get("name", Path(name).stem))
+                own = [settings.get(subfolders[element.tag], settings.get("assetdir", "")), ""]
+                element.set("file", self._asset(_found(name, own, folders, file)))
+        return root
+
+    def _part(self, path: Path, folders: list[Path], tag: str) -> str:
+        around = [path.parent, *folders] if tag == "include" else [path.parent]
         try:
-            compiled = spec.compile()
-        except ValueError as error:
-            raise RobotError(f"{model.file}: {error}") from error
-        assets, contents = _named_by_content(model, spec)
-        text = spec.to_xml()
-        again = mujoco.MjSpec.from_string(text, assets=contents).compile()
-    for name in ("body_pos", "body_quat", "body_mass", "geom_pos", "geom_quat", "geom_size", "geom_friction", "jnt_range"):
-        saved, loaded = getattr(again, name), getattr(compiled, name)
-        if saved.shape != loaded.shape or not np.allclose(saved, loaded, rtol=1e-5, atol=1e-6):
-            raise RobotError(f"{model.file}: MuJoCo does not save this scene faithfully ({name} differs)")
-    for kind in ("body", "geom", "joint", "actuator", "sensor"):
-        if _names(again, kind) != _names(compiled, kind):
-            raise RobotError(f"{model.file}: MuJoCo does not save this scene faithfully (names of {kind}s differ)")
-    return SceneFile(text, tuple(sorted(assets, key=lambda asset: asset.key)))
+            root = self.rewritten(ET.parse(path).getroot(), path, around)
+        except ET.ParseError as error:
+            raise RobotError(f"{path}: not XML: {error}") from error
+        text = ET.tostring(root, encoding="unicode")
+        key = f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.xml"
+        self.parts[key] = text
+        return key
+
+    def _asset(self, path: Path) -> str:
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        key = f"{digest[:32]}{path.suffix.lower()}"
+        self.assets[key] = Asset(key, portable(path), digest)
+        self.contents[key] = content
+        return key
 
 
-def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    count = {"body": model.nbody, "geom": model.ngeom, "joint": model.njnt, "actuator": model.nu, "sensor": model.nsensor}
-    return [getattr(model, kind)(i).name for i in range(count[kind])]
-
-
-def _named_by_content(model: Model, spec: mujoco.MjSpec) -> tuple[list[Asset], dict[str, bytes]]:
-    folders = list(dict.fromkeys(path.parent for path in xml_files(model.file)))
-    assets: dict[str, Asset] = {}
-    contents: dict[str, bytes] = {}
-    for kind in ASSET_KINDS:
-        for element in getattr(spec, kind):
-            if not getattr(element, "file", ""):
-                continue
-            path = _found(model, element, folders)
-            content = path.read_bytes()
-            digest = hashlib.sha256(content).hexdigest()
-            key = f"{digest[:32]}{path.suffix.lower()}"
-            assets[key] = Asset(key, portable(path), digest)
-            contents[key] = content
-            element.file = key
-    spec.meshdir = spec.texturedir = ""
-    return list(assets.values()), contents
-
-
-def _found(model: Model, element: mujoco.MjsMesh | mujoco.MjsTexture, folders: list[Path]) -> Path:
-    compiler = element.compiler
-    subfolder = compiler.texturedir if isinstance(element, mujoco.MjsTexture) else compiler.meshdir
+def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) -> Path:
     for folder in folders:
-        for path in (folder / subfolder / element.file, folder / element.file):
-            if path.is_file():
+        for subfolder in subfolders:
+            if (path := folder / subfolder / name).is_file():
                 return path.resolve()
-    raise RobotError(f'{model.file}: asset "{element.file}" was not found beside any of the files that make up this model')
+    raise RobotError(f'{file}: the file "{name}" that it names was not found')
 
 
-def portable(path: Path) -> str:
-    """Return a path as an artefact keeps it: `robots:` and the rest for a robot that comes with tgdsl, else absolute."""
-    folder = robots_folder().resolve()
-    return f"robots:{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()
+def _compare(model: Model, again: mujoco.MjModel) -> None:
+    """Refuse a kept scene that is not the loaded one: same elements, same numbers to the digits MuJoCo writes."""
+    for kind, count in {"body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu", "keyframe": "nkey"}.items():
+        names = [[getattr(m, kind)(i).name for i in range(getattr(m, count))] for m in (model.compiled, again)]
+        if names[0] != names[1]:
+            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: names of {kind}s differ")
+    for name in COMPARED:
+        loaded, kept = getattr(model.compiled, name), getattr(again, name)
+        if loaded.shape != kept.shape or not np.allclose(loaded, kept, rtol=1e-4, atol=1e-6):
+            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: {name} differs")

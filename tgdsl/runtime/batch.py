@@ -18,8 +18,8 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module import SceneState, TactileModule
 from tgdsl.plan import contact_sensor_names
-from tgdsl.runtime.scene import scene_model
 from tgdsl.runtime.source import EnvIds
+from tgdsl.scene import scene_model
 
 Array = np.ndarray
 _SLOT_SIZE = 16
