@@ -1,6 +1,6 @@
 """Compare the XHand1's surfaces with the vendor's: distance and angle from our taxels to the same link's mesh there.
 
-Run `python robots/xhand1/measure.py REFERENCE_DIR`, where that folder holds the vendor's URDF and meshes (see README.md).
+Run `python robots/xhand1/measure.py REFERENCE_DIR`; the folder holds the vendor's URDF and meshes (see README.md).
 Exits with 1 if the mean distance is 1 mm or more, the mean angle 20° or more, or the two give different taxel counts.
 """
 
@@ -45,7 +45,7 @@ def taxels(robot: Model, placements: dict[str, Placement]) -> dict[str, Samples]
 def errors(samples: Samples, reference: Surface) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance [m] of each taxel to a surface, and the angle [deg] to its normal at the nearest point."""
     squared, face, _ = igl.point_mesh_squared_distance(samples.pos, reference.vertices, reference.faces)
-    cosine = (reference.face_normals[face] * samples.normal).sum(axis=1)
+    cosine = (reference.face_normals[np.asarray(face)] * samples.normal).sum(axis=1)
     return np.sqrt(squared), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
@@ -72,7 +72,7 @@ def same_counts(ours: Model, reference: Model) -> bool:
 
 def main() -> None:
     """Print the comparison at the highest resolution, per link and in total."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Compare our surfaces with the vendor's.")
     parser.add_argument("reference_dir", type=Path, help="folder that holds the vendor's URDF and meshes")
     [urdf] = parser.parse_args().reference_dir.glob("*.urdf")
     ours, reference = load_model(HERE / "xhand1_right.xml"), load_model(urdf)

@@ -5,11 +5,10 @@ Shapes: `taxel` taxels of one sensor, `face` triangles, `h` and `w` rows and col
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from os.path import commonprefix
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib
 import mujoco
@@ -18,6 +17,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
@@ -30,7 +30,7 @@ from tgdsl.runtime.batch import BatchSimulation
 Array = np.ndarray
 GeomType = mujoco.mjtGeom
 SIZE, DPI = (16.0, 9.0), 100
-VIEW = (0.0125, 0.02, 0.55, 0.86)  # the 3-D view in the figure: left, bottom, width, height
+VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 FINE = 2  # pixels of the 3-D view per pixel of the file, along each axis
 MAX_MAPS = 12
 INK, FAINT, REST = "#2b2f36", "#7b828c", "#d3d6da"
@@ -61,7 +61,7 @@ class Dots:
         normal: Outward unit normal in the world.
         size: Width of the patch that the taxel stands for [m].
         value: Magnitude of the reading, in `unit`.
-        quantity: What is read, such as `force`.
+        quantity: What is read, such as `|force|`.
         unit: Its unit, with the prefix that suits the values; empty for plain numbers.
     """
 
@@ -82,7 +82,7 @@ class Dots:
         """Quantity and unit."""
         return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
 
-    def summary(self, chosen: Int[Array, " chosen"] | slice) -> str:
+    def summary(self, chosen: Int[Array, " chosen"] | slice = slice(None)) -> str:
         """Return the sum of some taxels' magnitudes, unless they are lengths, and the largest."""
         value, unit = self.value[chosen], f" {self.unit}" if self.unit else ""
         if not value.any():
@@ -95,10 +95,10 @@ class Dots:
 class Camera(NamedTuple):
     """An orthographic camera: image axes and viewing direction as unit vectors of the world, and a point that it looks at."""
 
-    right: Float[Array, "3"]
-    up: Float[Array, "3"]
-    toward: Float[Array, "3"]
-    centre: Float[Array, "3"]
+    right: Float[Array, " 3"]
+    up: Float[Array, " 3"]
+    toward: Float[Array, " 3"]
+    centre: Float[Array, " 3"]
 
     def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return image x, image y and nearness to the camera [m], from the centre."""
@@ -162,7 +162,7 @@ def picture(
     figure.text(0.016, 0.955, title or output.name, size=19, weight="bold", color=INK, va="center")
     parts = [output.name] if title else []
     parts += [output.kind, f"resolution {resolution}"] if resolution else [output.kind]
-    parts += [f"{dots.is_read.sum()} of {len(table)} taxels touched", dots.summary(slice(None)), f"environment {env}"]
+    parts += [f"{dots.is_read.sum()} of {len(table)} taxels touched", f"{dots.quantity} {dots.summary()}", f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, format="png")
@@ -184,7 +184,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
     rotation = Rotation.from_quat(sim.batch.xquat[env][body], scalar_first=True)
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
     value = np.linalg.norm(values[env].detach().cpu().double().numpy()[:, same], axis=1)
-    stem = commonprefix([output.channels[i] for i in same]).rstrip("_")
+    stem = output.channels[0].removesuffix("_x")
     unit = "" if output.units[0] == "1" else output.units[0]
     if unit and 0 < value.max() < 0.1:
         value, unit = (1e3 * value, f"m{unit}") if value.max() >= 1e-4 else (1e6 * value, f"µ{unit}")
@@ -193,7 +193,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         normal=rotation.apply(table["normal"]),
         size=np.sqrt(table["area"]),
         value=value,
-        quantity=stem or output.name,
+        quantity=f"|{stem}|" if len(same) > 1 else stem,
         unit=unit,
     )
 
@@ -252,7 +252,8 @@ def _draw_scene(
 
 
 def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, scale: float) -> None:
-    area = (np.clip(0.62 * scale / FINE * dots.size, 3.5, 20.0) * 72 / DPI) ** 2
+    size = np.minimum(dots.size, np.median(dots.size))
+    area = (np.clip(0.62 * scale / FINE * size, 3.5, 20.0) * 72 / DPI) ** 2
     rest, shown, hidden = seen & ~dots.is_read, seen & dots.is_read, ~seen & dots.is_read
     axes.scatter(*at[rest, :2].T, s=0.3 * area[rest], c="#8d949e", linewidths=0, zorder=3)
     ring = _HEAT(norm(dots.value[hidden]))
@@ -265,11 +266,12 @@ def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, 
 def _draw_ruler(axes: Axes, scale: float, width: int) -> None:
     steps = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
     length = steps[np.abs(steps * scale / 1000 / width - 0.12).argmin()]
-    axes.plot([24, 24 + length * scale / 1000], [28, 28], color=INK, linewidth=1.6, solid_capstyle="butt")
-    axes.text(24, 42, f"{length} mm", fontsize=9.5, color=INK, va="bottom")
+    end = 8 + length * scale / 1000
+    axes.plot([8, end], [-44, -44], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
+    axes.text(end + 16, -45, f"{length} mm", fontsize=9.5, color=INK, va="center")
 
 
-def camera_for(dots: Dots, root: Float[Array, "3"]) -> Camera:
+def camera_for(dots: Dots, root: Float[Array, " 3"]) -> Camera:
     """Return a camera that the most strongly read taxels face, a little from the side.
 
     Args:
@@ -291,8 +293,10 @@ def camera_for(dots: Dots, root: Float[Array, "3"]) -> Camera:
 
 def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " taxel"]:
     """Return which taxels face the camera with nothing of the robot between."""
-    column, row = (np.clip(np.rint(at[:, axis]), 0, limit - 1).astype(int) for axis, limit in ((0, shot.near.shape[1]), (1, shot.near.shape[0])))
-    slack = np.maximum(0.5 * dots.size, 1e-3)
+    height, width = shot.near.shape
+    column = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(int)
+    row = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(int)
+    slack = np.maximum(0.2 * dots.size, 5e-4)  # [m] for taxels a little under the surface
     return (dots.normal @ camera.toward > 0) & (at[:, 2] + slack >= shot.near[row, column])
 
 
@@ -352,7 +356,9 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3
         return np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
     shape = _PRIMITIVES[kind](model.geom_size[geom])
     flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
-    return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[shape.faces]
+    return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[
+        shape.faces
+    ]
 
 
 def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Shot:
@@ -428,18 +434,26 @@ def _draw_maps(figure: Figure, dots: Dots, table: Array, norm: Normalize) -> Non
     columns = int(np.ceil(np.sqrt(len(shown))))
     rows = -(-len(shown) // columns)
     grid = figure.add_gridspec(rows, columns, left=0.60, right=0.985, bottom=0.15, top=0.83, hspace=0.36, wspace=0.16)
-    for place, link in zip(grid, shown, strict=False):
-        axes = figure.add_subplot(place, anchor="N")
+    for i, link in enumerate(shown):
+        axes = figure.add_subplot(grid[i], anchor="N")
         chosen = np.flatnonzero(table["link"] == link)
         _draw_map(axes, dots.value[chosen], table[chosen], norm)
         axes.set_title(f"{names[link]}\n{dots.summary(chosen)}", fontsize=9 if columns > 2 else 11, color=INK, linespacing=1.35)
-    bar = figure.add_axes((0.645, 0.075, 0.295, 0.016))
-    colorbar = figure.colorbar(matplotlib.cm.ScalarMappable(norm, _HEAT), cax=bar, orientation="horizontal")
-    colorbar.outline.set_visible(False)
-    bar.set_xlabel(f"{dots.label}   (grey: zero)", fontsize=10.5, color=INK)
-    bar.tick_params(labelsize=9.5, colors=INK, length=3)
     if len(links) > MAX_MAPS:
-        figure.text(0.985, 0.912, f"and {len(links) - MAX_MAPS} more links, touched less", size=10.5, color=FAINT, ha="right", va="center")
+        rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
+        figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")
+    if dots.is_read.any():
+        _draw_scale(figure, dots, norm)
+    else:
+        figure.text(0.7925, 0.083, f"{dots.quantity}: nothing is touched", size=10.5, color=FAINT, ha="center", va="center")
+
+
+def _draw_scale(figure: Figure, dots: Dots, norm: Normalize) -> None:
+    axes = figure.add_axes((0.645, 0.075, 0.295, 0.016))
+    bar = figure.colorbar(ScalarMappable(norm, _HEAT), cax=axes, orientation="horizontal")
+    bar.outline.set_visible(False)
+    axes.set_xlabel(f"{dots.label}   (grey: zero)", fontsize=10.5, color=INK)
+    axes.tick_params(labelsize=9.5, colors=INK, length=3)
 
 
 def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
@@ -452,14 +466,16 @@ def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
         cells = np.full((table["row"].max() + 1, table["column"].max() + 1), np.nan)
         cells[table["row"][active], table["column"][active]] = shown[active]
         axes.patch.set(facecolor="#f6f7f8", hatch="////", edgecolor="#d9dce0", linewidth=0)
-        axes.pcolormesh(np.ma.masked_invalid(cells), cmap=_HEAT, norm=norm, edgecolors="white", linewidth=0.8)
+        edge = 9.0 / max(9, *cells.shape)
+        axes.pcolormesh(np.ma.masked_invalid(cells), cmap=_HEAT, norm=norm, edgecolors="white", linewidth=edge)
         axes.set(aspect="equal", ylim=(len(cells), 0))
         return
     normal = _unit(table["normal"].mean(axis=0), table["normal"][0])
     across = table["tangent"].mean(axis=0)
     across = _unit(across - (across @ normal) * normal, table["tangent"][0])
     x, y = 1e3 * table["pos"] @ across, 1e3 * table["pos"] @ np.cross(normal, across)
-    axes.scatter(x[active], y[active], c=shown[active], cmap=_HEAT, norm=norm, s=26, linewidths=0)
+    size = 0.03 * axes.get_window_extent().height * 72 / DPI
+    axes.scatter(x[active], y[active], c=shown[active], cmap=_HEAT, norm=norm, s=size**2, linewidths=0)
     axes.patch.set_facecolor("#f6f7f8")
     axes.margins(0.12)
     axes.set_aspect("equal", "datalim")
@@ -467,6 +483,8 @@ def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
 
 def short_names(links: list[str]) -> dict[str, str]:
     """Return the names without the leading words that all share, but with at least two words each."""
-    words = [link.split("_") for link in links]
-    shared = len(commonprefix(words)) if len(links) > 1 else 0
-    return {"_".join(own): "_".join(own[max(min(shared, len(own) - 2), 0) :]) for own in words}
+    words = {link: link.split("_") for link in links}
+    shared = 0 if len(links) == 1 else min(len(own) for own in words.values()) - 2
+    while shared > 0 and len({tuple(own[:shared]) for own in words.values()}) > 1:
+        shared -= 1
+    return {link: "_".join(own[max(shared, 0) :]) for link, own in words.items()}

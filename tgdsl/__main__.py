@@ -1,0 +1,5 @@
+"""`python -m tgdsl`."""
+
+from tgdsl.cli import main
+
+main()

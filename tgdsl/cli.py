@@ -1,0 +1,187 @@
+"""The command line: `tgdsl compile`, `explain`, `schema` and `run`."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from tgdsl.errors import SpecError, TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.module import TactileModule
+
+Overrides = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+Document = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+
+
+@dataclass(frozen=True)
+class Compile:
+    """Compile a document to an artefact that `tgdsl.load` and `tgdsl run` take."""
+
+    document: Document
+    """The YAML document."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """The artefact; default: the document's name with the ending .safetensors, in the working folder."""
+    set: Overrides = ()
+    """Override a value, as in `--set resolution=high`; may be repeated."""
+
+    def run(self) -> None:
+        """Compile, write and say what came of it."""
+        from tgdsl.artifact import save_plan
+        from tgdsl.compiler.pipeline import compile_plan
+
+        start = time.perf_counter()
+        plan = compile_plan(self.document, parsed_overrides(self.set))
+        out = self.out or Path(self.document.with_suffix(".safetensors").name)
+        size = save_plan(plan, out)
+        layout = plan.layout()
+        sensors = ", ".join(f"{s.name} ({s.kind}, {plan.queries[s.query].num_taxels})" for s in plan.sensors)
+        print(f"{layout.num_taxels} taxels on {len(layout.links)} links at resolution {plan.origin.resolution}")
+        print(f"sensors: {sensors}")
+        print(f"{out}: {size} bytes in {time.perf_counter() - start:.1f} s")
+
+
+@dataclass(frozen=True)
+class Explain:
+    """Say what a document or an artefact computes, what it leaves out and why, and what it costs."""
+
+    document: Document
+    """The YAML document, or an artefact (.safetensors)."""
+    set: Overrides = ()
+    """Override a value of the document, as in `--set resolution=high`; may be repeated."""
+
+    def run(self) -> None:
+        """Print the account."""
+        print(_module(self.document, self.set).explain())
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Write the JSON Schema of documents and layouts, with which editors complete and check them."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("tgdsl.schema.json")
+    """The file to write."""
+
+    def run(self) -> None:
+        """Write it."""
+        from tgdsl.schema.document import json_schema
+
+        self.out.write_text(json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        print(self.out)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Step a document's scene on the CPU, show what is felt, and write readings and a picture."""
+
+    document: Document
+    """The YAML document, or an artefact (.safetensors)."""
+    keyframes: tuple[str, ...] = ("rest", "squeeze")
+    """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start."""
+    seconds: float = 1.0
+    """Duration of each hold and of each move between keyframes [s]."""
+    controls: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator) or (step, env, actuator)."""
+    num_envs: int = 1
+    """Environments; the table and the picture show the first."""
+    substeps: int = 5
+    """Physics steps per control step."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
+    """Folder for readings.npz and picture.png."""
+    compiled: bool = False
+    """Fuse the module with torch.compile first."""
+    set: Overrides = ()
+    """Override a value of the document, as in `--set resolution=high`; may be repeated."""
+
+    def run(self) -> None:
+        """Step through the controls, show the table, write the files."""
+        from tqdm import tqdm
+
+        from tgdsl.runtime.batch import simulate
+        from tgdsl.runtime.rollout import Recorder, recorded_controls, rollout, scripted_controls
+        from tgdsl.runtime.table import LiveTable, table
+        from tgdsl.runtime.view import picture
+
+        touch = _module(self.document, self.set)
+        if self.compiled:
+            touch.compile()
+        start = self.keyframes[0] if self.keyframes and self.controls is None else None
+        sim = simulate(touch, self.num_envs, substeps=self.substeps, keyframe=start)
+        if self.controls is not None:
+            controls = recorded_controls(self.controls)
+        else:
+            controls = scripted_controls(sim.model, self.keyframes, self.seconds, sim.control_step)
+        self.out.mkdir(parents=True, exist_ok=True)
+        recorder, live = Recorder(touch, len(controls), self.num_envs), LiveTable()
+        readings = {}
+        bar = tqdm(total=len(controls), unit="step", disable=None, leave=False)
+        for step in rollout(touch, sim, controls):
+            recorder.add(step)
+            readings = step.readings
+            bar.update()
+            with bar.external_write_mode():
+                live.show([f"t = {step.time:.2f} s", *table(touch, readings)], is_last=step.index == len(controls) - 1)
+        bar.close()
+        recorder.write(self.out / "readings.npz", controls)
+        print(f"readings: {self.out / 'readings.npz'}")
+        print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
+
+
+def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
+    """Return `KEY=VALUE` arguments as a mapping.
+
+    Raises:
+        TgdslError: If one has no equals sign.
+    """
+    for pair in pairs:
+        if "=" not in pair:
+            raise TgdslError(f'--set {pair}: expected KEY=VALUE, such as "resolution=high"')
+    return {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
+
+
+def _module(document: Path, overrides: tuple[str, ...]) -> TactileModule:
+    import tgdsl
+
+    if document.suffix == ".safetensors":
+        if overrides:
+            raise TgdslError("an artefact cannot be overridden; compile the document with --set instead")
+        return tgdsl.load(document)
+    return tgdsl.compile(document, overrides=parsed_overrides(overrides))
+
+
+Command = (
+    Annotated[Compile, tyro.conf.subcommand("compile")]
+    | Annotated[Explain, tyro.conf.subcommand("explain")]
+    | Annotated[Schema, tyro.conf.subcommand("schema")]
+    | Annotated[Run, tyro.conf.subcommand("run")]
+)
+
+
+def _warn(message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: object) -> None:
+    print(f"tgdsl: warning: {message}", file=sys.stderr)
+
+
+def main() -> None:
+    """Run one command; a mistake of the user's ends in its message and exit code 2, never in a traceback."""
+    warnings.showwarning = _warn
+    command = tyro.cli(Command, prog="tgdsl", description="Touch for robot learning.")  # type: ignore[arg-type]
+    try:
+        command.run()
+    except SpecError as error:
+        count = len(error.problems)
+        print(f"{error}\n{count} mistake{'s' if count > 1 else ''}", file=sys.stderr)
+        sys.exit(2)
+    except TgdslError as error:
+        print(f"tgdsl: {error}", file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone; say nothing at exit either
+        sys.exit(1)

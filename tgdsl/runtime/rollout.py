@@ -1,0 +1,120 @@
+"""Rollouts: a scene stepped through given controls, with every reading kept.
+
+Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` and `channel` as the readings'.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.module import TactileModule
+from tgdsl.runtime.batch import BatchSimulation
+
+Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One control step of a rollout: its number, the time after it [s], and the readings."""
+
+    index: int
+    time: float
+    readings: dict[str, Tensor]
+
+
+def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds: float, control_step: float) -> Controls:
+    """Return controls that hold each keyframe's for a while and move evenly to the next one's in as long.
+
+    Args:
+        model: The scene.
+        keyframes: Names of the keyframes, of which only `ctrl` counts.
+        seconds: Duration of each hold and of each move [s].
+        control_step: Duration of a control step [s].
+
+    Raises:
+        SimulationError: If the scene has no such keyframe.
+    """
+    known = [model.key(i).name for i in range(model.nkey)]
+    for name in keyframes:
+        if name not in known:
+            raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}')
+    steps = max(round(seconds / control_step), 1)
+    targets = [model.key_ctrl[model.key(name).id] for name in keyframes]
+    parts = [np.tile(targets[0], (steps, 1))]
+    for start, end in zip(targets[:-1], targets[1:], strict=True):
+        ramp = np.linspace(0.0, 1.0, steps)[:, None]
+        parts += [start + ramp * (end - start), np.tile(end, (steps, 1))]
+    return np.concatenate(parts)
+
+
+def recorded_controls(path: Path) -> Controls:
+    """Return the array `ctrl` of an `.npz` file, (step, actuator) or (step, env, actuator).
+
+    Raises:
+        SimulationError: If the file cannot be read or holds no such array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            controls = archive["ctrl"]
+    except (OSError, ValueError, KeyError) as error:
+        raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
+    if controls.ndim not in (2, 3) or not np.issubdtype(controls.dtype, np.floating):
+        raise SimulationError(
+            f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, expected floats (step, actuator) or (step, env, actuator)"
+        )
+    return controls.astype(np.float64)
+
+
+def rollout(touch: TactileModule, sim: BatchSimulation, controls: Controls) -> Iterator[Step]:
+    """Step a scene through controls and yield the readings after each control step."""
+    for index, control in enumerate(controls):
+        sim.step(control)
+        yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
+
+
+class Recorder:
+    """Keeps the readings of a rollout and writes them as one `.npz` file.
+
+    The file holds `time` (step,) [s], `ctrl` (step, …, actuator), each reading by its name (step, env, taxel, channel) as
+    float32, and its channels' names and units under `<name>:channels` and `<name>:units`.
+    """
+
+    def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
+        """Make room for a rollout."""
+        self._outputs = touch.outputs
+        self._readings = {
+            output.name: np.empty((num_steps, num_envs, *output.shape), dtype=np.float32) for output in self._outputs
+        }
+        self._time = np.empty(num_steps)
+
+    def add(self, step: Step) -> None:
+        """Keep one step."""
+        self._time[step.index] = step.time
+        for name, kept in self._readings.items():
+            kept[step.index] = step.readings[name].detach().cpu().numpy()
+
+    def write(self, path: Path, controls: Controls) -> None:
+        """Write the file; it appears whole or not at all."""
+        arrays: dict[str, np.ndarray] = {"time": self._time, "ctrl": controls, **self._readings}
+        for output in self._outputs:
+            arrays[f"{output.name}:channels"] = np.array(output.channels)
+            arrays[f"{output.name}:units"] = np.array(output.units)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
