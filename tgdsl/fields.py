@@ -43,8 +43,8 @@ def quantity(dimension: str, ge: float | None = None, gt: float | None = None) -
             raise ValueError(f"{value:g} is out of range, expected at least {ge:g}")
         return value
 
-    names = [name for name in units.UNITS[dimension] if name.isascii()]
-    pattern = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*(" + "|".join(map(_escape, names)) + r")?\s*$"
+    names = list(units.UNITS[dimension])
+    pattern = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(" + "|".join(map(_escape, names)) + r")?\s*$"
     number: dict[str, Any] = {"type": "number"}
     if gt is not None:
         number["exclusiveMinimum"] = gt
@@ -106,6 +106,8 @@ def _as_selection(value: object) -> object:
         return {"include": (value,)}
     if isinstance(value, (list, tuple)):
         return {"include": value}
+    if not isinstance(value, (dict, Selection)):
+        raise ValueError("not a selection, expected a name, a list of names, or {include: [...], exclude: [...]}")
     return value
 
 

@@ -16,7 +16,7 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-zµ][\w*/µ]*)?\s*\Z")
+_QUANTITY = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([A-Za-zµ][\w*/µ]*)?\s*\Z")
 
 
 def parse(value: object, dimension: str) -> float:
@@ -40,6 +40,10 @@ def parse(value: object, dimension: str) -> float:
         if match[2] and match[2] not in known:
             raise ValueError(f'"{match[2]}" is not a unit of {dimension}, expected one of {", ".join(known)}')
         value = float(match[1]) * known.get(match[2] or "", 1.0)
+    try:
+        value = float(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        value = math.inf
     if not math.isfinite(value):
         raise ValueError(f"{value} is not finite, expected {wanted}")
-    return float(value)
+    return value

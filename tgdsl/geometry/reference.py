@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
@@ -28,7 +30,7 @@ class ReferenceBody:
     linvel: Float[Array, "3"]
     angvel: Float[Array, "3"]
 
-    @property
+    @cached_property
     def rotation(self) -> Float[Array, "3 3"]:
         """Rotates body vectors into the world."""
         return Rotation.from_quat(self.quat, scalar_first=True).as_matrix()
@@ -137,7 +139,7 @@ def _cylinder(size: Array, point: Array) -> tuple[Array, bool, Array]:
 
 
 def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
-    """Nearest point by bisection on the Lagrange multiplier t: X_i = e_i² p_i / (t + e_i²), ‖X/e‖ = 1.
+    """Nearest point by bracketing the Lagrange multiplier t: X_i = e_i² p_i / (t + e_i²), ‖X/e‖ = 1.
 
     If no t above the pole −e² of the least axis solves it, the point is on that axis' plane of symmetry and the nearest
     points are a mirrored pair, of which the positive is taken.
@@ -147,8 +149,10 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
     sign = np.where(point < 0, -1.0, 1.0)
     y = np.abs(point)
 
+    scaled, poles = (size * y).tolist(), square.tolist()
+
     def excess(t: float) -> float:
-        return float(np.sum((size * y / (t + square)) ** 2)) - 1.0
+        return sum((part / (t + pole)) ** 2 for part, pole in zip(scaled, poles, strict=True)) - 1.0
 
     others = np.arange(3) != least
     flat = others & (square > square[least])
@@ -158,11 +162,8 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
         nearest[flat] = square[flat] * y[flat] / (square[flat] - square[least])
         nearest[least] = size[least] * np.sqrt(1.0 - at_pole)
     else:
-        low, high = -square[least] + size[least] * y[least], float(np.linalg.norm(size * y))
-        for _ in range(200):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-        nearest = square * y / (0.5 * (low + high) + square)
+        low, high = float(size[least] * y[least] - square[least]), float(np.linalg.norm(size * y) - square[least])
+        nearest = square * y / (brentq(excess, low, high, xtol=1e-300, rtol=1e-15) + square)
     inside = bool(np.sum((point / size) ** 2) < 1.0)
     outward = nearest / square
     return sign * nearest, inside, sign * outward / np.linalg.norm(outward)

@@ -42,9 +42,7 @@ _PRIMITIVES = {
     GeomType.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
     GeomType.mjGEOM_ELLIPSOID: lambda size: trimesh.creation.icosphere(subdivisions=3).apply_scale(size),
     GeomType.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1], sections=64),
-    GeomType.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(
-        2 * size[1], size[0], count=[32, 32], transform=trimesh.transformations.translation_matrix([0, 0, -size[1]])
-    ),
+    GeomType.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2 * size[1], size[0], count=[32, 32]),
 }
 
 
@@ -59,7 +57,7 @@ class Dots:
     Attributes:
         pos: Position in the world [m].
         normal: Outward unit normal in the world.
-        size: Width of the patch that the taxel stands for [m].
+        size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
         value: Magnitude of the reading, in `unit`.
         quantity: What is read, such as `|force|`.
         unit: Its unit, with the prefix that suits the values; empty for plain numbers.
@@ -90,35 +88,6 @@ class Dots:
         total = "" if self.unit in ("m", "mm", "µm") else f"Σ {value.sum():.3g}{unit}"
         most = f"max {value.max():.2g}{unit}" if self.unit else ""
         return " · ".join(part for part in (total, most) if part)
-
-
-class Camera(NamedTuple):
-    """An orthographic camera: image axes and viewing direction as unit vectors of the world, and a point that it looks at."""
-
-    right: Float[Array, " 3"]
-    up: Float[Array, " 3"]
-    toward: Float[Array, " 3"]
-    centre: Float[Array, " 3"]
-
-    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-        """Return image x, image y and nearness to the camera [m], from the centre."""
-        return (points - self.centre) @ np.stack([self.right, self.up, self.toward]).T
-
-
-class Solid(NamedTuple):
-    """Triangles in the world: corners [m], unit normals at the corners, and the body of each."""
-
-    corners: Float[Array, "face 3 3"]
-    normals: Float[Array, "face 3 3"]
-    body: Int[Array, " face"]
-
-
-class Shot(NamedTuple):
-    """What each pixel shows: nearness [m] (−inf: nothing), the face, and the weights of its corners."""
-
-    near: Float[Array, "h w"]
-    face: Int[Array, "h w"]
-    weights: Float[Array, "h w 3"]
 
 
 def picture(
@@ -191,7 +160,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
     return Dots(
         pos=sim.batch.xpos[env][body] + rotation.apply(table["pos"]),
         normal=rotation.apply(table["normal"]),
-        size=np.sqrt(table["area"]),
+        size=np.sqrt(table["area"]) * (table["radius"] > 0),
         value=value,
         quantity=f"|{stem}|" if len(same) > 1 else stem,
         unit=unit,
@@ -213,7 +182,7 @@ def _sensor(touch: TactileModule, reading: str) -> str:
     return next(sensor.name for sensor in touch.plan.sensors if reading in sensor.readings)
 
 
-# The view -------------------------------------------------------------------------------------------------------------
+# The scene ------------------------------------------------------------------------------------------------------------
 
 
 def _draw_scene(
@@ -254,10 +223,10 @@ def _draw_scene(
 def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, scale: float) -> None:
     size = np.minimum(dots.size, np.median(dots.size))
     area = (np.clip(0.62 * scale / FINE * size, 3.5, 20.0) * 72 / DPI) ** 2
-    rest, shown, hidden = seen & ~dots.is_read, seen & dots.is_read, ~seen & dots.is_read
+    shown, hidden, rest = seen & dots.is_read, ~seen & dots.is_read, seen & ~dots.is_read & (dots.size > 0)
     axes.scatter(*at[rest, :2].T, s=0.3 * area[rest], c="#8d949e", linewidths=0, zorder=3)
     ring = _HEAT(norm(dots.value[hidden]))
-    axes.scatter(*at[hidden, :2].T, s=0.6 * area[hidden], facecolors="none", edgecolors=ring, linewidths=1.0, zorder=4)
+    axes.scatter(*at[hidden, :2].T, s=0.6 * area[hidden], facecolors="none", edgecolors=list(ring), linewidths=1.0, zorder=4)
     order = np.argsort(dots.value[shown], kind="stable")
     place, value, size = at[shown, :2][order], dots.value[shown][order], area[shown][order]
     axes.scatter(*place.T, s=size, c=value, cmap=_HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
@@ -269,6 +238,61 @@ def _draw_ruler(axes: Axes, scale: float, width: int) -> None:
     end = 8 + length * scale / 1000
     axes.plot([8, end], [-44, -44], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
     axes.text(end + 16, -45, f"{length} mm", fontsize=9.5, color=INK, va="center")
+
+
+def _window(hand: Array, objects: Array) -> Array:
+    """Return the lower and upper corner of what is to be seen: the hand, and objects unless they are far off."""
+    low, high = hand[..., :2].min(axis=(0, 1)), hand[..., :2].max(axis=(0, 1))
+    room = 0.3 * (high - low).max()
+    if len(objects):
+        near = objects[..., :2].reshape(-1, 2)
+        near = near[((near > low - room) & (near < high + room)).all(axis=1)]
+        low, high = np.vstack([near, [low]]).min(axis=0), np.vstack([near, [high]]).max(axis=0)
+    margin = 0.03 * (high - low).max()
+    return np.stack([low - margin, high + margin])
+
+
+def _robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], set[int]]:
+    """Return the bodies to fit in the view (the smallest subtree that holds all taxels), and all of the robot's."""
+    above = [[0]]
+    for body in range(1, model.nbody):
+        above.append([*above[model.body_parentid[body]], body])
+    roots = {int(model.body_rootid[body]) for body in carriers}
+    robot = {body for body in range(model.nbody) if model.body_rootid[body] in roots}
+    top = max(set.intersection(*(set(above[body]) for body in carriers)))
+    return {body for body in robot if top in above[body]}, robot
+
+
+# Camera, triangles and pixels -----------------------------------------------------------------------------------------
+
+
+class Camera(NamedTuple):
+    """An orthographic camera: image axes and viewing direction as unit vectors of the world, and a point that it looks at."""
+
+    right: Float[Array, " 3"]
+    up: Float[Array, " 3"]
+    toward: Float[Array, " 3"]
+    centre: Float[Array, " 3"]
+
+    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """Return image x, image y and nearness to the camera [m], from the centre."""
+        return (points - self.centre) @ np.stack([self.right, self.up, self.toward]).T
+
+
+class Solid(NamedTuple):
+    """Triangles in the world: corners [m], unit normals at the corners, and the body of each."""
+
+    corners: Float[Array, "face 3 3"]
+    normals: Float[Array, "face 3 3"]
+    body: Int[Array, " face"]
+
+
+class Shot(NamedTuple):
+    """What each pixel shows: nearness [m] (−inf: nothing), the face, and the weights of its corners."""
+
+    near: Float[Array, "h w"]
+    face: Int[Array, "h w"]
+    weights: Float[Array, "h w 3"]
 
 
 def camera_for(dots: Dots, root: Float[Array, " 3"]) -> Camera:
@@ -300,34 +324,6 @@ def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " 
     return (dots.normal @ camera.toward > 0) & (at[:, 2] + slack >= shot.near[row, column])
 
 
-def _unit(vector: Array, otherwise: Array) -> Array:
-    length = np.linalg.norm(vector)
-    return vector / length if length > 1e-9 else otherwise
-
-
-def _window(hand: Array, objects: Array) -> Array:
-    """Return the lower and upper corner of what is to be seen: the hand, and objects unless they are far off."""
-    low, high = hand[..., :2].min(axis=(0, 1)), hand[..., :2].max(axis=(0, 1))
-    room = 0.3 * (high - low).max()
-    if len(objects):
-        near = objects[..., :2].reshape(-1, 2)
-        near = near[((near > low - room) & (near < high + room)).all(axis=1)]
-        low, high = np.vstack([near, [low]]).min(axis=0), np.vstack([near, [high]]).max(axis=0)
-    margin = 0.03 * (high - low).max()
-    return np.stack([low - margin, high + margin])
-
-
-def _robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], set[int]]:
-    """Return the bodies to fit in the view (the smallest subtree that holds all taxels), and all of the robot's."""
-    above = [[0]]
-    for body in range(1, model.nbody):
-        above.append([*above[model.body_parentid[body]], body])
-    roots = {int(model.body_rootid[body]) for body in carriers}
-    robot = {body for body in range(model.nbody) if model.body_rootid[body] in roots}
-    top = max(set.intersection(*(set(above[body]) for body in carriers)))
-    return {body for body in robot if top in above[body]}, robot
-
-
 def solid_of(sim: BatchSimulation, env: int, bodies: set[int]) -> Solid:
     """Return the triangles of some bodies in one environment: of their geoms that collide, or else of all; planes not."""
     model = sim.model
@@ -355,6 +351,7 @@ def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3
     if kind not in _PRIMITIVES:
         return np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
     shape = _PRIMITIVES[kind](model.geom_size[geom])
+    shape.apply_translation(-shape.bounds.mean(axis=0))  # trimesh puts capsules elsewhere in some versions
     flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
     return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[
         shape.faces
@@ -423,6 +420,11 @@ def _shaded(image: Array, shot: Shot, solid: Solid, colour: Array, camera: Camer
     return image
 
 
+def _unit(vector: Array, otherwise: Array) -> Array:
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-9 else otherwise
+
+
 # The maps -------------------------------------------------------------------------------------------------------------
 
 
@@ -484,7 +486,7 @@ def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
 def short_names(links: list[str]) -> dict[str, str]:
     """Return the names without the leading words that all share, but with at least two words each."""
     words = {link: link.split("_") for link in links}
-    shared = 0 if len(links) == 1 else min(len(own) for own in words.values()) - 2
-    while shared > 0 and len({tuple(own[:shared]) for own in words.values()}) > 1:
-        shared -= 1
-    return {link: "_".join(own[max(shared, 0) :]) for link, own in words.items()}
+    shared = 0
+    while len(links) > 1 and len({tuple(own[: shared + 1]) for own in words.values()}) == 1:
+        shared += 1
+    return {link: "_".join(own[max(min(shared, len(own) - 2), 0) :]) for link, own in words.items()}

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import tgdsl
 
 _PACKAGE = Path(tgdsl.__file__).parent
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is such a file; unlike `Path.is_file`, also of names that no file can have."""
+    return os.path.isfile(path)
 
 
 def robots_folder() -> Path:
@@ -31,4 +37,4 @@ def robot_file(model: str, folder: Path) -> Path | None:
     if model in (known := robot_names()):
         return known[model]
     path = folder / model
-    return path if path.is_file() else None
+    return path if is_file(path) else None

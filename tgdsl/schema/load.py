@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path as FilePath
@@ -21,6 +21,9 @@ from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
 
 ENTRY_DEPTH = {"sensors": 2, "objects": 2, "noise": 2, "groups": 2, "observations": 3, "resolutions": 3}
 """How deep an entry sits under each of these keys: a faulty entry is left out, and the rest is still checked."""
+
+DISCRIMINATORS = ("kind", "method", "type")
+"""Keys whose value says as what a mapping is read: pydantic's error locations hold that value as if it were a key."""
 
 
 @dataclass
@@ -130,7 +133,7 @@ def _read_file(path: FilePath, name: str) -> Source:
         raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
     source = yaml.parse(text, name)
     if source.value is None:
-        raise SpecError(source.problems)
+        raise SpecError(source.problems or [Problem(name, 1, 1, "", "the document is empty")])
     return source
 
 
@@ -154,9 +157,10 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
 def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     if wanted is not None:
         path = loaded.folder / wanted
-        if path.is_file():
+        if files.is_file(path):
             return path
-        loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', "paths are relative to this document"))
+        hint = "paths are relative to this document"
+        loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', hint))
         return None
     known = files.robot_names().get(loaded.spec.robot.model)
     if known is not None and (known.parent / "layout.yaml").is_file():
@@ -184,8 +188,9 @@ def _validate(
         faults = error.errors()
     entries: set[Path] = set()
     for fault in faults:
-        path = _raw_path(value, fault["loc"])
-        problems.append(_translated(source, prefix, value, path, fault, known))
+        path = _raw_path(value, fault, known)
+        if not _is_follow_up(fault):
+            problems.append(_translated(source, prefix, value, path, fault, known))
         entries.add(path if fault["type"] == "extra_forbidden" else _entry(path))
     if not isinstance(value, dict):
         return None
@@ -201,18 +206,31 @@ def _validate(
         return None
 
 
-def _raw_path(value: Any, location: Iterable[str | int]) -> Path:
-    """Return pydantic's location as a path through the plain value: the tags of unions, which are no keys, are left out."""
+def _is_follow_up(fault: Any) -> bool:
+    """Return whether a fault only repeats another: of a value that is no YAML, or of items that have faults themselves."""
+    found, context = fault["input"], fault.get("ctx", {})
+    return found is yaml.Unreadable or (fault["type"] == "too_short" and len(found) >= context["min_length"])
+
+
+def _raw_path(value: Any, fault: Any, known: Mapping[int, type[BaseModel]]) -> Path:
+    """Return the path through the plain value to where pydantic found a fault: without the tags of unions, no keys."""
     path: list[str | int] = []
-    location = list(location)
+    location = fault["loc"]
+    is_tagged = False
     for i, part in enumerate(location):
-        if isinstance(value, dict) and part in value:
-            value = value[part]
-        elif isinstance(value, list) and isinstance(part, int) and part < len(value):
-            value = value[part]
-        elif i < len(location) - 1 or not isinstance(value, dict):
-            continue
-        path.append(part)
+        if i == len(location) - 1 and fault["type"] in ("missing", "extra_forbidden"):
+            return (*path, part)
+        if isinstance(value, dict):
+            model = known.get(id(value))
+            if model is not None and not is_tagged and part in [value.get(key) for key in DISCRIMINATORS]:
+                is_tagged = True
+                continue
+            is_key = part in value and (model is None or part in model.model_fields)
+        else:
+            is_key = isinstance(value, list) and isinstance(part, int) and part < len(value)
+        if is_key:
+            path.append(part)
+            value, is_tagged = value[part], False
     return tuple(path)
 
 
@@ -250,6 +268,11 @@ def _translated(
             parent = parent[part]
         fields = known[id(parent)].model_fields if id(parent) in known else {}
         return source.problem(full, f'unknown key "{path[-1]}"', did_you_mean(str(path[-1]), fields, "keys"), on_key=True)
+    if fault["loc"][-1:] == ("[key]",):
+        what = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
+        return source.problem(full, what, on_key=True)
+    if kind == "missing" and isinstance(path[-1], int):
+        return source.problem(full[:-1], f"found {_brief(found)}, value {path[-1] + 1} is missing")
     if kind == "missing":
         return source.problem(full[:-1], f'missing key "{path[-1]}"', on_key=True)
     if kind == "union_tag_not_found":
@@ -264,13 +287,28 @@ def _translated(
         return source.problem(full, str(context["error"]))
     if kind == "region":
         return source.problem(full, fault["msg"])
+    if kind == "too_short":
+        return source.problem(full, f"found {_brief(found)}, expected at least {context['min_length']} entry")
+    if kind == "too_long":
+        return source.problem(full, f"found {_brief(found)}, expected {context['max_length']} entries")
+    if _wanted(kind):
+        return source.problem(full, f"found {_brief(found)}, expected {_wanted(kind)}")
     message = fault["msg"][0].lower() + fault["msg"][1:]
     return source.problem(full, f"found {_brief(found)}: {message}")
+
+
+def _wanted(kind: str) -> str:
+    """Return what pydantic's errors about Python types mean in a document, or nothing."""
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return "a mapping"
+    return {"tuple_type": "a list", "string_type": "a string"}.get(kind, "")
 
 
 def _brief(found: Any) -> str:
     if isinstance(found, (dict, list, tuple)):
         return f"a {'mapping' if isinstance(found, dict) else 'list'} of {len(found)}"
+    if isinstance(found, int) and abs(found) >= 10**20:
+        return "a huge number"  # Python refuses to print more than 4300 digits
     return f'"{found}"' if isinstance(found, str) else "nothing" if found is None else str(found)
 
 
@@ -279,43 +317,49 @@ def _name_problems(loaded: Loaded) -> list[Problem]:
     spec, source = loaded.spec, loaded.source
     problems: list[Problem] = []
 
-    def names(key: str) -> list[str]:
-        return list(source.get((key,)) or {})
+    def names(key: str) -> list[str] | None:
+        """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
+        found = source.value.get(key, {})
+        return list(found) if isinstance(found, dict) else None
+
+    objects, profiles, sensors = names("objects"), names("noise"), names("sensors") or []
 
     for name, sensor in spec.sensors.items():
         path: Path = ("sensors", name)
         for i, target in enumerate(sensor.feels):
-            if target not in names("objects"):
-                hint = did_you_mean(target, names("objects"), "objects")
+            if objects is not None and target not in objects:
+                hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
-        problems += _noise_problems(loaded, path, sensor.noise, getattr(sensor, "kind", ""), names("noise"))
-    for group, terms in (source.get(("observations",)) or {}).items():
+        problems += _noise_problems(loaded, path, sensor.noise, getattr(sensor, "kind", ""), profiles)
+    for group in names("observations") or []:
+        terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
             target = term.get("of") if isinstance(term, dict) else None
-            if isinstance(target, str) and target.removesuffix("/clean") not in names("sensors"):
-                hint = did_you_mean(target, names("sensors"), "sensors")
+            if isinstance(target, str) and target.removesuffix("/clean") not in sensors:
+                hint = did_you_mean(target, sensors, "sensors")
                 problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
     if loaded.layout is not None:
         resolutions = list((loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {}))
-        if loaded.resolution is None:
+        if loaded.resolution is None and source.get(("resolution",)) is None:
             hint = f"the layout has {', '.join(resolutions)}"
             problems.append(source.problem((), 'missing key "resolution"', hint, on_key=True))
-        elif loaded.resolution not in resolutions:
+        elif loaded.resolution is not None and loaded.resolution not in resolutions:
             hint = did_you_mean(loaded.resolution, resolutions, "resolutions")
             problems.append(source.problem(("resolution",), f'unknown resolution "{loaded.resolution}"', hint))
     return problems
 
 
 def _noise_problems(
-    loaded: Loaded, path: Path, noise: str | NoiseSpec, kind: str, profiles: Iterable[str]
+    loaded: Loaded, path: Path, noise: str | NoiseSpec, kind: str, profiles: list[str] | None
 ) -> list[Problem]:
     """Return the knobs that are turned: the grammar has them, but no sensor obeys them yet, so none may pass unnoticed."""
     path = (*path, "noise")
-    if isinstance(noise, str) and noise not in loaded.spec.noise and noise not in PROFILES:
-        if noise in profiles:
-            return []  # the profile itself has a mistake, which is reported there
-        hint = did_you_mean(noise, [*profiles, *PROFILES], "noise profiles")
-        return [loaded.source.problem(path, f'unknown noise profile "{noise}"', hint)]
+    if isinstance(noise, str) and noise not in loaded.spec.noise:
+        if profiles is None or noise in profiles:
+            return []  # the profile itself, or all of them, have a mistake, which is reported there
+        if noise not in PROFILES:
+            hint = did_you_mean(noise, [*profiles, *PROFILES], "noise profiles")
+            return [loaded.source.problem(path, f'unknown noise profile "{noise}"', hint)]
     knobs = resolve_noise(noise, kind, loaded.spec.noise).active_knobs()
     if not knobs:
         return []

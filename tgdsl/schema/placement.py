@@ -70,16 +70,17 @@ _REGIONS: dict[str, type[SpecModel]] = {"facing": Facing, "box": InBox, "sphere"
 
 
 def _region_tag(value: object) -> str | None:
+    """Return the region's key with an article, because a tag in an error's location must not look like a key."""
     if isinstance(value, dict):
-        return next((key for key in _REGIONS if key in value), None)
-    return next((key for key, model in _REGIONS.items() if isinstance(value, model)), None)
+        return next((f"a {key}" for key in _REGIONS if key in value), None)
+    return next((f"a {key}" for key, model in _REGIONS.items() if isinstance(value, model)), None)
 
 
 _TaggedRegion = Annotated[
-    Annotated[Facing, Tag("facing")]
-    | Annotated[InBox, Tag("box")]
-    | Annotated[InSphere, Tag("sphere")]
-    | Annotated[OnGeoms, Tag("geoms")],
+    Annotated[Facing, Tag("a facing")]
+    | Annotated[InBox, Tag("a box")]
+    | Annotated[InSphere, Tag("a sphere")]
+    | Annotated[OnGeoms, Tag("a geoms")],
     Discriminator(
         _region_tag,
         custom_error_type="region",

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from tgdsl.errors import Problem
 
 Path = tuple[str | int, ...]
+
+MAX_DEPTH = 50
+"""Values that are nested more deeply are refused, before Python's own limit is reached in some odd place."""
+_TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
+
+
+class Unreadable:
+    """Stands, itself, for a value that could not be read: what is wrong with it is noted already."""
 
 
 class Mark(NamedTuple):
@@ -47,7 +56,7 @@ class Source:
         near = path
         while near and near not in first and near not in second:
             near = near[:-1]
-        mark = first.get(near) or second.get(near) or Mark(self.file, 1 if self.values else 0, 1)
+        mark = first.get(near) or second.get(near) or Mark(self.file, 0, 0)
         return Problem(*mark, path=spelled(path), what=what, hint=hint)
 
     def get(self, path: Path) -> Any:
@@ -65,6 +74,8 @@ class Source:
         path: Path = tuple(dotted.split("."))
         parsed = parse(text, f"--set {dotted}={text}")
         self.problems += parsed.problems
+        if parsed.problems:
+            return
         parent = self.value
         for part in path[:-1]:
             parent = parent.setdefault(part, {}) if isinstance(parent, dict) else None
@@ -91,7 +102,9 @@ def parse(text: str, file: str) -> Source:
     source = Source(file)
     yaml = YAML(typ="safe", pure=True)
     try:
-        node = yaml.compose(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ReusedAnchorWarning)  # an anchor may be set anew
+            node = yaml.compose(text)
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
@@ -99,6 +112,9 @@ def parse(text: str, file: str) -> Source:
         return source
     except YAMLError as error:
         source.problems.append(Problem(file, 1, 1, "", f"not YAML: {' '.join(str(error).split())}"))
+        return source
+    except RecursionError:
+        source.problems.append(Problem(file, 1, 1, "", _TOO_DEEP))
         return source
     if node is None:
         source.problems.append(Problem(file, 1, 1, "", "the document is empty"))
@@ -109,14 +125,19 @@ def parse(text: str, file: str) -> Source:
 
 def from_mapping(value: Mapping[str, Any], file: str) -> Source:
     """Return a document that was built in Python; its mistakes have paths but no lines."""
-    return Source(file, _plain(value))
+    source = Source(file)
+    source.value = _plain(value, (), source)
+    return source
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: Any, path: Path, source: Source) -> Any:
+    if len(path) > MAX_DEPTH:
+        source.problems.append(Problem(source.file, 0, 0, spelled(path), _TOO_DEEP))
+        return Unreadable
     if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
+        return {str(key): _plain(part, (*path, str(key)), source) for key, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
-        return [_plain(part) for part in value]
+        return [_plain(part, (*path, i), source) for i, part in enumerate(value)]
     return value
 
 
@@ -133,41 +154,59 @@ class _Reader:
 
     def read(self, node: Node, path: Path, inside: tuple[int, ...]) -> Any:
         self.source.values[path] = self.mark(node)
-        if id(node) in inside:
-            self.note(node, path, "this alias contains itself")
-            return None
+        if id(node) in inside or len(inside) > MAX_DEPTH:
+            self.note(node, path, "this alias contains itself" if id(node) in inside else _TOO_DEEP)
+            return Unreadable
         if isinstance(node, MappingNode):
             return self.mapping(node, path, (*inside, id(node)))
         if isinstance(node, SequenceNode):
             return [self.read(part, (*path, i), (*inside, id(node))) for i, part in enumerate(node.value)]
         try:
-            return self.constructor.construct_object(node)
-        except (YAMLError, ValueError) as error:
+            value = self.constructor.construct_object(node)
+        except Exception as error:  # ruamel lets through whatever Python raises on, say, `!!bool maybe`
             self.note(node, path, f"cannot read this value: {getattr(error, 'problem', None) or error}")
-            return None
+            return Unreadable
+        if isinstance(value, str) and not _is_text(value):
+            self.note(node, path, "half of a surrogate pair is no text")
+            return Unreadable
+        return value
 
     def mapping(self, node: MappingNode, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
+        """Return a mapping; its own keys count before those merged in, and so do their places."""
+        is_merge = [key.tag == "tag:yaml.org,2002:merge" or key.value == "<<" for key, _ in node.value]
         result: dict[str, Any] = {}
-        merged: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            if not isinstance(key_node, ScalarNode):
+        for (_, value_node), is_merged in reversed(list(zip(node.value, is_merge, strict=True))):
+            if is_merged:
+                result |= self.merged(value_node, path, inside)
+        self.source.values[path] = self.mark(node)
+        own: set[str] = set()
+        for (key_node, value_node), is_merged in zip(node.value, is_merge, strict=True):
+            if is_merged:
+                continue
+            if not isinstance(key_node, ScalarNode) or not _is_text(key_node.value):
                 self.note(key_node, path, "a key must be a plain name")
                 continue
-            if key_node.tag == "tag:yaml.org,2002:merge" or key_node.value == "<<":
-                parts = value_node.value if isinstance(value_node, SequenceNode) else [value_node]
-                for part in parts:
-                    found = self.read(part, path, inside)
-                    if isinstance(found, dict):
-                        merged = {**found, **merged}
-                    else:
-                        self.note(part, path, "only a mapping can be merged in")
-                self.source.values[path] = self.mark(node)
-                continue
             key = str(key_node.value)
-            if key in result:
+            if key in own:
                 first = self.source.keys[(*path, key)].line
                 self.note(key_node, (*path, key), f"this key stands twice, first in line {first}")
                 continue
+            own.add(key)
             self.source.keys[(*path, key)] = self.mark(key_node)
             result[key] = self.read(value_node, (*path, key), inside)
-        return {**merged, **result}
+        return result
+
+    def merged(self, node: Node, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
+        """Return what `<<` brings in: a mapping, or a list of mappings of which the first counts most."""
+        result: dict[str, Any] = {}
+        for part in reversed(node.value if isinstance(node, SequenceNode) else [node]):
+            found = self.read(part, path, inside)
+            if isinstance(found, dict):
+                result |= found
+            elif found is not Unreadable:
+                self.note(part, path, "only a mapping can be merged in")
+        return result
+
+
+def _is_text(text: str) -> bool:
+    return not any("\ud800" <= character <= "\udfff" for character in text)
