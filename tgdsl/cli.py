@@ -41,6 +41,7 @@ class Compile:
         start = time.perf_counter()
         plan = compile_plan(self.document, parsed_overrides(self.set))
         out = self.out or Path(self.document.with_suffix(".safetensors").name)
+        out.parent.mkdir(parents=True, exist_ok=True)
         size = save_plan(plan, out)
         layout = plan.layout()
         sensors = ", ".join(f"{s.name} ({s.kind}, {plan.queries[s.query].num_taxels})" for s in plan.sensors)
@@ -185,3 +186,6 @@ def main() -> None:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone; say nothing at exit either
         sys.exit(1)
+    except OSError as error:
+        print(f"tgdsl: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        sys.exit(2)

@@ -271,7 +271,7 @@ def test_sound_urdf_gives_no_warning(tmp_path):
             link_of("a", "<mesh filename='package://pkg/m/gone.stl'/>"),
             'mesh "package://pkg/m/gone.stl": no folder above the file holds "pkg/m/gone.stl"',
         ),
-        ("<link>", "not XML: mismatched tag: line 1, column 28"),
+        ("<link>", "not XML: mismatched tag: line 1, column 27"),
     ],
 )
 def test_urdf_errors(tmp_path, text, message):
@@ -284,7 +284,7 @@ def test_urdf_errors(tmp_path, text, message):
 def test_a_number_that_is_none_in_a_urdf(tmp_path):
     bad = BALL.replace("ixx='1e-5'", "ixx='abc'")
     path = urdf_of(tmp_path, link_of("a", "<sphere radius='.01'/>", bad))
-    with pytest.raises(RobotError, match=r'hand\.urdf: .*"?abc'):
+    with pytest.raises(RobotError, match=r"hand\.urdf: .*'ixx'.*inertia.*line 1"):
         load_model(path)
 
 
@@ -293,7 +293,10 @@ def test_urdf_meshes_of_one_name_in_two_folders(tmp_path):
         (tmp_path / folder).mkdir()
         trimesh.creation.box((size, size, size)).export(tmp_path / folder / "tip.stl")
     links = link_of("a", "<mesh filename='left/tip.stl'/>") + link_of("b", "<mesh filename='right/tip.stl'/>")
-    model = load_model(urdf_of(tmp_path, links + joint_of("j", "a", "b")))
+    links += link_of("c", "<mesh filename='right/tip.stl' scale='2 2 2'/>")
+    model = load_model(urdf_of(tmp_path, links + joint_of("j", "a", "b") + joint_of("k", "a", "c")))
+    assert [geom.mesh for geom in model.geoms] == ["tip", "tip_2", "tip_21"]
+    np.testing.assert_allclose(trimesh_of(model, "c").extents, 0.08, rtol=1e-5)
     np.testing.assert_allclose(trimesh_of(model, "a").extents, 0.02, rtol=1e-5)
     np.testing.assert_allclose(trimesh_of(model, "b").extents, 0.04, rtol=1e-5)
 
@@ -362,6 +365,10 @@ CASES = {
     ),
     "one_of_two_geoms_collides": (two_bodies(FREE + TOUCHING_VISUAL, f"|{FREE}"), True),
     "contacts_disabled": (two_bodies(FREE, f"|{FREE}", rest="<option><flag contact='disable'/></option>"), False),
+    "mocap_and_free": (two_bodies(FREE, "mocap='true'|"), True),
+    "mocap_and_static": (two_bodies("", "mocap='true'|"), False),
+    "mocap_and_its_child": (two_bodies("", f"|{HINGE}", nested=True).replace("'a'", "'a' mocap='true'"), False),
+    "two_mocaps": (two_bodies("", "mocap='true'|").replace("'a'", "'a' mocap='true'"), False),
     "planes_of_the_world": (
         f"<mujoco><worldbody><body name='a'><geom name='ga' type='plane' size='1 1 1'/></body>"
         f"<body name='b'>{FREE}<geom name='gb' size='.1'/></body></worldbody></mujoco>",

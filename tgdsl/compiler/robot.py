@@ -95,6 +95,7 @@ class Model:
     def geoms(self) -> tuple[Geom, ...]:
         """All geoms of named bodies."""
         model = self.compiled
+        paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
         found = []
         for i in range(model.ngeom):
             body = model.body(model.geom_bodyid[i]).name
@@ -111,7 +112,7 @@ class Model:
                     size=model.geom_size[i].copy(),
                     pos=model.geom_pos[i].copy(),
                     rotation=Rotation.from_quat(model.geom_quat[i], scalar_first=True).as_matrix(),
-                    is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i]),
+                    is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i] or i in paired),
                 )
             )
         return tuple(found)
@@ -124,6 +125,8 @@ class Model:
     def can_meet(self, first: str, second: str) -> bool:
         """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
         model = self.compiled
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+            return False
         one, two = model.body(first).id, model.body(second).id
         signature = (min(one, two) << 16) + max(one, two)
         pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
@@ -138,10 +141,10 @@ class Model:
         return False
 
     def _welded(self, one: int, two: int) -> bool:
-        """MuJoCo collides no two geoms of one rigid cluster, nor (by default) of parent and child clusters."""
+        """MuJoCo collides no two geoms of one rigid cluster, nor of what cannot move, nor (by default) of parent and child."""
         model = self.compiled
         one, two = model.body_weldid[one], model.body_weldid[two]
-        if one == two:
+        if one == two or not (model.body_dofnum[one] or model.body_dofnum[two]):
             return True
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT or not one or not two:
             return False
@@ -194,7 +197,10 @@ def load_model(path: Path) -> Model:
     try:
         with muted_mujoco():
             is_urdf = _is_urdf(path)
-            spec = mujoco.MjSpec.from_string(as_mujoco_text(path)) if is_urdf else mujoco.MjSpec.from_file(str(path))
+            text, files = as_mujoco_text(path) if is_urdf else ("", {})
+            spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(path))
+            for mesh in spec.meshes if is_urdf else ():
+                mesh.file = str(files[Path(mesh.file).stem])
             return Model(path, spec, spec.compile(), is_urdf)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error

@@ -14,11 +14,11 @@ LEAST_INERTIA = 1e-9
 """Principal moment given to a link whose inertia is not one of any real body [kg·m²]."""
 
 
-def as_mujoco_text(path: Path) -> str:
-    """Return a URDF's text with what MuJoCo needs to read it.
+def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
+    """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
 
-    Mesh paths become absolute (`package://` is looked up in the folders above the file), links on fixed joints keep their
-    own bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size.
+    Mesh files are found (`package://` is looked up in the folders above the file), links on fixed joints keep their own
+    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size.
 
     Raises:
         RobotError: If the file is not XML, or a mesh cannot be found.
@@ -28,8 +28,14 @@ def as_mujoco_text(path: Path) -> str:
     except ET.ParseError as error:
         raise RobotError(f"{path}: not XML: {error}") from error
     robot = tree.getroot()
+    files: dict[str, Path] = {}
     for mesh in robot.iter("mesh"):
-        mesh.set("filename", str(_mesh_file(mesh.get("filename", ""), path)))
+        file = _mesh_file(mesh.get("filename", ""), path)
+        stem, number = file.stem, 1
+        while files.setdefault(stem, file) != file:  # MuJoCo tells a URDF's meshes apart by this alone
+            number += 1
+            stem = f"{file.stem}_{number}"
+        mesh.set("filename", f"{stem}{file.suffix}")
     mended = [link.get("name", "") for link in robot.iter("link") if _mend(link)]
     if mended:
         warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=4)
@@ -38,7 +44,7 @@ def as_mujoco_text(path: Path) -> str:
     compiler = settings.find("compiler")
     compiler = ET.SubElement(settings, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "meshdir": ""}
-    return ET.tostring(robot, encoding="unicode")
+    return ET.tostring(robot, encoding="unicode"), files
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
@@ -62,7 +68,10 @@ def _mend(link: ET.Element) -> bool:
     inertia = link.find("inertial/inertia")
     if inertia is None:
         return False
-    xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", "0")) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    try:
+        xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", "0")) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    except ValueError:
+        return False  # MuJoCo will name the line
     low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     if low > 0 and low + middle >= high * (1 - 1e-9):
         return False

@@ -127,14 +127,16 @@ def relate(
     apart = planes.sub(planes.split(pos[:, link]), planes.split(pos[:, target]))
     rotation = planes.transpose_times(target_rotation, link_rotation)
     offset = planes.rotate_back(target_rotation, apart)
-    motion = None
+    parts = [*rotation, *offset]
     if linvel is not None and angvel is not None:
         spin, turn = planes.split(angvel[:, target]), planes.split(angvel[:, link])
         slide = planes.sub(planes.split(linvel[:, target]), planes.split(linvel[:, link]))
-        linear = planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
-        angular = planes.rotate_back(link_rotation, planes.sub(spin, turn))
-        motion = Motion(_cast(linear, dtype), _cast(angular, dtype))
-    return Pairs(tuple(part.to(dtype) for part in rotation), _cast(offset, dtype), motion, gate)  # type: ignore[arg-type]
+        parts += planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
+        parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
+    # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
+    parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
+    motion = Motion(_vec(parts[12:15]), _vec(parts[15:18])) if len(parts) > 12 else None
+    return Pairs(parts[:9], _vec(parts[9:12]), motion, gate)  # type: ignore[arg-type]
 
 
 def feel(
@@ -199,6 +201,6 @@ def _gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
     return x[:, own][:, pair], y[:, own][:, pair], z[:, own][:, pair]
 
 
-def _cast(vector: Vec, dtype: torch.dtype) -> Vec:
-    x, y, z = vector
-    return x.to(dtype), y.to(dtype), z.to(dtype)
+def _vec(parts: Sequence[Tensor]) -> Vec:
+    x, y, z = parts
+    return x, y, z

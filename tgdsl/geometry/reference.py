@@ -139,31 +139,31 @@ def _cylinder(size: Array, point: Array) -> tuple[Array, bool, Array]:
 
 
 def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
-    """Nearest point by bracketing the Lagrange multiplier t: X_i = e_i² p_i / (t + e_i²), ‖X/e‖ = 1.
+    """Nearest point by bracketing u = t + e², t the Lagrange multiplier: X_i = e_i² p_i / (u + e_i² − e²), ‖X/e‖ = 1.
 
-    If no t above the pole −e² of the least axis solves it, the point is on that axis' plane of symmetry and the nearest
+    If no u above the pole 0 of the least semi-axis e solves it, the point is on that axis' plane of symmetry and the nearest
     points are a mirrored pair, of which the positive is taken.
     """
     square = size**2
     least = int(np.argmin(size))
     sign = np.where(point < 0, -1.0, 1.0)
     y = np.abs(point)
+    gap = square - square[least]
+    terms = [(part, rest) for part, rest in zip((size * y).tolist(), gap.tolist(), strict=True) if part > 0]
 
-    scaled, poles = (size * y).tolist(), square.tolist()
+    def excess(u: float) -> float:
+        return sum((part / (u + rest)) ** 2 for part, rest in terms) - 1.0
 
-    def excess(t: float) -> float:
-        return sum((part / (t + pole)) ** 2 for part, pole in zip(scaled, poles, strict=True)) - 1.0
-
-    others = np.arange(3) != least
-    flat = others & (square > square[least])
-    at_pole = np.sum((size[flat] * y[flat] / (square[flat] - square[least])) ** 2)
+    flat = square > square[least]
+    at_pole = np.sum((size[flat] * y[flat] / gap[flat]) ** 2)
     if not np.any(y[square == square[least]] > 0) and at_pole <= 1.0:
         nearest = np.zeros(3)
-        nearest[flat] = square[flat] * y[flat] / (square[flat] - square[least])
+        nearest[flat] = square[flat] * y[flat] / gap[flat]
         nearest[least] = size[least] * np.sqrt(1.0 - at_pole)
     else:
-        low, high = float(size[least] * y[least] - square[least]), float(np.linalg.norm(size * y) - square[least])
-        nearest = square * y / (brentq(excess, low, high, xtol=1e-300, rtol=1e-15) + square)
+        low, high = max(1e-300, float(np.max(size * y - gap))), float(np.linalg.norm(size * y))
+        u = brentq(excess, 0.5 * low, 2.0 * max(low, high), xtol=1e-300, rtol=1e-15)
+        nearest = square * y / (u + gap)
     inside = bool(np.sum((point / size) ** 2) < 1.0)
     outward = nearest / square
     return sign * nearest, inside, sign * outward / np.linalg.norm(outward)

@@ -61,8 +61,10 @@ class BatchSimulation:
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe, or there is nothing to step.
         """
+        if num_envs < 1 or substeps < 1:
+            raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
         self.model = scene_model(touch.plan.scene) if model is None else model
         self.substeps = substeps
         self._touch = touch
@@ -118,9 +120,13 @@ class BatchSimulation:
         return SceneState(**values)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start some environments anew (default: all), in the simulator and in the module."""
+        """Start some environments anew (default: all), in the simulator and in the module.
+
+        Raises:
+            SimulationError: If there are no such environments, or MuJoCo reports one as failed.
+        """
         ids = None if env_ids is None else np.asarray(torch.as_tensor(env_ids).cpu())
-        if ids is not None and ids.dtype == bool:
+        if ids is not None and ids.dtype == bool and ids.shape == (self.num_envs,):
             ids = np.flatnonzero(ids)
         if ids is None or len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
@@ -129,7 +135,7 @@ class BatchSimulation:
     def _run(self, call: Callable[[], None]) -> None:
         try:
             call()
-        except mujoco.batch.SimulationError as error:
+        except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
 
     def _id(self, kind: str, name: str, what: str) -> int:
@@ -147,7 +153,7 @@ class BatchSimulation:
             sensor = self.model.sensor(name)
         except KeyError as error:
             what = f'the scene has no contact sensor "{name}", which the module wants'
-            raise SimulationError(f"{what}; add them with tgdsl.instrument(spec, touch) before compiling") from error
+            raise SimulationError(f"{what}; add them with tgdsl.instrument(spec, touch.inputs) before compiling") from error
         return slice(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
 
     def _body_pos(self) -> Float[Array, "env body 3"]:

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import mujoco
 import numpy as np
@@ -42,8 +43,10 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
         control_step: Duration of a control step [s].
 
     Raises:
-        SimulationError: If the scene has no such keyframe.
+        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive.
     """
+    if not keyframes or not 0 < seconds < np.inf:
+        raise SimulationError(f"{len(keyframes)} keyframes held for {seconds:g} s: expected at least one, and more than 0 s")
     known = [model.key(i).name for i in range(model.nkey)]
     for name in keyframes:
         if name not in known:
@@ -66,9 +69,9 @@ def recorded_controls(path: Path) -> Controls:
     try:
         with np.load(path, allow_pickle=False) as archive:
             controls = archive["ctrl"]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
         raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
-    if controls.ndim not in (2, 3) or not np.issubdtype(controls.dtype, np.floating):
+    if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
         raise SimulationError(
             f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, expected floats (step, actuator) or (step, env, actuator)"
         )

@@ -166,7 +166,9 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     if known is not None and (known.parent / "layout.yaml").is_file():
         return known.parent / "layout.yaml"
     loaded.problems.append(
-        loaded.source.problem(("robot",), 'missing key "layout"', "only robots given by name bring their own layout")
+        loaded.source.problem(
+            ("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True
+        )
     )
     return None
 
@@ -339,7 +341,7 @@ def _name_problems(loaded: Loaded) -> list[Problem]:
                 hint = did_you_mean(target, sensors, "sensors")
                 problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
     if loaded.layout is not None:
-        resolutions = list((loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {}))
+        resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})
         if loaded.resolution is None and source.get(("resolution",)) is None:
             hint = f"the layout has {', '.join(resolutions)}"
             problems.append(source.problem((), 'missing key "resolution"', hint, on_key=True))

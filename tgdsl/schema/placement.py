@@ -96,7 +96,10 @@ def _as_list(value: object) -> object:
 class _Sampled(SpecModel):
     radius: Radius
     """Sensing radius of each probe [m]; 0 makes it an inactive filler."""
-    region: Annotated[tuple[_TaggedRegion, ...], BeforeValidator(_as_list)] = ()
+    region: Annotated[
+        tuple[_TaggedRegion, ...],
+        BeforeValidator(_as_list, json_schema_input_type=_TaggedRegion | tuple[_TaggedRegion, ...]),
+    ] = ()
     """Part of the surface to sample: a region, or a list of regions that means their intersection; default: all of it."""
 
 

@@ -161,15 +161,14 @@ class _Reader:
             return self.mapping(node, path, (*inside, id(node)))
         if isinstance(node, SequenceNode):
             return [self.read(part, (*path, i), (*inside, id(node))) for i, part in enumerate(node.value)]
+        if not _is_text(node.value):
+            self.note(node, path, "half of a surrogate pair is no text")
+            return Unreadable
         try:
-            value = self.constructor.construct_object(node)
+            return self.constructor.construct_object(node)
         except Exception as error:  # ruamel lets through whatever Python raises on, say, `!!bool maybe`
             self.note(node, path, f"cannot read this value: {getattr(error, 'problem', None) or error}")
             return Unreadable
-        if isinstance(value, str) and not _is_text(value):
-            self.note(node, path, "half of a surrogate pair is no text")
-            return Unreadable
-        return value
 
     def mapping(self, node: MappingNode, path: Path, inside: tuple[int, ...]) -> dict[str, Any]:
         """Return a mapping; its own keys count before those merged in, and so do their places."""

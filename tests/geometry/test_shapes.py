@@ -1,0 +1,155 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from tgdsl.geometry.reference import signed_distance
+from tgdsl.geometry.shapes import SHAPES
+
+SIZES = {
+    "plane": [(1.0, 1.0, 0.1)],
+    "sphere": [(0.02, 0.0, 0.0)],
+    "capsule": [(0.01, 0.03, 0.0), (0.02, 0.001, 0.0)],
+    "box": [(0.02, 0.015, 0.03), (0.02, 0.02, 0.02), (0.05, 0.04, 1e-4)],
+    "cylinder": [(0.012, 0.03, 0.0), (0.05, 0.002, 0.0)],
+    "ellipsoid": [(0.02, 0.012, 0.03), (0.02, 0.02, 0.01), (0.015, 0.015, 0.015), (0.05, 0.001, 0.02)],
+}
+CASES = [(shape, size) for shape, sizes in SIZES.items() for size in sizes]
+DISTANCE_TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
+"""Of the shape's largest size: float64 to rounding, float32 to some eight roundings."""
+
+
+def distances(shape: str, size: tuple[float, ...], points: np.ndarray, dtype: torch.dtype):
+    p = torch.tensor(points, dtype=dtype)
+    s = torch.tensor(size, dtype=dtype)
+    distance, gradient = SHAPES[shape](tuple(p.unbind(-1)), tuple(s.unbind(-1)))
+    return distance.double().numpy(), torch.stack(gradient, dim=-1).double().numpy()
+
+
+def reference(shape: str, size: tuple[float, ...], points: np.ndarray):
+    pairs = [signed_distance(shape, np.array(size), point) for point in points]
+    return np.array([d for d, _ in pairs]), np.array([g for _, g in pairs])
+
+
+def random_points(size: tuple[float, ...], count: int, seed: int = 0) -> np.ndarray:
+    """Points all over the shape and around it, half of them near its bounding box."""
+    rng = np.random.default_rng(seed)
+    extent = np.array(size) + max(size) * 0.3
+    return rng.uniform(-1, 1, (count, 3)) * extent * rng.uniform(0.2, 1.5, (count, 1))
+
+
+def special_points(size: tuple[float, ...]) -> np.ndarray:
+    """Centre, axes, planes of symmetry, faces, edges and corners of the bounding box, from inside and outside."""
+    values = [[-1.5 * s, -s, -0.5 * s, 0.0, 0.5 * s, s, 1.5 * s] for s in size]
+    return np.array(list(itertools.product(*values)))
+
+
+@pytest.mark.parametrize(("shape", "size"), CASES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_distance_is_that_of_the_nearest_surface_point(shape, size, dtype):
+    points = np.concatenate([random_points(size, 1500), special_points(size)]).astype(np.float32).astype(np.float64)
+    found, _ = distances(shape, size, points, dtype)
+    expected, _ = reference(shape, size, points)
+    assert np.abs(found - expected).max() <= DISTANCE_TOLERANCE[dtype] * max(size)
+
+
+@pytest.mark.parametrize(("shape", "size"), CASES)
+def test_gradient_points_away_from_the_nearest_surface_point(shape, size):
+    points = random_points(size, 1500)
+    _, found = distances(shape, size, points, torch.float64)
+    _, expected = reference(shape, size, points)
+    assert np.abs(found - expected).max() < 1e-7
+
+
+@pytest.mark.parametrize(("shape", "size"), [case for case in CASES if case[0] != "ellipsoid"])
+def test_where_the_nearest_point_is_not_unique_the_convention_holds(shape, size):
+    points = special_points(size)
+    _, found = distances(shape, size, points, torch.float64)
+    _, expected = reference(shape, size, points)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "size"), CASES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gradient_is_a_unit_vector_everywhere(shape, size, dtype):
+    tiny = 1e-30 * np.random.default_rng(0).normal(size=(50, 3))
+    points = np.concatenate([random_points(size, 1000), special_points(size), tiny, 1e-12 + special_points(size)])
+    distance, gradient = distances(shape, size, points, dtype)
+    assert np.isfinite(distance).all()
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("shape", "size"), CASES)
+def test_autograd_gives_the_gradient(shape, size):
+    p = torch.tensor(random_points(size, 500), requires_grad=True)
+    s = torch.tensor(size, dtype=torch.float64)
+    distance, gradient = SHAPES[shape](tuple(p.unbind(-1)), tuple(s.unbind(-1)))
+    (derivative,) = torch.autograd.grad(distance.sum(), p)
+    torch.testing.assert_close(derivative, torch.stack(gradient, dim=-1).detach(), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(("shape", "size"), CASES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_derivatives_are_finite_everywhere(shape, size, dtype):
+    p = torch.tensor(special_points(size), dtype=dtype, requires_grad=True)
+    s = torch.tensor(size, dtype=dtype, requires_grad=True)
+    distance, gradient = SHAPES[shape](tuple(p.unbind(-1)), tuple(s.unbind(-1)))
+    total = distance.sum() + sum((part * (i + 1.0)).sum() for i, part in enumerate(gradient))
+    for derivative in torch.autograd.grad(total, (p, s), allow_unused=True):
+        assert derivative is None or torch.isfinite(derivative).all()
+
+
+@pytest.mark.parametrize("size", SIZES["ellipsoid"])
+def test_ellipsoid_derivative_with_respect_to_its_size(size):
+    points = torch.tensor(random_points(size, 200))
+
+    def distance(s: torch.Tensor) -> torch.Tensor:
+        return SHAPES["ellipsoid"](tuple(points.unbind(-1)), tuple(s.unbind(-1)))[0]
+
+    # One Newton step carries the derivative, but not where two equal axes exchange their roles.
+    if len(set(size)) == 3:
+        assert torch.autograd.gradcheck(distance, torch.tensor(size, dtype=torch.float64, requires_grad=True), eps=1e-9, atol=1e-4)
+
+
+def test_known_distances():
+    """Distances that need no code: (shape, size, point, distance, gradient)."""
+    third = 1 / np.sqrt(3)
+    table = [
+        ("plane", (0, 0, 0), (5, -3, -2), -2.0, (0, 0, 1)),
+        ("sphere", (2, 0, 0), (0, 0, 0), -2.0, (1, 0, 0)),
+        ("sphere", (2, 0, 0), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
+        ("capsule", (1, 2, 0), (0, 0, 5), 2.0, (0, 0, 1)),
+        ("capsule", (1, 2, 0), (0, 0, 1), -1.0, (1, 0, 0)),
+        ("capsule", (1, 2, 0), (3, 4, 2), 4.0, (0.6, 0.8, 0)),
+        ("box", (1, 2, 3), (2, 3, 4), np.sqrt(3), (third, third, third)),
+        ("box", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
+        ("box", (1, 2, 3), (-0.5, 1.9, 0), -0.1, (0, 1, 0)),
+        ("box", (1, 2, 3), (1, 2, 3), 0.0, (1, 0, 0)),
+        ("cylinder", (1, 2, 0), (4, 0, 6), 5.0, (0.6, 0, 0.8)),
+        ("cylinder", (1, 2, 0), (0, 0, 0), -1.0, (1, 0, 0)),
+        ("cylinder", (3, 1, 0), (0, 0, -0.5), -0.5, (0, 0, -1)),
+        ("ellipsoid", (1, 2, 3), (0, 0, 5), 2.0, (0, 0, 1)),
+        ("ellipsoid", (1, 2, 3), (-4, 0, 0), 3.0, (-1, 0, 0)),
+        ("ellipsoid", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
+        ("ellipsoid", (2, 2, 2), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
+    ]
+    for shape, size, point, distance, gradient in table:
+        found, direction = distances(shape, size, np.array([point], dtype=float), torch.float64)
+        assert found[0] == pytest.approx(distance, abs=1e-12), (shape, point)
+        np.testing.assert_allclose(direction[0], gradient, atol=1e-12, err_msg=f"{shape} {point}")
+
+
+def test_half_way_to_the_surface_of_an_ellipsoid():
+    """p = X + t n with X on the surface and n its normal has the distance t: exact for every X."""
+    rng = np.random.default_rng(0)
+    size = np.array([0.02, 0.012, 0.03])
+    on_sphere = rng.normal(size=(1000, 3))
+    surface = size * on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True)
+    normal = surface / size**2
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    least_curvature_radius = size.min() ** 2 / size.max()
+    for t in (0.05, 0.5 * least_curvature_radius, 0.0, -0.5 * least_curvature_radius):
+        found, gradient = distances("ellipsoid", tuple(size), surface + t * normal, torch.float64)
+        np.testing.assert_allclose(found, t, atol=1e-14)
+        np.testing.assert_allclose(gradient, normal, atol=1e-11)

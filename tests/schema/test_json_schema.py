@@ -1,0 +1,168 @@
+"""The JSON Schema says what the loader says, by a small validator of the keywords that it uses."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from documents import DOCUMENT, LAYOUT, POISSON, read, valid
+from wrong import WRONG, WRONG_LAYOUT
+
+from tgdsl.errors import SpecError
+from tgdsl.schema import yaml
+from tgdsl.schema.document import json_schema
+from tgdsl.schema.files import robots_folder
+from tgdsl.sensors import KINDS
+
+SCHEMA = json_schema()
+TYPES = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "null": type(None)}
+ANNOTATIONS = {"$schema", "$defs", "title", "description", "default", "discriminator", "then", "else"}
+
+
+def accepts(schema: dict[str, Any], value: Any) -> bool:
+    return all(holds(key, schema, value) for key in schema if key not in ANNOTATIONS)
+
+
+def holds(key: str, schema: dict[str, Any], value: Any) -> bool:
+    """Whether one keyword of draft 2020-12 holds; a keyword that is not known here is an error."""
+    wanted = schema[key]
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    match key:
+        case "$ref":
+            return accepts(SCHEMA["$defs"][wanted.removeprefix("#/$defs/")], value)
+        case "type":
+            return isinstance(value, TYPES[wanted]) and (wanted == "boolean" or not isinstance(value, bool))
+        case "const":
+            return value == wanted
+        case "enum":
+            return value in wanted
+        case "anyOf":
+            return any(accepts(part, value) for part in wanted)
+        case "oneOf":
+            return sum(accepts(part, value) for part in wanted) == 1
+        case "if":
+            return accepts(schema["then" if accepts(wanted, value) else "else"], value)
+        case "required":
+            return not isinstance(value, dict) or set(wanted) <= set(value)
+        case "minProperties":
+            return not isinstance(value, dict) or len(value) >= wanted
+        case "properties":
+            return not isinstance(value, dict) or all(accepts(wanted[k], v) for k, v in value.items() if k in wanted)
+        case "patternProperties":
+            return not isinstance(value, dict) or all(
+                accepts(part, v) for pattern, part in wanted.items() for k, v in value.items() if re.search(pattern, k)
+            )
+        case "additionalProperties":
+            if not isinstance(value, dict):
+                return True
+            others = [v for k, v in value.items() if k not in schema.get("properties", {})]
+            return not others if wanted is False else all(accepts(wanted, v) for v in others)
+        case "prefixItems":
+            return not isinstance(value, list) or all(map(accepts, wanted, value))
+        case "items":
+            return not isinstance(value, list) or all(accepts(wanted, part) for part in value)
+        case "minItems":
+            return not isinstance(value, list) or len(value) >= wanted
+        case "maxItems":
+            return not isinstance(value, list) or len(value) <= wanted
+        case "pattern":
+            return not isinstance(value, str) or re.search(wanted, value) is not None
+        case "minimum":
+            return not is_number or value >= wanted
+        case "maximum":
+            return not is_number or value <= wanted
+        case "exclusiveMinimum":
+            return not is_number or value > wanted
+    raise NotImplementedError(key)
+
+
+def plain(text: str) -> Any:
+    return yaml.parse(text, "f").value
+
+
+def test_it_is_plain_json_whose_references_lead_somewhere():
+    text = json.dumps(SCHEMA)
+    assert json.loads(text) == SCHEMA
+    assert set(re.findall(r'"\$ref": "#/\$defs/(\w+)"', text)) <= set(SCHEMA["$defs"])
+    assert SCHEMA["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+
+
+def test_good_documents_are_accepted():
+    layout = robots_folder() / "xhand1" / "layout.yaml"
+    for document in (plain(DOCUMENT), {"tgdsl": 1} | plain(LAYOUT), valid(), plain(layout.read_text("utf-8"))):
+        assert accepts(SCHEMA, document)
+
+
+BEYOND_A_SCHEMA = {
+    "out of range",
+    "two keys at odds",
+    "missing layout",
+    "duplicate key",
+    "huge number",
+    "not a name",
+    "layout file that does not exist",
+    "layout file with a name too long",
+    "tab",
+    "no resolution",
+    "unknown object",
+    "unknown sensor",
+    "unknown noise profile",
+    "unknown resolution",
+    "knob in line",
+    "knob of a built-in profile",
+    "knob of an own profile",
+}
+"""Mistakes that only the loader finds: between keys, of names and files, and those of YAML itself."""
+
+
+@pytest.mark.parametrize("name", sorted(set(WRONG) - {"empty", "tab", "null"}))
+def test_wrong_documents_are_refused_where_a_schema_can(name):
+    assert accepts(SCHEMA, plain(WRONG[name][0])) == (name in BEYOND_A_SCHEMA)
+
+
+@pytest.mark.parametrize("name", sorted(WRONG_LAYOUT))
+def test_wrong_layouts_are_refused_where_a_schema_can(name):
+    layout = {"tgdsl": 1} | plain(LAYOUT.replace(POISSON, f"{POISSON[:-1]}, {WRONG_LAYOUT[name][0]}}}", 1))
+    assert accepts(SCHEMA, layout) == (name in ("unordered box", "two of which one is wanted"))
+
+
+QUANTITIES = ["4 mm", "4mm", "-4 mm", ".4e1 µm", "4.", "4", "4 mn", "4 MM", "mm", "4 mm 5", "", "٤ mm", "4 N", "1e-3 m"]
+
+
+@pytest.mark.parametrize("text", QUANTITIES)
+def test_patterns_of_units_agree_with_the_loader(tmp_path: Path, text):
+    pos = f'{{method: points, radius: 0, points: [{{pos: ["{text}", 0, 0], normal: [0, 0, 1]}}]}}'
+    layout = LAYOUT.replace(POISSON, pos)
+    assert pos in layout
+    try:
+        read(tmp_path, layout=layout)
+        is_good = True
+    except SpecError:
+        is_good = False
+    assert accepts(SCHEMA, {"tgdsl": 1} | plain(layout)) == is_good
+    assert is_good == (text in QUANTITIES[:6] + QUANTITIES[-1:])
+
+
+def test_every_key_is_described():
+    bare = [
+        f"{name}.{key}"
+        for name, definition in SCHEMA["$defs"].items()
+        for key, value in definition.get("properties", {}).items()
+        if not value.get("description")
+    ]
+    assert bare == []
+    assert [name for name, definition in SCHEMA["$defs"].items() if not definition.get("description")] == []
+
+
+def test_unknown_keys_are_refused_everywhere():
+    assert [name for name, part in SCHEMA["$defs"].items() if part.get("additionalProperties") is not False] == []
+
+
+def test_all_kinds_are_there():
+    sensors = SCHEMA["$defs"]["Document"]["properties"]["sensors"]
+    (sensor,) = sensors["patternProperties"].values()
+    assert set(sensor["discriminator"]["mapping"]) == {kind.name for kind in KINDS}
+    only = json_schema(KINDS[:1])["$defs"]
+    assert f"{KINDS[0].spec.__name__}" in only
+    assert KINDS[1].spec.__name__ not in only

@@ -1,0 +1,97 @@
+"""Whatever is found in a document, only SpecError is raised, and it says something that can be printed."""
+
+from pathlib import Path
+
+from documents import DOCUMENT, valid, write
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tgdsl.errors import SpecError
+from tgdsl.schema.load import load
+
+FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+WORDS = sorted(set(DOCUMENT.replace(":", " ").split()) | {"noise", "observations", "scene", "grid", "points", "box"})
+SCALARS = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.sampled_from(WORDS), st.dates()
+)
+KEYS_OR_TEXT = st.one_of(st.sampled_from(WORDS), st.text(max_size=4))
+VALUES = st.recursive(
+    SCALARS,
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(KEYS_OR_TEXT, inner, max_size=4)),
+    max_leaves=12,
+)
+
+
+def never_another_error(document: object, overrides: dict[str, str] | None = None) -> None:
+    said = "nothing"
+    try:
+        load(document, overrides).raise_problems()  # type: ignore[arg-type]
+    except SpecError as error:
+        said = str(error)
+    assert said.encode()
+
+
+def places(value: object, path: tuple = ()) -> list[tuple]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path] + [place for key, part in inner for place in places(part, (*path, key))]
+
+
+def test_the_fuzzed_document_is_valid():
+    assert load(valid()).problems == []
+
+
+@FUZZ
+@given(st.data())
+def test_one_or_two_parts_replaced(data):
+    document = valid()
+    for _ in range(data.draw(st.integers(1, 2))):
+        path = data.draw(st.sampled_from(places(document)[1:]))
+        parent = document
+        for part in path[:-1]:
+            parent = parent[part]
+        if isinstance(parent, dict) and data.draw(st.booleans()):
+            del parent[path[-1]]
+            parent[data.draw(KEYS_OR_TEXT)] = data.draw(VALUES)
+        else:
+            parent[path[-1]] = data.draw(VALUES)
+    never_another_error(document)
+
+
+@FUZZ
+@given(st.dictionaries(KEYS_OR_TEXT, VALUES, max_size=8))
+def test_arbitrary_mappings(document):
+    never_another_error(document)
+
+
+LINES = DOCUMENT.splitlines(keepends=True)
+PIECES = st.one_of(
+    st.sampled_from(LINES),
+    st.sampled_from(["  ", "\t", ": ", "- ", "[", "]", "{", "}", "&a ", "*a", "<<: ", "? ", "!!int ", "!!set ", "|\n"]),
+    st.sampled_from(['"\\ud800"', "!!timestamp ", "!!binary ", "%YAML 1.1\n", "---\n", "=", "0x", "1e400", ".nan"]),
+    st.text(max_size=4),
+)
+
+
+@FUZZ
+@given(text=st.one_of(st.lists(PIECES, max_size=12).map("".join), st.text()))
+def test_arbitrary_text(tmp_path: Path, text):
+    never_another_error(write(tmp_path, text))
+
+
+@FUZZ
+@given(data=st.data())
+def test_a_document_with_pieces_put_in(tmp_path: Path, data):
+    text = DOCUMENT
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(text)))
+        text = text[:at] + data.draw(PIECES) + text[at + data.draw(st.integers(0, 3)) :]
+    never_another_error(write(tmp_path, text))
+
+
+@FUZZ
+@given(data=st.data())
+def test_arbitrary_overrides(tmp_path: Path, data):
+    key = ".".join(data.draw(st.lists(KEYS_OR_TEXT, min_size=1, max_size=4)))
+    text = data.draw(st.one_of(st.text(max_size=10), PIECES))
+    never_another_error(write(tmp_path), {key: text})

@@ -1,0 +1,49 @@
+"""Names, wildcards and groups against what a shell would take."""
+
+from tgdsl.fields import Selection
+from tgdsl.schema.select import matching, select
+
+LINKS = [["palm"], ["index_tip", "index_mesh"], ["index_mid"], ["thumb_tip", "thumb_mesh"]]
+
+
+def chosen(include, exclude=(), groups=None) -> tuple[list[int], list[tuple[str, str, str]]]:
+    named = {name: Selection(include=tuple(parts)) for name, parts in (groups or {}).items()}
+    said: list[tuple[str, str, str]] = []
+    selection = Selection(include=tuple(include), exclude=tuple(exclude))
+    found = select(selection, LINKS, named, lambda pattern, what, hint: said.append((pattern, what, hint)))
+    return found, said
+
+
+def test_wildcards_take_names_in_the_order_of_the_links_and_heed_case():
+    assert chosen(["thumb_*", "index_*"]) == ([1, 2, 3], [])
+    assert chosen(["*_mesh"]) == ([1, 3], [])
+    assert chosen(["index_m[ie]*"]) == ([1, 2], [])
+    assert chosen(["palm", "palm", "p?lm"]) == ([0], [])
+    assert matching("P*", ["palm", "Palm"]) == ["Palm"]
+
+
+def test_exclude_takes_away_and_may_match_nothing():
+    assert chosen(["*"], ["*_tip", "nobody"]) == ([0, 2], [])
+    assert chosen(["palm"], ["*"]) == ([], [])
+
+
+def test_groups_may_hold_groups():
+    groups = {"tips": ["*_tip"], "index": ["index_*"], "both": ["tips", "palm"]}
+    assert chosen(["both"], groups=groups) == ([0, 1, 3], [])
+    assert chosen(["both"], ["index"], groups) == ([0, 3], [])
+
+
+def test_a_group_counts_before_a_link_of_its_name():
+    assert chosen(["palm"], groups={"palm": ["index_mid"]}) == ([2], [])
+
+
+def test_what_matches_nothing_is_named():
+    assert chosen(["palm", "pam"]) == ([0], [("pam", 'no link matches "pam"', 'did you mean "palm"?')])
+    hint = "known links: index_mesh, index_mid, index_tip, palm, thumb_mesh, thumb_tip, tips"
+    assert chosen(["zzz"], groups={"tips": ["x"]}) == ([], [("zzz", 'no link matches "zzz"', hint)])
+    assert chosen(["tips"], groups={"tips": ["x"]}) == ([], [("tips", 'group "tips" holds no link', "")])
+
+
+def test_groups_that_contain_themselves_end():
+    assert chosen(["a", "palm"], groups={"a": ["b"], "b": ["a", "thumb_tip"]}) == ([0, 3], [])
+    assert chosen(["a"], groups={"a": ["a"]}) == ([], [("a", 'group "a" holds no link', "")])

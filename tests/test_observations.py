@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="a"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="b"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="item"><freejoint/><geom type="sphere" size=".03"/></body>
+</worldbody></mujoco>
+"""
+NORMALS = {"a": [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], "b": [[0, 0, 1], [0.6, 0, 0.8]]}
+
+
+@pytest.fixture
+def touch(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    layout = {
+        link: {"method": "points", "radius": 0.004, "points": [{"pos": [0.004 * i, 0, 0.01], "normal": n} for i, n in enumerate(rows)]}
+        for link, rows in NORMALS.items()
+    }
+    sensor = {"links": "*", "feels": ["item"]}
+    return tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": layout}}},
+            "objects": {"item": {"body": "item"}},
+            "sensors": {
+                "touch": {"kind": "kinematic_taxel", **sensor},
+                "depth": {"kind": "contact_depth", **sensor},
+                "contact": {"kind": "contact", **sensor},
+            },
+            "observations": {
+                "taxels": [{"type": "force", "of": "touch"}, {"type": "depth", "of": "depth"}],
+                "all": [{"type": "force_torque", "of": "touch"}],
+                "links": [{"type": "agg_force", "of": "depth"}, {"type": "agg_bool", "of": "contact"}],
+                "plain": [{"type": "agg_force", "of": "depth", "axes": "xyz", "scale": 2}, {"type": "bool", "of": "contact"}],
+                "any": [{"type": "agg_bool", "of": "contact", "more_than": 0}],
+            },
+        },
+        dtype=torch.float64,
+    )
+
+
+@pytest.fixture
+def readings():
+    rng = np.random.default_rng(0)
+    return {
+        "touch": torch.tensor(rng.normal(size=(3, 6, 6))),
+        "depth": torch.tensor(rng.uniform(0, 0.004, (3, 6, 1))),
+        "contact": torch.tensor([[1, 1, 1, 0, 1, 1], [1, 1, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1]], dtype=torch.float64)[..., None],
+    }
+
+
+def test_taxels_are_flattened_channel_major(touch, readings):
+    found = touch.observe(readings)
+    force = readings["touch"][:, :, :3].numpy()
+    expected = np.concatenate([*(force[:, :, axis] for axis in range(3)), readings["depth"][:, :, 0].numpy()], axis=1)
+    np.testing.assert_array_equal(found["taxels"].numpy(), expected)
+    both = readings["touch"].numpy()
+    np.testing.assert_array_equal(found["all"].numpy(), np.concatenate([both[:, :, c] for c in range(6)], axis=1))
+
+
+def test_agg_force_is_the_papers_formula(touch, readings):
+    """10⁴ P_ZYX Σ d n, per link, channel-major: z of every link, then y, then x."""
+    depth = readings["depth"].numpy()[:, :, 0]
+    per_link = np.stack(
+        [np.einsum("ej,jk->ek", depth[:, :4], NORMALS["a"]), np.einsum("ej,jk->ek", depth[:, 4:], NORMALS["b"])], axis=1
+    )
+    found = touch.observe(readings)
+    expected = 1e4 * per_link[:, :, ::-1].transpose(0, 2, 1).reshape(3, 6)
+    np.testing.assert_allclose(found["links"][:, :6].numpy(), expected, rtol=1e-12)
+    np.testing.assert_allclose(found["plain"][:, :6].numpy(), 2 * per_link.transpose(0, 2, 1).reshape(3, 6), rtol=1e-12)
+
+
+def test_agg_bool_counts_more_than_two(touch, readings):
+    found = touch.observe(readings)
+    np.testing.assert_array_equal(found["links"][:, 6:].numpy(), [[1, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(found["any"].numpy(), [[1, 1], [1, 0], [0, 1]])
+    np.testing.assert_array_equal(found["plain"][:, 6:].numpy(), readings["contact"][:, :, 0].numpy())
+
+
+def test_not_a_number_is_not_hidden_by_a_count(touch, readings):
+    readings["contact"][0, 0] = torch.nan
+    assert touch.observe(readings)["links"][0, 6].isnan()
+
+
+def test_the_plan_says_how_many_features_there_are(touch, readings):
+    found = touch.observe(readings)
+    planned: dict[str, int] = {}
+    for term in touch.plan.observations:
+        planned[term.group] = planned.get(term.group, 0) + term.num_features
+    assert {group: part.shape[1] for group, part in found.items()} == planned
+    real = touch.observe(touch(touch.example_state(2)))
+    assert {group: tuple(part.shape) for group, part in real.items()} == {group: (2, n) for group, n in planned.items()}
