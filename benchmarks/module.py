@@ -21,7 +21,8 @@ import tyro
 from torch import Tensor
 
 import tgdsl
-from tgdsl.module import SceneState, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.state import SceneState
 
 PAD = """
 <mujoco><worldbody>

@@ -9,9 +9,10 @@ import torch
 import tgdsl
 from tgdsl.errors import SpecError, StateError, TgdslError
 from tgdsl.explain import operations_per_env
-from tgdsl.module import SceneState, TactileModule
+from tgdsl.module import TactileModule
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import Channel, Kind, Lowered, ProbeSpec
+from tgdsl.state import SceneState
 
 SCENE = """
 <mujoco><worldbody>
@@ -91,13 +92,19 @@ def test_outputs_and_taxels_describe_the_readings(touch):
     readings = touch(touch.example_state(5))
     assert {output.name: (5, *output.shape) for output in touch.outputs} == {k: tuple(v.shape) for k, v in readings.items()}
     first = touch.outputs[0]
-    assert (first.name, first.kind, first.channels[:4]) == ("touch", "kinematic_taxel", ("force_x", "force_y", "force_z", "torque_x"))
+    assert (first.name, first.kind, first.channels[:4]) == (
+        "touch",
+        "kinematic_taxel",
+        ("force_x", "force_y", "force_z", "torque_x"),
+    )
     assert first.units == ("N",) * 3 + ("N·m",) * 3
     table = touch.taxels["touch"]
     assert list(table.dtype.names) == ["link", "body", "pos", "normal", "tangent", "radius", "area", "row", "column", "groups"]
     assert set(table["link"]) == {"pad"} and set(table["groups"]) == {"all,flat"}
     np.testing.assert_allclose(table["pos"][:, 2], 0.01)
-    assert [tuple(cell) for cell in zip(table["row"], table["column"], strict=True)] == [(r, c) for r in range(3) for c in range(4)]
+    assert [tuple(cell) for cell in zip(table["row"], table["column"], strict=True)] == [
+        (r, c) for r in range(3) for c in range(4)
+    ]
 
 
 def test_readings_are_views_of_channel_major_storage(touch):
@@ -127,7 +134,14 @@ def test_a_shared_query_costs_once(document):
 
 def test_explain_names_counts_inputs_and_what_was_dropped(touch):
     text = touch.explain()
-    for part in ("12 taxels", "link tip: no sensor is on it", "pad – item", "for touch, contact", "remembers bit", "contact_found"):
+    for part in (
+        "12 taxels",
+        "link tip: no sensor is on it",
+        "pad – item",
+        "for touch, contact",
+        "remembers bit",
+        "contact_found",
+    ):
         assert part in text
     assert f"{operations_per_env(touch)} elementary operations" in text
     assert f"{4 * 12 * (6 + 6 + 1)} bytes of readings" in text

@@ -18,7 +18,11 @@ NORMALS = {"a": [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], "b": [[0, 0, 1], [
 def touch(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     layout = {
-        link: {"method": "points", "radius": 0.004, "points": [{"pos": [0.004 * i, 0, 0.01], "normal": n} for i, n in enumerate(rows)]}
+        link: {
+            "method": "points",
+            "radius": 0.004,
+            "points": [{"pos": [0.004 * i, 0, 0.01], "normal": n} for i, n in enumerate(rows)],
+        }
         for link, rows in NORMALS.items()
     }
     sensor = {"links": "*", "feels": ["item"]}

@@ -12,7 +12,9 @@ import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch import BatchSimulation
-from tgdsl.runtime.view import Camera, Dots, camera_for, dots_of, is_seen, picture, rasterise, short_names, solid_of
+from tgdsl.runtime.dots import Dots, dots_of
+from tgdsl.runtime.shot import Camera, camera_for, is_seen, rasterise, solid_of
+from tgdsl.runtime.view import picture, short_names
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 

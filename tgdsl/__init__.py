@@ -1,9 +1,9 @@
 """Touch for robot learning: a scene and sensor language compiled to one batched PyTorch module.
 
-    touch = tgdsl.compile("hand.yaml")
-    sim = tgdsl.simulate(touch, num_envs=1024)
-    sim.step(control)
-    readings = touch(sim.state())
+touch = tgdsl.compile("hand.yaml")
+sim = tgdsl.simulate(touch, num_envs=1024)
+sim.step(control)
+readings = touch(sim.state())
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from tgdsl.compiler.pipeline import load_module as load
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import ArtifactError, RobotError, SimulationError, SpecError, StateError, TgdslError
-    from tgdsl.module import SceneState, TactileModule
+    from tgdsl.module import TactileModule
     from tgdsl.runtime.batch import BatchSimulation
     from tgdsl.runtime.batch import simulate as simulate
+    from tgdsl.state import SceneState
 
 _PLACES = {
     "ArtifactError": "errors",
     "BatchSimulation": "runtime.batch",
     "RobotError": "errors",
-    "SceneState": "module",
+    "SceneState": "state",
     "SimulationError": "errors",
     "SpecError": "errors",
     "StateError": "errors",

@@ -14,7 +14,23 @@ from tgdsl.plan import PlannedSensor
 class _OperationCounter(TorchDispatchMode):
     """Counts the elements that pointwise and matrix operations write: what an eager run computes."""
 
-    FREE = frozenset({"view", "select", "slice", "t", "transpose", "unsqueeze", "squeeze", "detach", "alias", "expand", "clone"})
+    FREE = frozenset(
+        [
+            "view",
+            "select",
+            "slice",
+            "t",
+            "transpose",
+            "unsqueeze",
+            "squeeze",
+            "detach",
+            "alias",
+            "expand",
+            "clone",
+            "unbind",
+            "to_copy",
+        ]
+    )
 
     def __init__(self) -> None:
         super().__init__()
@@ -23,7 +39,7 @@ class _OperationCounter(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
         name = func.__name__.split(".")[0].lstrip("_")
-        if isinstance(result, torch.Tensor) and name not in self.FREE and not name.startswith(("to_copy", "unbind")):
+        if isinstance(result, torch.Tensor) and name not in self.FREE:
             self.elements += result.numel()
         return result
 
@@ -34,7 +50,9 @@ def operations_per_env(touch: TactileModule) -> int:
     for num_envs in (2, 4):
         state = touch.example_state(num_envs)
         memory = {
-            f"{s.name}:{plane}": torch.zeros(num_envs, touch.plan.queries[s.query].num_taxels, dtype=touch.dtype)
+            f"{s.name}:{plane}": torch.zeros(
+                num_envs, touch.plan.queries[s.query].num_taxels, dtype=touch.dtype, device=touch.device
+            )
             for s in touch.plan.sensors
             for plane in s.state
         }

@@ -10,7 +10,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,59 +23,7 @@ from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, relate
 from tgdsl.plan import Inputs, Plan, PlannedQuery, PlannedSensor
 from tgdsl.sensors import KINDS, Kind
-
-SHAPES: dict[str, tuple[str | int, ...]] = {
-    "body_pos": ("body", 3),
-    "body_quat": ("body", 4),
-    "body_linvel": ("body", 3),
-    "body_angvel": ("body", 3),
-    "contact_found": ("pair",),
-    "contact_pos": ("pair", "slot", 3),
-    "contact_force": ("pair", "slot", 3),
-    "contact_torque": ("pair", "slot", 3),
-    "contact_normal": ("pair", "slot", 3),
-    "contact_netforce": ("pair", 3),
-}
-"""Shape of each tensor of a `SceneState`, after the leading `env`."""
-
-
-@dataclass
-class SceneState:
-    """What a simulator (or hardware) says of all environments at one instant. Only what `inputs.fields` names is read.
-
-    All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
-    dtype and then cast, so that far from the origin nothing is lost.
-
-    Attributes:
-        body_pos: Position of each body's frame [m].
-        body_quat: Orientation of each body, w, x, y, z.
-        body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
-        body_angvel: Angular velocity of the body [rad/s].
-        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive.
-        contact_pos: Contact points [m].
-        contact_force: Force on the link at each point [N].
-        contact_torque: Torque on the link at each point [N·m].
-        contact_normal: Unit normal out of the object at each point.
-        contact_netforce: The pair's whole force on the link [N].
-        dt: Time since the last state [s].
-    """
-
-    body_pos: Float[Tensor, "env body 3"] | None = None
-    body_quat: Float[Tensor, "env body 4"] | None = None
-    body_linvel: Float[Tensor, "env body 3"] | None = None
-    body_angvel: Float[Tensor, "env body 3"] | None = None
-    contact_found: Tensor | None = None
-    contact_pos: Float[Tensor, "env pair slot 3"] | None = None
-    contact_force: Float[Tensor, "env pair slot 3"] | None = None
-    contact_torque: Float[Tensor, "env pair slot 3"] | None = None
-    contact_normal: Float[Tensor, "env pair slot 3"] | None = None
-    contact_netforce: Float[Tensor, "env pair 3"] | None = None
-    dt: float | None = None
-
-    def to(self, *args: Any, **kwargs: Any) -> SceneState:
-        """Return the state with `torch.Tensor.to` applied to every tensor."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return SceneState(**{name: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for name, v in values.items()})
+from tgdsl.state import SHAPES, SceneState, shape_of
 
 
 @dataclass(frozen=True)
@@ -202,7 +150,7 @@ class TactileModule(nn.Module):
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
         """
-        tensors = self._checked(state)
+        tensors = state.checked(self.inputs, self.device)
         num_envs = tensors["body_pos"].shape[0]
         memory = self._memory_for(num_envs)
         readings, updated = (self._compiled_core or self.core)(tensors, memory)
@@ -231,7 +179,7 @@ class TactileModule(nn.Module):
             constants = self.constants.under(f"sensors/{sensor.name}", sensor.constants)
             result, new = self._kinds[sensor.name].forward(felt, probes, constants, own)
             reading = torch.stack([result[channel] for channel in sensor.channels], dim=1).transpose(1, 2)
-            readings |= {name: reading for name in sensor.readings}
+            readings |= dict.fromkeys(sensor.readings, reading)
             updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         return readings, updated
 
@@ -284,10 +232,9 @@ class TactileModule(nn.Module):
             spread: Standard deviation of the bodies' positions [m].
         """
         generator = torch.Generator().manual_seed(seed)
-        sizes = {"body": len(self.inputs.bodies), "pair": len(self.inputs.pairs), "slot": self.inputs.slots}
         values: dict[str, Any] = {}
         for name in (name for name in self.inputs.fields if name in SHAPES):
-            shape = [num_envs, *(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])]
+            shape = (num_envs, *shape_of(name, self.inputs))
             value = torch.randn(shape, generator=generator, dtype=dtype)
             if name == "body_pos":
                 value = spread * value
@@ -335,32 +282,6 @@ class TactileModule(nn.Module):
         target = self.plan.objects[index]
         tensors = self.constants.under(f"objects/{target.name}", ("size", "pos", "rotation"))
         return FeltObject(target.first_pair, target.num_pairs, target.shapes, target.is_centred, **tensors)
-
-    def _checked(self, state: SceneState) -> dict[str, Tensor]:
-        """Return the wanted fields, after a look at their shapes."""
-        sizes: dict[str, int] = {"body": len(self.inputs.bodies), "pair": len(self.inputs.pairs), "slot": self.inputs.slots}
-        tensors: dict[str, Tensor] = {}
-        num_envs = None
-        for name in self.inputs.fields:
-            value = getattr(state, name)
-            if value is None:
-                raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(self.inputs.fields)}")
-            if name == "dt":
-                continue
-            want = tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
-            if not isinstance(value, Tensor):
-                raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
-            if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
-                raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {', '.join(map(str, want))})")
-            if num_envs is not None and value.shape[0] != num_envs:
-                raise StateError(f"SceneState.{name} holds {value.shape[0]} environments, body_pos {num_envs}")
-            if value.device != self.device:
-                raise StateError(f"SceneState.{name} is on {value.device}, the module on {self.device}")
-            if name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
-                raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
-            num_envs = value.shape[0]
-            tensors[name] = value
-        return tensors
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""

@@ -77,12 +77,7 @@ class ForceTorqueObservation(_Of):
 
 
 ObservationSpec = Annotated[
-    BoolObservation
-    | AggBoolObservation
-    | DepthObservation
-    | AggForceObservation
-    | ForceObservation
-    | ForceTorqueObservation,
+    BoolObservation | AggBoolObservation | DepthObservation | AggForceObservation | ForceObservation | ForceTorqueObservation,
     Field(discriminator="type"),
 ]
 

@@ -24,10 +24,11 @@ from torch import Tensor
 from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.geometry.reference import ReferenceBody, ReferenceGeom, Touch, touch
-from tgdsl.module import SHAPES, SceneState, TactileModule
+from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind, SensorSpec
+from tgdsl.state import SHAPES, SceneState
 
 FLOAT32_TOLERANCE = 1e-5
 """Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""

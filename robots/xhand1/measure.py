@@ -62,8 +62,7 @@ def same_counts(ours: Model, reference: Model) -> bool:
     is_same = True
     for resolution, placements in layout().items():
         mine, theirs = (
-            {link: len(samples.pos) for link, samples in taxels(robot, placements).items()}
-            for robot in (ours, reference)
+            {link: len(samples.pos) for link, samples in taxels(robot, placements).items()} for robot in (ours, reference)
         )
         print(f"{resolution}: {sum(mine.values())} taxels on our surfaces, {sum(theirs.values())} on the vendor's")
         is_same &= mine == theirs
@@ -77,9 +76,7 @@ def main() -> None:
     [urdf] = parser.parse_args().reference_dir.glob("*.urdf")
     ours, reference = load_model(HERE / "xhand1_right.xml"), load_model(urdf)
     is_good = same_counts(ours, reference)
-    found = {
-        link: errors(samples, surface(reference, link)) for link, samples in taxels(ours, layout()["high"]).items()
-    }
+    found = {link: errors(samples, surface(reference, link)) for link, samples in taxels(ours, layout()["high"]).items()}
     print(f"{'link':<30} taxels  mean mm  max mm  mean deg  max deg")
     for link, (distance, angle) in found.items():
         print(row(link, distance, angle))

@@ -109,7 +109,9 @@ def test_ellipsoid_derivative_with_respect_to_its_size(size):
 
     # One Newton step carries the derivative, but not where two equal axes exchange their roles.
     if len(set(size)) == 3:
-        assert torch.autograd.gradcheck(distance, torch.tensor(size, dtype=torch.float64, requires_grad=True), eps=1e-9, atol=1e-4)
+        assert torch.autograd.gradcheck(
+            distance, torch.tensor(size, dtype=torch.float64, requires_grad=True), eps=1e-9, atol=1e-4
+        )
 
 
 def test_known_distances():
@@ -141,7 +143,7 @@ def test_known_distances():
 
 
 def test_half_way_to_the_surface_of_an_ellipsoid():
-    """p = X + t n with X on the surface and n its normal has the distance t: exact for every X."""
+    """P = X + t n with X on the surface and n its normal has the distance t: exact for every X."""
     rng = np.random.default_rng(0)
     size = np.array([0.02, 0.012, 0.03])
     on_sphere = rng.normal(size=(1000, 3))

@@ -145,7 +145,7 @@ def test_velocity_is_the_derivative_of_position(tmp_path):
     assert np.abs(after - now).max() > 1e-3
     # MuJoCo moves positions with the velocity at the end of a step: over two steps, the mean of the velocities at their ends.
     mean = (value(states[1], "body_linvel") + value(states[2], "body_linvel")) / 2
-    np.testing.assert_allclose((after - before) / (2 * sim.control_step), mean, atol=2e-3)
+    np.testing.assert_allclose((after - before) / (2 * sim.control_step), mean, atol=5e-3)
 
 
 def test_state_dtypes_and_fields(tmp_path):
@@ -311,7 +311,7 @@ def test_reset_of_none_does_nothing(tmp_path, ids):
     np.testing.assert_array_equal(sim.batch.qpos, before)
 
 
-@pytest.mark.parametrize("ids", [[3], [-1], [True, False], [0.5]])
+@pytest.mark.parametrize("ids", [[3], [-1], [True, False], np.array([0.5])])
 def test_reset_of_what_is_not_there(tmp_path, ids):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, keyframe="home")
@@ -373,12 +373,18 @@ def test_bad_controls_step_nothing(tmp_path):
     assert not sim.batch.ctrl.any()
 
 
-def test_a_diverging_environment_is_reported(tmp_path):
+def test_a_diverging_environment_is_reported(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the current folder
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, keyframe="home")
     sim.batch.qvel[1, 0] = np.nan
-    with pytest.raises(SimulationError, match=r"^MuJoCo: .*\b1\b"):
+    with pytest.raises(SimulationError) as caught:
         sim.step()
+    assert str(caught.value) == "environments 1 diverged, and MuJoCo has started them anew; reset them to go on"
+    sim.reset([1])
+    sim.step()
+    np.testing.assert_allclose(sim.batch.time, [0.004, 0.002, 0.004])
+    assert np.isfinite(sim.batch.qpos).all()
 
 
 # what a scene lacks
@@ -409,6 +415,18 @@ def test_nothing_to_step(tmp_path, keys):
     touch, _ = arm(tmp_path)
     with pytest.raises(SimulationError, match="expected at least 1 of each"):
         simulate(touch, **keys)
+
+
+def test_rk4_is_refused_because_its_poses_and_contacts_are_of_two_instants(tmp_path):
+    text = PAD.format(mount="", place="pos='0 0 .03'").replace("<option ", "<option integrator='RK4' ")
+    touch = module(scene(tmp_path, text))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1
+    mujoco.mj_step(model, data)
+    assert data.body("cube").xpos[0] > 1e-3  # not where the contacts were found: there is the oracle
+    with pytest.raises(SimulationError, match="^with the integrator RK4 MuJoCo's poses and contacts are of two instants"):
+        simulate(touch, 1)
 
 
 def test_other_devices(tmp_path):

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 import tgdsl
-from tgdsl.module import SceneState, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.state import SceneState
 
 
 def module(

@@ -1,7 +1,7 @@
 import pytest
 import torch
-from sensors.scenes import module, state
 
+from sensors.scenes import module, state
 from tgdsl.errors import SpecError
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.testing import KindConformance
@@ -49,5 +49,7 @@ def test_bits_are_of_the_modules_dtype(tmp_path):
 
 
 def test_release_above_threshold_is_refused(tmp_path):
-    with pytest.raises(SpecError, match=r"sensors\.s: release_threshold 0\.0006 m is above threshold 0\.0005 m, expected at most"):
+    with pytest.raises(
+        SpecError, match=r"sensors\.s: release_threshold 0\.0006 m is above threshold 0\.0005 m, expected at most"
+    ):
         module(tmp_path, [(0, 0, 0)], SPHERE, kind="contact", threshold="0.5 mm", release_threshold="0.6 mm")

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from sensors.scenes import module, state
 
+from sensors.scenes import module, state
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.testing import FAR_TOLERANCE, KindConformance, moved
 
@@ -72,7 +72,9 @@ def test_depth_1_km_from_the_origin(tmp_path, geom):
 def test_a_probe_reaches_its_radius_and_no_further(tmp_path):
     """A 4 cm cube and a radius of 10 mm: the right depth at every clearance, near or far compared with the cube."""
     clearances = np.array([-5.0, 0.0, 1.0, 2.5, 4.0, 5.0, 7.5, 9.0, 9.9, 10.0, 10.1]) * 1e-3
-    touch = module(tmp_path, [(0, 0, HALF + c) for c in clearances], '<geom type="box" size=".02 .02 .02"/>', kind="contact_depth")
+    touch = module(
+        tmp_path, [(0, 0, HALF + c) for c in clearances], '<geom type="box" size=".02 .02 .02"/>', kind="contact_depth"
+    )
     found = touch(state(touch))["s"][0, :, 0].numpy()
     np.testing.assert_allclose(found, np.maximum(R - clearances, 0), atol=1e-15)
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 import torch
-from sensors.scenes import module, state
 
+from sensors.scenes import module, state
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
 

@@ -1,0 +1,1 @@
+"""From documents and robots to Plans and modules."""

@@ -126,9 +126,7 @@ def fold(work: Draft) -> dict[str, np.ndarray]:
     return arrays
 
 
-def pack(
-    work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarray]
-) -> tuple[tuple[PlannedObject, ...], Inputs]:
+def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarray]) -> tuple[tuple[PlannedObject, ...], Inputs]:
     """Number bodies, pairs and objects, and write the index tables of pairs and queries into the arrays."""
     names = sorted({pair.object for pair in work.pairs})
     body_of = {name: work.objects[name][0].body for name in names}

@@ -46,7 +46,7 @@ def compile_plan(document: Document, overrides: Mapping[str, str] | None = None,
     return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs))
 
 
-def compile(  # noqa: A001 - the word users say
+def compile(
     document: Document,
     *,
     resolution: str | None = None,

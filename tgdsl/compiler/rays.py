@@ -70,9 +70,7 @@ def reference_axes(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n
     return np.eye(3)[2 - np.argmax(is_across, axis=1)]
 
 
-def frame(
-    direction: Float[np.ndarray, " 3"], columns: Float[np.ndarray, " 3"] | None = None
-) -> Float[np.ndarray, "3 3"]:
+def frame(direction: Float[np.ndarray, " 3"], columns: Float[np.ndarray, " 3"] | None = None) -> Float[np.ndarray, "3 3"]:
     """Return unit vectors along columns, rows and rays, right-handed; rows run along direction × columns.
 
     Args:
@@ -143,9 +141,7 @@ def _hits(
     return face, ray, np.clip(t, corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1))
 
 
-def _pairs(
-    view: View, uv: Float[np.ndarray, "ray 2"]
-) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
+def _pairs(view: View, uv: Float[np.ndarray, "ray 2"]) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
     """Yield (face, ray) pairs whose bounding boxes meet, in chunks; rays are sorted into coarse squares."""
     if not len(uv):
         return

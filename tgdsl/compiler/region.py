@@ -114,9 +114,7 @@ def _clipped(
     return np.take_along_axis(points, np.take_along_axis(order, slot, 1)[..., None], 1)[kept], kept
 
 
-def _rim(
-    polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, " 3"], radius: float
-) -> Float[np.ndarray, "n k 3"]:
+def _rim(polygons: Float[np.ndarray, "n m 3"], center: Float[np.ndarray, " 3"], radius: float) -> Float[np.ndarray, "n k 3"]:
     """Return where the edges of polygons pass through a sphere; NaN where they do not."""
     start, along = polygons - center, np.roll(polygons, -1, axis=1) - polygons
     a, b = (along**2).sum(-1), (start * along).sum(-1)

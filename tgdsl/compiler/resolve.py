@@ -124,9 +124,7 @@ def _reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem])
     return report
 
 
-def _patches(
-    loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]
-) -> list[Patch]:
+def _patches(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]) -> list[Patch]:
     """Return the links that carry taxels, in the robot's body order."""
     found: dict[str, Patch] = {}
     for pattern, placement in placements.items():
@@ -168,9 +166,7 @@ def _matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
     return links
 
 
-def _sensor_links(
-    loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]
-) -> dict[str, tuple[str, ...]]:
+def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
     candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
     on_robot = _names(robot)
     links: dict[str, tuple[str, ...]] = {}

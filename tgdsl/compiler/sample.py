@@ -114,9 +114,7 @@ def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
     return frame(direction, columns)
 
 
-def _central(
-    placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]
-) -> Int[np.ndarray, " kept"]:
+def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.ndarray, " 2"]) -> Int[np.ndarray, " kept"]:
     """Return which of the cells that hit are kept, ascending: all, or the `count` nearest the rectangle's centre."""
     total = placement.rows * placement.columns
     if not len(cell):
@@ -191,9 +189,7 @@ def _region(surface: Surface, placement: Grid | Poisson) -> Region:
         is_geom=is_geom,
         facings=tuple((_unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
         boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
-        spheres=tuple(
-            (np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)
-        ),
+        spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
     )
 
 

@@ -22,10 +22,34 @@ SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
 """MuJoCo's ways to reduce contacts, in the order of its numbers."""
 COMPARED = (
-    "body_pos body_quat body_mass body_inertia body_ipos geom_pos geom_quat geom_size geom_friction geom_solref geom_contype "
-    "geom_conaffinity mesh_vert jnt_axis jnt_range jnt_pos dof_damping dof_armature actuator_gainprm actuator_biasprm "
-    "actuator_forcerange actuator_ctrlrange key_qpos key_ctrl exclude_signature eq_data tendon_range"
-).split()
+    "body_pos",
+    "body_quat",
+    "body_mass",
+    "body_inertia",
+    "body_ipos",
+    "geom_pos",
+    "geom_quat",
+    "geom_size",
+    "geom_friction",
+    "geom_solref",
+    "geom_contype",
+    "geom_conaffinity",
+    "mesh_vert",
+    "jnt_axis",
+    "jnt_range",
+    "jnt_pos",
+    "dof_damping",
+    "dof_armature",
+    "actuator_gainprm",
+    "actuator_biasprm",
+    "actuator_forcerange",
+    "actuator_ctrlrange",
+    "key_qpos",
+    "key_ctrl",
+    "exclude_signature",
+    "eq_data",
+    "tendon_range",
+)
 """Arrays of the compiled model that a kept scene must reproduce."""
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
 """Elements of an MJCF file's `<asset>` that name a file."""

@@ -1,0 +1,1 @@
+"""Vectors as planes, primitives, the contact query, and triangle surfaces."""

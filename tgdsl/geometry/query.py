@@ -139,9 +139,7 @@ def relate(
     return Pairs(parts[:9], _vec(parts[9:12]), motion, gate)  # type: ignore[arg-type]
 
 
-def feel(
-    pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_normal: bool, with_motion: bool
-) -> Felt:
+def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_normal: bool, with_motion: bool) -> Felt:
     """Query all probes against all objects; the deepest geom wins, the first among equals.
 
     Args:

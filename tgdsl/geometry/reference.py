@@ -25,17 +25,17 @@ class ReferenceBody:
         angvel: Angular velocity [rad/s].
     """
 
-    pos: Float[Array, "3"]
-    quat: Float[Array, "4"]
-    linvel: Float[Array, "3"]
-    angvel: Float[Array, "3"]
+    pos: Float[Array, 3]
+    quat: Float[Array, 4]
+    linvel: Float[Array, 3]
+    angvel: Float[Array, 3]
 
     @cached_property
     def rotation(self) -> Float[Array, "3 3"]:
         """Rotates body vectors into the world."""
         return Rotation.from_quat(self.quat, scalar_first=True).as_matrix()
 
-    def velocity_at(self, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    def velocity_at(self, point: Float[Array, 3]) -> Float[Array, 3]:
         """Velocity [m/s] of the body's material at a world point."""
         return self.linvel + np.cross(self.angvel, point - self.pos)
 
@@ -45,8 +45,8 @@ class ReferenceGeom:
     """A geom in its body's frame: MuJoCo's type name and size [m], position [m], rotation matrix."""
 
     shape: str
-    size: Float[Array, "3"]
-    pos: Float[Array, "3"]
+    size: Float[Array, 3]
+    pos: Float[Array, 3]
     rotation: Float[Array, "3 3"]
 
 
@@ -89,9 +89,7 @@ def touch(
     return felt
 
 
-def signed_distance(
-    shape: str, size: Float[Array, "3"], point: Float[Array, "3"]
-) -> tuple[float, Float[Array, "3"]]:
+def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:
     """Return the signed distance [m] of a point to a primitive, and the outward gradient, both in the geom's frame.
 
     Found by way of the nearest surface point, which the module's own `shapes` never form. Where that is not unique, the

@@ -24,7 +24,7 @@ ELLIPSOID_STEPS = 18
 
 def plane(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     """Half-space z ≤ 0. MuJoCo collides planes as infinite, whatever their size."""
-    x, y, z = point
+    z = point[2]
     zero = torch.zeros_like(z)
     return z, (zero, zero, torch.ones_like(z))
 

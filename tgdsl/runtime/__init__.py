@@ -1,0 +1,1 @@
+"""Simulators and hardware that feed a module, and what shows its readings."""

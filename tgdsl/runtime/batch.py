@@ -16,13 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.module import SceneState, TactileModule
+from tgdsl.module import TactileModule
 from tgdsl.plan import contact_sensor_names
 from tgdsl.runtime.source import EnvIds
 from tgdsl.scene import scene_model
+from tgdsl.state import SceneState
 
 Array = np.ndarray
 _SLOT_SIZE = 16
+_DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 _DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 
 
@@ -61,11 +63,14 @@ class BatchSimulation:
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, or there is nothing to step.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, or if there
+                is nothing to step.
         """
         if num_envs < 1 or substeps < 1:
             raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
         self.model = scene_model(touch.plan.scene) if model is None else model
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
         self.substeps = substeps
         self._touch = touch
         self._keyframe = -1 if keyframe is None else self._id("key", keyframe, "keyframe")
@@ -97,7 +102,8 @@ class BatchSimulation:
             control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were.
 
         Raises:
-            SimulationError: If the controls are not finite or do not fit, or MuJoCo reports an environment as failed.
+            SimulationError: If the controls are not finite or do not fit, an environment diverges, or MuJoCo reports one as
+                failed. The other environments have then made their step.
         """
         if control is not None:
             values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control, dtype=np.float64)
@@ -108,7 +114,12 @@ class BatchSimulation:
             if not np.isfinite(values).all():
                 raise SimulationError(f"control is not finite in environments {_bad_rows(values)}")
             self.batch.ctrl[...] = values
+        self.batch.warning[...] = 0
         self._run(lambda: self.batch.step(nstep=self.substeps))
+        diverged = np.flatnonzero(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1))
+        if len(diverged):
+            which = listed([str(env) for env in diverged])
+            raise SimulationError(f"environments {which} diverged, and MuJoCo has started them anew; reset them to go on")
 
     def state(self) -> SceneState:
         """Return what the module wants, of one instant, in float64 on the module's device."""

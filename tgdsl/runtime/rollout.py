@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -54,7 +55,7 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     steps = max(round(seconds / control_step), 1)
     targets = [model.key_ctrl[model.key(name).id] for name in keyframes]
     parts = [np.tile(targets[0], (steps, 1))]
-    for start, end in zip(targets[:-1], targets[1:], strict=True):
+    for start, end in pairwise(targets):
         ramp = np.linspace(0.0, 1.0, steps)[:, None]
         parts += [start + ramp * (end - start), np.tile(end, (steps, 1))]
     return np.concatenate(parts)
@@ -73,7 +74,8 @@ def recorded_controls(path: Path) -> Controls:
         raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
     if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
         raise SimulationError(
-            f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, expected floats (step, actuator) or (step, env, actuator)"
+            f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, "
+            "expected floats (step, actuator) or (step, env, actuator)"
         )
     return controls.astype(np.float64)
 

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from tgdsl.module import SceneState
+from tgdsl.state import SceneState
 
 EnvIds = Tensor | np.ndarray | Sequence[int]
 """Environments: indices, or a boolean mask over all of them."""

@@ -23,8 +23,10 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
     header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in touch.outputs]
     rows = [[link] + [_cell(touch, output, readings, link, env) for output in touch.outputs] for link in links]
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
-    lines = ["  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))
-             for row in [header, *rows]]
+    lines = [
+        "  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))
+        for row in [header, *rows]
+    ]
     return [lines[0], "  ".join("─" * width for width in widths), *lines[1:]]
 
 

@@ -1,34 +1,27 @@
-"""Pictures of touch: the robot with its taxels coloured by reading, beside one heat map per link. Matplotlib's Agg, no display.
-
-Shapes: `taxel` taxels of one sensor, `face` triangles, `h` and `w` rows and columns of pixels, row 0 at the bottom.
-"""
+"""Pictures of touch: the robot with its taxels coloured by reading, beside one heat map per link. No display is needed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import matplotlib
 import mujoco
 import numpy as np
-import trimesh
-from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module import Output, TactileModule
 from tgdsl.runtime.batch import BatchSimulation
+from tgdsl.runtime.dots import Dots, dots_of, sensor_of
+from tgdsl.runtime.shot import camera_for, is_seen, rasterise, shaded, solid_of, unit
 
 Array = np.ndarray
-GeomType = mujoco.mjtGeom
 SIZE, DPI = (16.0, 9.0), 100
 VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 FINE = 2  # pixels of the 3-D view per pixel of the file, along each axis
@@ -37,57 +30,10 @@ INK, FAINT, REST = "#2b2f36", "#7b828c", "#d3d6da"
 _LIT, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
 _HEAT = LinearSegmentedColormap.from_list("touch", matplotlib.colormaps["YlOrRd"](np.linspace(0.2, 0.93, 256)))
 _HEAT = _HEAT.with_extremes(under=REST, bad=(0, 0, 0, 0))
-_PRIMITIVES = {
-    GeomType.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
-    GeomType.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
-    GeomType.mjGEOM_ELLIPSOID: lambda size: trimesh.creation.icosphere(subdivisions=3).apply_scale(size),
-    GeomType.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1], sections=64),
-    GeomType.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2 * size[1], size[0], count=[32, 32]),
-}
 
 
 class ViewError(TgdslError):
     """A picture that cannot be drawn of what was given."""
-
-
-@dataclass(frozen=True, eq=False)
-class Dots:
-    """The taxels of one sensor in one environment, and what they read.
-
-    Attributes:
-        pos: Position in the world [m].
-        normal: Outward unit normal in the world.
-        size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
-        value: Magnitude of the reading, in `unit`.
-        quantity: What is read, such as `|force|`.
-        unit: Its unit, with the prefix that suits the values; empty for plain numbers.
-    """
-
-    pos: Float[Array, "taxel 3"]
-    normal: Float[Array, "taxel 3"]
-    size: Float[Array, " taxel"]
-    value: Float[Array, " taxel"]
-    quantity: str
-    unit: str
-
-    @property
-    def is_read(self) -> Bool[Array, " taxel"]:
-        """Which taxels read anything: those that are coloured."""
-        return self.value > 0
-
-    @property
-    def label(self) -> str:
-        """Quantity and unit."""
-        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
-
-    def summary(self, chosen: Int[Array, " chosen"] | slice = slice(None)) -> str:
-        """Return the sum of some taxels' magnitudes, unless they are lengths, and the largest."""
-        value, unit = self.value[chosen], f" {self.unit}" if self.unit else ""
-        if not value.any():
-            return f"0{unit}"
-        total = "" if self.unit in ("m", "mm", "µm") else f"Σ {value.sum():.3g}{unit}"
-        most = f"max {value.max():.2g}{unit}" if self.unit else ""
-        return " · ".join(part for part in (total, most) if part)
 
 
 def picture(
@@ -121,7 +67,7 @@ def picture(
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = dots_of(touch, sim, output, readings[output.name], env)
-    table = touch.taxels[_sensor(touch, output.name)]
+    table = touch.taxels[sensor_of(touch, output.name)]
     norm = Normalize(0.0, float(dots.value.max()) or 1.0)
     figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
@@ -138,35 +84,6 @@ def picture(
     return path
 
 
-def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: Tensor, env: int) -> Dots:
-    """Return where the taxels of a reading are in one environment, and the magnitude of what they read.
-
-    Args:
-        touch: The module.
-        sim: The scene, at the instant of the reading.
-        output: Which reading; its magnitude is the norm over the channels that share the first one's unit.
-        values: The reading of all environments.
-        env: Which environment.
-    """
-    table = touch.taxels[_sensor(touch, output.name)]
-    body = np.array([sim.model.body(name).id for name in table["body"]])
-    rotation = Rotation.from_quat(sim.batch.xquat[env][body], scalar_first=True)
-    same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
-    value = np.linalg.norm(values[env].detach().cpu().double().numpy()[:, same], axis=1)
-    stem = output.channels[0].removesuffix("_x")
-    unit = "" if output.units[0] == "1" else output.units[0]
-    if unit and 0 < value.max() < 0.1:
-        value, unit = (1e3 * value, f"m{unit}") if value.max() >= 1e-4 else (1e6 * value, f"µ{unit}")
-    return Dots(
-        pos=sim.batch.xpos[env][body] + rotation.apply(table["pos"]),
-        normal=rotation.apply(table["normal"]),
-        size=np.sqrt(table["area"]) * (table["radius"] > 0),
-        value=value,
-        quantity=f"|{stem}|" if len(same) > 1 else stem,
-        unit=unit,
-    )
-
-
 def _chosen(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None) -> Output:
     known = {output.name: output for output in touch.outputs if output.name in readings}
     if not known:
@@ -176,10 +93,6 @@ def _chosen(touch: TactileModule, readings: Mapping[str, Tensor], name: str | No
     if name not in known:
         raise ViewError(f'there is no reading "{name}"; {did_you_mean(name, known, "readings")}')
     return known[name]
-
-
-def _sensor(touch: TactileModule, reading: str) -> str:
-    return next(sensor.name for sensor in touch.plan.sensors if reading in sensor.readings)
 
 
 # The scene ------------------------------------------------------------------------------------------------------------
@@ -208,10 +121,10 @@ def _draw_scene(
 
     shot = rasterise(pixels(hand.corners), width, height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], _LIT, _OTHER)
-    image = _shaded(np.ones((height, width, 3)), shot, hand, colour, camera, 1.0, scale)
+    image = shaded(np.ones((height, width, 3)), shot, hand, colour, camera, 1.0, scale)
     veil = rasterise(pixels(objects.corners), width, height)
     veil.face[veil.near < shot.near] = -1
-    image = _shaded(image, veil, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, scale)
+    image = shaded(image, veil, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, scale)
     image = image.reshape(height // FINE, FINE, width // FINE, FINE, 3).mean(axis=(1, 3))
     axes.imshow(image, origin="lower", extent=(-0.5, width - 0.5, -0.5, height - 0.5), interpolation="nearest", aspect="auto")
     axes.set_axis_off()
@@ -263,168 +176,6 @@ def _robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], 
     return {body for body in robot if top in above[body]}, robot
 
 
-# Camera, triangles and pixels -----------------------------------------------------------------------------------------
-
-
-class Camera(NamedTuple):
-    """An orthographic camera: image axes and viewing direction as unit vectors of the world, and a point that it looks at."""
-
-    right: Float[Array, " 3"]
-    up: Float[Array, " 3"]
-    toward: Float[Array, " 3"]
-    centre: Float[Array, " 3"]
-
-    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-        """Return image x, image y and nearness to the camera [m], from the centre."""
-        return (points - self.centre) @ np.stack([self.right, self.up, self.toward]).T
-
-
-class Solid(NamedTuple):
-    """Triangles in the world: corners [m], unit normals at the corners, and the body of each."""
-
-    corners: Float[Array, "face 3 3"]
-    normals: Float[Array, "face 3 3"]
-    body: Int[Array, " face"]
-
-
-class Shot(NamedTuple):
-    """What each pixel shows: nearness [m] (−inf: nothing), the face, and the weights of its corners."""
-
-    near: Float[Array, "h w"]
-    face: Int[Array, "h w"]
-    weights: Float[Array, "h w 3"]
-
-
-def camera_for(dots: Dots, root: Float[Array, " 3"]) -> Camera:
-    """Return a camera that the most strongly read taxels face, a little from the side.
-
-    Args:
-        dots: The taxels; where none reads anything, all count alike.
-        root: Where the hand begins [m]: the image's up is the world's, or else leads away from here.
-    """
-    weight = dots.value if dots.is_read.any() else np.ones(len(dots.value))
-    toward = _unit(weight @ dots.normal, np.array([0.0, 0.0, 1.0]))
-    along = dots.pos.mean(axis=0) - root
-    for up in (np.array([0.0, 0.0, 1.0]), along, np.array([0.0, 1.0, 0.0])):
-        across = up - (up @ toward) * toward
-        if np.linalg.norm(across) > 0.5 * np.linalg.norm(up) > 0:
-            break
-    up = _unit(across, up)
-    toward = _unit(toward - 0.38 * up + 0.28 * np.cross(up, toward), toward)
-    right = _unit(np.cross(up, toward), up)
-    return Camera(right, np.cross(toward, right), toward, dots.pos.mean(axis=0))
-
-
-def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " taxel"]:
-    """Return which taxels face the camera with nothing of the robot between."""
-    height, width = shot.near.shape
-    column = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(int)
-    row = np.clip(np.rint(at[:, 1]), 0, height - 1).astype(int)
-    slack = np.maximum(0.2 * dots.size, 5e-4)  # [m] for taxels a little under the surface
-    return (dots.normal @ camera.toward > 0) & (at[:, 2] + slack >= shot.near[row, column])
-
-
-def solid_of(sim: BatchSimulation, env: int, bodies: set[int]) -> Solid:
-    """Return the triangles of some bodies in one environment: of their geoms that collide, or else of all; planes not."""
-    model = sim.model
-    parts = [Solid(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
-    for body in sorted(bodies):
-        own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body]
-        for geom in [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]] or own:
-            corners, normals = _triangles(model, geom)
-            in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)
-            in_world = Rotation.from_quat(sim.batch.xquat[env][body], scalar_first=True)
-            centre = sim.batch.xpos[env][body] + in_world.apply(model.geom_pos[geom])
-            matrix = (in_world * in_body).as_matrix().T
-            parts.append(Solid(corners @ matrix + centre, normals @ matrix, np.full(len(corners), body)))
-    return Solid(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
-    """Return corners and normals of a geom in its own frame; none of one without a bounded surface."""
-    kind, mesh = GeomType(int(model.geom_type[geom])), int(model.geom_dataid[geom])
-    if kind in (GeomType.mjGEOM_MESH, GeomType.mjGEOM_SDF) and mesh >= 0:
-        first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        vertices = model.mesh_face[first : first + count] + model.mesh_vertadr[mesh]
-        normals = model.mesh_facenormal[first : first + count] + model.mesh_normaladr[mesh]
-        return model.mesh_vert[vertices].astype(np.float64), model.mesh_normal[normals].astype(np.float64)
-    if kind not in _PRIMITIVES:
-        return np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
-    shape = _PRIMITIVES[kind](model.geom_size[geom])
-    shape.apply_translation(-shape.bounds.mean(axis=0))  # trimesh puts capsules elsewhere in some versions
-    flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
-    return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[
-        shape.faces
-    ]
-
-
-def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Shot:
-    """Return what each pixel shows: the nearest triangle, by z-buffer.
-
-    Args:
-        corners: Corners as (column [pixel], row [pixel], nearness [m]).
-        width: Number of columns.
-        height: Number of rows.
-    """
-    face, row, left, right = _spans(corners, width, height)
-    count = np.maximum(right - left + 1, 0)
-    inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    face, row, column = np.repeat(face, count), np.repeat(row, count), np.repeat(left, count) + inside
-    edges = corners[:, 1:, :2] - corners[:, :1, :2]
-    inverse = np.linalg.pinv(edges) if len(edges) else edges
-    relative = np.stack([column, row], axis=-1) - corners[face, 0, :2]
-    second = np.einsum("pi,pij->pj", relative, inverse[face])
-    weights = np.clip(np.column_stack([1 - second.sum(axis=1), second]), 0, 1)
-    nearness = (weights * corners[face, :, 2]).sum(axis=1)
-    pixel = row * width + column
-    near = np.full(height * width, -np.inf)
-    np.maximum.at(near, pixel, nearness)
-    won = nearness == near[pixel]
-    shot = Shot(near, np.full(height * width, -1), np.zeros((height * width, 3)))
-    shot.face[pixel[won]] = face[won]
-    shot.weights[pixel[won]] = weights[won]
-    return Shot(*(part.reshape(height, width, *part.shape[1:]) for part in shot))
-
-
-def _spans(corners: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
-    """Return face, row, first and last column of each run of pixels that a triangle covers in a row."""
-    low = np.clip(np.ceil(corners[:, :, 1].min(axis=1)), 0, height).astype(int)
-    high = np.clip(np.floor(corners[:, :, 1].max(axis=1)), -1, height - 1).astype(int)
-    count = np.maximum(high - low + 1, 0)
-    face = np.repeat(np.arange(len(corners)), count)
-    row = np.repeat(low, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    left, right = np.full(len(face), np.inf), np.full(len(face), -np.inf)
-    for first, second in ((0, 1), (1, 2), (2, 0)):
-        (x, y), (x_end, y_end) = corners[face, first, :2].T, corners[face, second, :2].T
-        rise = np.where(y_end == y, np.nan, y_end - y)
-        part = (row - y) / rise
-        crossing = np.where((part >= 0) & (part <= 1), x + part * (x_end - x), np.nan)
-        left, right = np.fmin(left, crossing), np.fmax(right, crossing)
-    left, right = np.where(left > right, 1, left), np.where(left > right, 0, right)
-    first = np.clip(np.ceil(left - 1e-9), 0, width).astype(int)
-    return face, row, first, np.clip(np.floor(right + 1e-9), -1, width - 1).astype(int)
-
-
-def _shaded(image: Array, shot: Shot, solid: Solid, colour: Array, camera: Camera, opacity: float, scale: float) -> Array:
-    """Return the image with a solid drawn over it: lit from the upper right, edges in depth drawn dark."""
-    drawn = shot.face >= 0
-    face, weights = shot.face[drawn], shot.weights[drawn]
-    normal = np.einsum("pi,pij->pj", weights, solid.normals[face])
-    normal *= np.where(normal @ camera.toward < 0, -1, 1)[:, None]
-    light = _unit(0.85 * camera.toward + 0.4 * camera.up + 0.35 * camera.right, camera.toward)
-    lit = 0.55 + 0.5 * np.clip(normal @ light, 0, 1)
-    image[drawn] += opacity * (np.minimum(colour[face] * lit[:, None], 1) - image[drawn])
-    near = np.where(drawn, shot.near, -1.0)
-    jump = np.maximum(*(np.abs(np.diff(near, axis=axis, append=near.take([-1], axis))) for axis in (0, 1)))
-    image[jump > np.maximum(6 / scale, 0.002)] *= 0.62
-    return image
-
-
-def _unit(vector: Array, otherwise: Array) -> Array:
-    length = np.linalg.norm(vector)
-    return vector / length if length > 1e-9 else otherwise
-
-
 # The maps -------------------------------------------------------------------------------------------------------------
 
 
@@ -472,9 +223,9 @@ def _draw_map(axes: Axes, value: Array, table: Array, norm: Normalize) -> None:
         axes.pcolormesh(np.ma.masked_invalid(cells), cmap=_HEAT, norm=norm, edgecolors="white", linewidth=edge)
         axes.set(aspect="equal", ylim=(len(cells), 0))
         return
-    normal = _unit(table["normal"].mean(axis=0), table["normal"][0])
+    normal = unit(table["normal"].mean(axis=0), table["normal"][0])
     across = table["tangent"].mean(axis=0)
-    across = _unit(across - (across @ normal) * normal, table["tangent"][0])
+    across = unit(across - (across @ normal) * normal, table["tangent"][0])
     x, y = 1e3 * table["pos"] @ across, 1e3 * table["pos"] @ np.cross(normal, across)
     size = 0.03 * axes.get_window_extent().height * 72 / DPI
     axes.scatter(x[active], y[active], c=shown[active], cmap=_HEAT, norm=norm, s=size**2, linewidths=0)

@@ -1,0 +1,1 @@
+"""The grammar: what a document may say, and how it is read."""

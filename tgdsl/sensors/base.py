@@ -90,9 +90,7 @@ class Kind:
     spec: type[ProbeSpec]
     lower: Callable[[Any, Layout], Lowered]
     forward: Callable[[Felt, Probes, Constants, State], tuple[Mapping[str, Tensor], State]]
-    reference: Callable[
-        [Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "taxel channel"], dict[str, np.ndarray]]
-    ]
+    reference: Callable[[Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "taxel channel"], dict[str, np.ndarray]]]
 
     @property
     def name(self) -> str:

@@ -38,8 +38,7 @@ class ContactSpec(ProbeSpec):
     def _ordered(self) -> ContactSpec:
         if self.release_threshold is not None and self.release_threshold > self.threshold:
             raise ValueError(
-                f"release_threshold {self.release_threshold:g} m is above threshold {self.threshold:g} m, "
-                "expected at most that"
+                f"release_threshold {self.release_threshold:g} m is above threshold {self.threshold:g} m, expected at most that"
             )
         return self
 

@@ -1,0 +1,155 @@
+"""Plain values to models: pydantic's faults in the words of the document, and the rest of it still read."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from tgdsl.errors import Problem, did_you_mean
+from tgdsl.schema import yaml
+from tgdsl.schema.yaml import Path, Source
+
+ENTRY_DEPTH = {"sensors": 2, "objects": 2, "noise": 2, "groups": 2, "observations": 3, "resolutions": 3}
+"""How deep an entry sits under each of these keys: a faulty entry is left out, and the rest is still checked."""
+
+DISCRIMINATORS = ("kind", "method", "type")
+"""Keys whose value says as what a mapping is read: pydantic's error locations hold that value as if it were a key."""
+
+
+def read_as(
+    source: Source, prefix: Path, model: type[BaseModel], problems: list[Problem], required: tuple[str, ...]
+) -> BaseModel | None:
+    """Read a mapping as a model; note every mistake, leave faulty entries out, and read what is left."""
+    value = source.get(prefix) if prefix else source.value
+    known: dict[int, type[BaseModel]] = {}
+    try:
+        return model.model_validate(value, context=known)
+    except ValidationError as error:
+        faults = error.errors()
+    entries: set[Path] = set()
+    for fault in faults:
+        path = _raw_path(value, fault, known)
+        if not _is_follow_up(fault):
+            problems.append(_translated(source, prefix, value, path, fault, known))
+        entries.add(path if fault["type"] == "extra_forbidden" else _entry(path))
+    if not isinstance(value, dict):
+        return None
+    rest = copy.deepcopy(value)
+    for entry in sorted(entries, key=lambda path: [f"{part:>9}" for part in path], reverse=True):
+        _remove(rest, entry)
+    for key in required:
+        if key not in rest:
+            return None
+    try:
+        return model.model_validate(rest)
+    except ValidationError:
+        return None
+
+
+def _is_follow_up(fault: Any) -> bool:
+    """Return whether a fault only repeats another: of a value that is no YAML, or of items that have faults themselves."""
+    found, context = fault["input"], fault.get("ctx", {})
+    return found is yaml.Unreadable or (fault["type"] == "too_short" and len(found) >= context["min_length"])
+
+
+def _raw_path(value: Any, fault: Any, known: Mapping[int, type[BaseModel]]) -> Path:
+    """Return the path through the plain value to where pydantic found a fault: without the tags of unions, no keys."""
+    path: list[str | int] = []
+    location = fault["loc"]
+    is_tagged = False
+    for i, part in enumerate(location):
+        if i == len(location) - 1 and fault["type"] in ("missing", "extra_forbidden"):
+            return (*path, part)
+        if isinstance(value, dict):
+            model = known.get(id(value))
+            if model is not None and not is_tagged and part in [value.get(key) for key in DISCRIMINATORS]:
+                is_tagged = True
+                continue
+            is_key = part in value and (model is None or part in model.model_fields)
+        else:
+            is_key = isinstance(value, list) and isinstance(part, int) and part < len(value)
+        if is_key:
+            path.append(part)
+            value, is_tagged = value[part], False
+    return tuple(path)
+
+
+def _entry(path: Path) -> Path:
+    """Return the path of the entry that a path is in: what is left out so that the rest can be checked."""
+    for i, part in enumerate(path):
+        if part in ENTRY_DEPTH:
+            return path[: i + ENTRY_DEPTH[str(part)]]
+    return path[:1]
+
+
+def _remove(value: Any, path: Path) -> None:
+    """Remove an entry, and its list with it if that becomes empty."""
+    if not path:
+        return
+    try:
+        for part in path[:-1]:
+            parent, key, value = value, part, value[part]
+        del value[path[-1]]
+    except (KeyError, IndexError, TypeError):
+        return
+    if value == [] and len(path) > 1:
+        del parent[key]
+
+
+def _translated(
+    source: Source, prefix: Path, value: Any, path: Path, fault: Any, known: Mapping[int, type[BaseModel]]
+) -> Problem:
+    """Return one of pydantic's errors in the words of the document."""
+    kind, context, found = fault["type"], fault.get("ctx", {}), fault["input"]
+    full = (*prefix, *path)
+    if kind == "extra_forbidden":
+        parent = value
+        for part in path[:-1]:
+            parent = parent[part]
+        fields = known[id(parent)].model_fields if id(parent) in known else {}
+        return source.problem(full, f'unknown key "{path[-1]}"', did_you_mean(str(path[-1]), fields, "keys"), on_key=True)
+    if fault["loc"][-1:] == ("[key]",):
+        what = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
+        return source.problem(full, what, on_key=True)
+    if kind == "missing" and isinstance(path[-1], int):
+        return source.problem(full[:-1], f"found {_brief(found)}, value {path[-1] + 1} is missing")
+    if kind == "missing":
+        return source.problem(full[:-1], f'missing key "{path[-1]}"', on_key=True)
+    if kind == "union_tag_not_found":
+        return source.problem(full, f"missing key {context['discriminator']}".replace("'", '"'), on_key=True)
+    if kind == "union_tag_invalid":
+        key = context["discriminator"].strip("'")
+        tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
+        return source.problem((*full, key), f'unknown {key} "{context["tag"]}"', did_you_mean(context["tag"], tags, f"{key}s"))
+    if kind == "literal_error":
+        return source.problem(full, f"found {_brief(found)}, expected {context['expected']}")
+    if kind == "value_error":
+        return source.problem(full, str(context["error"]))
+    if kind == "region":
+        return source.problem(full, fault["msg"])
+    if kind == "too_short":
+        return source.problem(full, f"found {_brief(found)}, expected at least {context['min_length']} entry")
+    if kind == "too_long":
+        return source.problem(full, f"found {_brief(found)}, expected {context['max_length']} entries")
+    if _wanted(kind):
+        return source.problem(full, f"found {_brief(found)}, expected {_wanted(kind)}")
+    message = fault["msg"][0].lower() + fault["msg"][1:]
+    return source.problem(full, f"found {_brief(found)}: {message}")
+
+
+def _wanted(kind: str) -> str:
+    """Return what pydantic's errors about Python types mean in a document, or nothing."""
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return "a mapping"
+    return {"tuple_type": "a list", "string_type": "a string"}.get(kind, "")
+
+
+def _brief(found: Any) -> str:
+    if isinstance(found, (dict, list, tuple)):
+        return f"a {'mapping' if isinstance(found, dict) else 'list'} of {len(found)}"
+    if isinstance(found, int) and abs(found) >= 10**20:
+        return "a huge number"  # Python refuses to print more than 4300 digits
+    return f'"{found}"' if isinstance(found, str) else "nothing" if found is None else str(found)

@@ -1,0 +1,108 @@
+"""The state of a scene: what a module reads of simulators and hardware.
+
+Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
+pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import StateError
+from tgdsl.plan import Inputs
+
+SHAPES: dict[str, tuple[str | int, ...]] = {
+    "body_pos": ("body", 3),
+    "body_quat": ("body", 4),
+    "body_linvel": ("body", 3),
+    "body_angvel": ("body", 3),
+    "contact_found": ("pair",),
+    "contact_pos": ("pair", "slot", 3),
+    "contact_force": ("pair", "slot", 3),
+    "contact_torque": ("pair", "slot", 3),
+    "contact_normal": ("pair", "slot", 3),
+    "contact_netforce": ("pair", 3),
+}
+"""Shape of each tensor of a `SceneState`, after the leading `env`."""
+
+
+@dataclass
+class SceneState:
+    """What a simulator (or hardware) says of all environments at one instant. Only what `inputs.fields` names is read.
+
+    All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
+    dtype and then cast, so that far from the origin nothing is lost.
+
+    Attributes:
+        body_pos: Position of each body's frame [m].
+        body_quat: Orientation of each body, w, x, y, z.
+        body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
+        body_angvel: Angular velocity of the body [rad/s].
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive.
+        contact_pos: Contact points [m].
+        contact_force: Force on the link at each point [N].
+        contact_torque: Torque on the link at each point [N·m].
+        contact_normal: Unit normal out of the object at each point.
+        contact_netforce: The pair's whole force on the link [N].
+        dt: Time since the last state [s].
+    """
+
+    body_pos: Float[Tensor, "env body 3"] | None = None
+    body_quat: Float[Tensor, "env body 4"] | None = None
+    body_linvel: Float[Tensor, "env body 3"] | None = None
+    body_angvel: Float[Tensor, "env body 3"] | None = None
+    contact_found: Tensor | None = None
+    contact_pos: Float[Tensor, "env pair slot 3"] | None = None
+    contact_force: Float[Tensor, "env pair slot 3"] | None = None
+    contact_torque: Float[Tensor, "env pair slot 3"] | None = None
+    contact_normal: Float[Tensor, "env pair slot 3"] | None = None
+    contact_netforce: Float[Tensor, "env pair 3"] | None = None
+    dt: float | None = None
+
+    def to(self, *args: Any, **kwargs: Any) -> SceneState:
+        """Return the state with `torch.Tensor.to` applied to every tensor."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return SceneState(**{name: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for name, v in values.items()})
+
+    def checked(self, inputs: Inputs, device: torch.device) -> dict[str, Tensor]:
+        """Return the tensors that a module wants, after a look at their shapes.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+        """
+        tensors: dict[str, Tensor] = {}
+        for name in inputs.fields:
+            value = getattr(self, name)
+            if value is None:
+                raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
+            if name != "dt":
+                tensors[name] = _checked(name, value, shape_of(name, inputs), device)
+        num_envs = {name: value.shape[0] for name, value in tensors.items()}
+        for name, count in num_envs.items():
+            if count != num_envs["body_pos"]:
+                raise StateError(f"SceneState.{name} holds {count} environments, body_pos {num_envs['body_pos']}")
+        return tensors
+
+
+def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
+    """Return the shape that a field has for a module, after the leading `env`."""
+    sizes = {"body": len(inputs.bodies), "pair": len(inputs.pairs), "slot": inputs.slots}
+    return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
+
+
+def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device) -> Tensor:
+    if not isinstance(value, Tensor):
+        raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
+    if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
+        expected = ", ".join(map(str, want))
+        raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected})")
+    if value.device != device:
+        raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
+    if name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
+        raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
+    return value
