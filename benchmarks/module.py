@@ -94,7 +94,7 @@ class VectorTaxels(torch.nn.Module):
         self.cube = bodies.index("cube")
         self.pos = torch.tensor(layout.pos, dtype=torch.float32, device=device)
         self.radius = torch.tensor(layout.radius, dtype=torch.float32, device=device)
-        self.half = torch.tensor(plan.arrays["objects/cube/size"][0], dtype=torch.float32, device=device)
+        self.half_size = torch.tensor(plan.arrays["objects/cube/size"][0], dtype=torch.float32, device=device)
 
     def forward(self, pos: Tensor, quat: Tensor, linvel: Tensor, angvel: Tensor, found: Tensor) -> Tensor:
         """Return force and torque (env, taxel, 6)."""
@@ -104,7 +104,7 @@ class VectorTaxels(torch.nn.Module):
         point = pos[:, self.link] + arm
         from_cube = point - pos[:, self.cube, None]
         local = (cube.transpose(-1, -2) @ from_cube[..., None]).squeeze(-1)
-        beyond = local.abs() - self.half
+        beyond = local.abs() - self.half_size
         outside = beyond.clamp(min=0).norm(dim=-1)
         inside = beyond.amax(dim=-1)
         sign = torch.where(local < 0, -1.0, 1.0)

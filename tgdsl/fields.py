@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import (
@@ -15,6 +16,7 @@ from pydantic import (
     WithJsonSchema,
     model_validator,
 )
+from pydantic_core import CoreSchema, core_schema
 
 from tgdsl import units
 
@@ -33,53 +35,60 @@ class SpecModel(BaseModel):
         return value
 
 
-def quantity(dimension: str, ge: float | None = None, gt: float | None = None) -> Any:
-    """Return a float type that also takes a string with a unit of `dimension`, bounded in SI units."""
+PATTERN = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(%s)?\s*$"
+"""A number and one of some units, as a pattern of JSON Schema."""
 
-    def check(value: float) -> float:
-        if gt is not None and not value > gt:
-            raise ValueError(f"{value:g} is out of range, expected more than {gt:g}")
-        if ge is not None and not value >= ge:
-            raise ValueError(f"{value:g} is out of range, expected at least {ge:g}")
+
+@dataclass(frozen=True)
+class Quantity:
+    """Marks a float that may also be written with a unit, bounded in SI units.
+
+    Attributes:
+        dimension: A key of `units.UNITS`.
+        ge: Least value.
+        gt: Bound that the value must exceed.
+    """
+
+    dimension: str
+    ge: float | None = None
+    gt: float | None = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        """Read a number or a string, then look at the bounds."""
+        return core_schema.no_info_plain_validator_function(self._read)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        """Return a number, or a string that ends in a unit."""
+        number: dict[str, Any] = {"type": "number"}
+        if self.gt is not None:
+            number["exclusiveMinimum"] = self.gt
+        if self.ge is not None:
+            number["minimum"] = self.ge
+        names = "|".join(name.replace("*", r"\*") for name in units.UNITS[self.dimension])
+        return {"anyOf": [number, {"type": "string", "pattern": PATTERN % names}]} if names else number
+
+    def _read(self, found: object) -> float:
+        value = units.parse(found, self.dimension)
+        if self.gt is not None and not value > self.gt:
+            raise ValueError(f"{value:g} is out of range, expected more than {self.gt:g}")
+        if self.ge is not None and not value >= self.ge:
+            raise ValueError(f"{value:g} is out of range, expected at least {self.ge:g}")
         return value
 
-    names = list(units.UNITS[dimension])
-    pattern = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(" + "|".join(map(_escape, names)) + r")?\s*$"
-    number: dict[str, Any] = {"type": "number"}
-    if gt is not None:
-        number["exclusiveMinimum"] = gt
-    if ge is not None:
-        number["minimum"] = ge
-    schema: dict[str, Any] = {"anyOf": [number, {"type": "string", "pattern": pattern}]} if names else number
-    return Annotated[
-        float,
-        BeforeValidator(lambda value: units.parse(value, dimension)),
-        AfterValidator(check),
-        WithJsonSchema(schema),
-    ]
 
+Text = Annotated[str, Tag("text")]
+TEXT_OR_OTHER = Discriminator(lambda value: "text" if isinstance(value, str) else "other")
+"""Tells `Text` from a type tagged "other" by what is found, so that errors speak of one of them only."""
 
-def text_or(other: Any) -> Any:
-    """Return the union of a string and another type, told apart by what is found, so that errors speak of one of them."""
-    return Annotated[
-        Annotated[str, Tag("text")] | Annotated[other, Tag("other")],
-        Discriminator(lambda value: "text" if isinstance(value, str) else "other"),
-    ]
-
-
-def _escape(unit: str) -> str:
-    return unit.replace("*", r"\*")
-
-
-Length = quantity("length")
-PositiveLength = quantity("length", gt=0.0)
-Radius = quantity("length", ge=0.0)
-Area = quantity("area", gt=0.0)
-Angle = quantity("angle", gt=0.0)
-Time = quantity("time", ge=0.0)
-Number = quantity("number")
-NonNegative = quantity("number", ge=0.0)
-Positive = quantity("number", gt=0.0)
+Length = Annotated[float, Quantity("length")]
+PositiveLength = Annotated[float, Quantity("length", gt=0.0)]
+Radius = Annotated[float, Quantity("length", ge=0.0)]
+Area = Annotated[float, Quantity("area", gt=0.0)]
+Angle = Annotated[float, Quantity("angle", gt=0.0)]
+Time = Annotated[float, Quantity("time", ge=0.0)]
+Number = Annotated[float, Quantity("number")]
+NonNegative = Annotated[float, Quantity("number", ge=0.0)]
+Positive = Annotated[float, Quantity("number", gt=0.0)]
 Position = tuple[Length, Length, Length]
 
 

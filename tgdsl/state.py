@@ -66,8 +66,9 @@ class SceneState:
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
         """Return the state with `torch.Tensor.to` applied to every tensor."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return SceneState(**{name: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for name, v in values.items()})
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
+        return SceneState(**moved)
 
     def checked(self, inputs: Inputs, device: torch.device) -> dict[str, Tensor]:
         """Return the tensors that a module wants, after a look at their shapes.

@@ -172,8 +172,9 @@ def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
 
 def only(state: SceneState, envs: Any) -> SceneState:
     """Return some of the environments of a state."""
-    values = {name: getattr(state, name) for name in (*SHAPES, "dt")}
-    return SceneState(**{name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()})
+    values: dict[str, Any] = {name: getattr(state, name) for name in (*SHAPES, "dt")}
+    chosen: dict[str, Any] = {name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()}
+    return SceneState(**chosen)
 
 
 class KindConformance:

@@ -6,7 +6,7 @@ operation is pointwise and a compiler fuses a whole sensor into one loop; a trai
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -57,9 +57,16 @@ def where(condition: Tensor, a: Vec, b: Vec) -> Vec:
     )
 
 
-def each(function: Callable[[Tensor], Tensor], planes: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Return the function applied to every plane."""
-    return tuple(function(plane) for plane in planes)
+def vec(parts: Iterable[Tensor]) -> Vec:
+    """Return three planes as a vector."""
+    x, y, z = parts
+    return x, y, z
+
+
+def rot(parts: Iterable[Tensor]) -> Rot:
+    """Return nine planes, row by row, as a rotation."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = parts
+    return xx, xy, xz, yx, yy, yz, zx, zy, zz
 
 
 def rotate(r: Rot, a: Vec) -> Vec:

@@ -135,8 +135,8 @@ def relate(
         parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
     # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
     parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
-    motion = Motion(_vec(parts[12:15]), _vec(parts[15:18])) if len(parts) > 12 else None
-    return Pairs(parts[:9], _vec(parts[9:12]), motion, gate)  # type: ignore[arg-type]
+    motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18])) if len(parts) > 12 else None
+    return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, gate)
 
 
 def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_normal: bool, with_motion: bool) -> Felt:
@@ -164,8 +164,8 @@ def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_norma
         best = depth
         for g in range(len(target.shapes)):
             rotation, offset = _link_in_geom(pairs, own, target, g)
-            rotation = tuple(part[:, pair] for part in rotation)
-            offset = tuple(part[:, pair] for part in offset)
+            rotation = planes.rot(part[:, pair] for part in rotation)
+            offset = planes.vec(part[:, pair] for part in offset)
             point = planes.add(planes.rotate(rotation, probes.pos), offset)
             distance, gradient = SHAPES[target.shapes[g]](point, planes.split(target.size[g]))
             reached = reach - distance
@@ -185,20 +185,14 @@ def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_norma
 
 
 def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple[Rot, Vec]:
-    rotation = tuple(part[:, own] for part in pairs.rotation)
-    offset = tuple(part[:, own] for part in pairs.offset)
+    rotation = planes.rot(part[:, own] for part in pairs.rotation)
+    offset = planes.vec(part[:, own] for part in pairs.offset)
     if target.is_centred[g]:
         return rotation, offset
-    geom_rotation: Rot = tuple(target.rotation[g, k] for k in range(9))  # type: ignore[assignment]
+    geom_rotation = planes.rot(target.rotation[g].unbind(0))
     moved = planes.sub(offset, planes.split(target.pos[g]))
     return planes.transpose_times(geom_rotation, rotation), planes.rotate_back(geom_rotation, moved)
 
 
 def _gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
-    x, y, z = vector
-    return x[:, own][:, pair], y[:, own][:, pair], z[:, own][:, pair]
-
-
-def _vec(parts: Sequence[Tensor]) -> Vec:
-    x, y, z = parts
-    return x, y, z
+    return planes.vec(part[:, own][:, pair] for part in vector)

@@ -160,7 +160,7 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
         nearest[least] = size[least] * np.sqrt(1.0 - at_pole)
     else:
         low, high = max(1e-300, float(np.max(size * y - gap))), float(np.linalg.norm(size * y))
-        u = brentq(excess, 0.5 * low, 2.0 * max(low, high), xtol=1e-300, rtol=1e-15)
+        u = brentq(excess, 0.5 * low, 2.0 * max(low, high), xtol=1e-300, rtol=np.float64(1e-15))
         nearest = square * y / (u + gap)
     inside = bool(np.sum((point / size) ** 2) < 1.0)
     outward = nearest / square

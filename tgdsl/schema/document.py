@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cache
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import Field, StringConstraints, create_model
+from pydantic import Field, StringConstraints, Tag, create_model
 
-from tgdsl.fields import SpecModel, text_or
+from tgdsl.fields import TEXT_OR_OTHER, SpecModel, Text
 from tgdsl.observations import ObservationSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
@@ -22,7 +22,7 @@ class RobotSpec(SpecModel):
 
     model: str
     """MJCF or URDF file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
-    layout: text_or(LayoutSpec) | None = None
+    layout: Annotated[Text | Annotated[LayoutSpec, Tag("other")], TEXT_OR_OTHER] | None = None
     """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name."""
 
 
@@ -65,7 +65,7 @@ class Spec(SpecModel):
 def document_model(kinds: tuple[Kind, ...] = KINDS) -> type[Spec]:
     """Return the document model whose sensors are of the given kinds."""
     specs = tuple(kind.spec for kind in kinds)
-    union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # noqa: UP007
+    union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # type: ignore  # noqa: UP007
     sensors = (dict[Name, union], Field(min_length=1, description="Sensors by name."))
     return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors)
 

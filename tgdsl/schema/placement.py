@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields import Angle, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, text_or
+from tgdsl.fields import TEXT_OR_OTHER, Angle, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, Text
 
 Count = Annotated[StrictInt, Field(ge=1, le=1_000_000)]
 
@@ -164,7 +164,7 @@ class Points(SpecModel):
 
     method: Literal["points"]
     """Explicit probes."""
-    points: text_or(Annotated[tuple[Point, ...], Field(min_length=1)])
+    points: Annotated[Text | Annotated[tuple[Point, ...], Field(min_length=1), Tag("other")], TEXT_OR_OTHER]
     """The probes, or the name of a CSV file beside the layout (SI units)."""
     radius: Radius | None = None
     """Sensing radius of the points that name none [m]."""

@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field
+from pydantic import Field, Tag
 from torch import Tensor
 
-from tgdsl.fields import Selector, SpecModel, text_or
+from tgdsl.fields import TEXT_OR_OTHER, Selector, SpecModel, Text
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
@@ -29,7 +29,7 @@ class SensorSpec(SpecModel):
 
     links: Selector
     """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
-    noise: text_or(NoiseSpec) = "clean"
+    noise: Annotated[Text | Annotated[NoiseSpec, Tag("other")], TEXT_OR_OTHER] = "clean"
     """A noise profile's name, or the knobs in line."""
     readout: Literal["clean", "measured", "both"] = "measured"
     """`measured` with the imperfections of `noise`, `clean` without, or `both`: `<name>` and `<name>/clean`."""

@@ -1,0 +1,171 @@
+"""Controls against sums by hand, recordings against what they were made of."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch import simulate
+from tgdsl.runtime.rollout import Recorder, Step, recorded_controls, rollout, scripted_controls
+
+SCENE = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos="0 0 .029">
+      <joint name="lift" type="slide" axis="0 0 1"/><joint name="slide" type="slide" axis="1 0 0"/>
+      <geom type="box" size=".02 .02 .02" mass=".25"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift"/><motor joint="slide"/></actuator>
+  <keyframe><key name="rest" ctrl="0 1"/><key name="squeeze" ctrl="-5 3"/><key name="up" ctrl="1 1"/></keyframe>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene.xml"
+    path.write_text(SCENE)
+    probes = [{"pos": [x, 0, 0.01], "normal": [0, 0, 1]} for x in (0.0, 0.01, 0.025)]
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(path), "layout": {"resolutions": {"o": {"pad": {"method": "points", "points": probes, "radius": 0.004}}}}},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {
+            "touch": {"kind": "kinematic_taxel", "links": "pad", "feels": ["cube"], "outputs": ["force"], "readout": "both"},
+            "depth": {"kind": "contact_depth", "links": "pad", "feels": ["cube"]},
+        },
+    }
+
+
+MODEL = mujoco.MjModel.from_xml_string(SCENE)
+
+
+def test_scripted_controls_hold_and_move():
+    found = scripted_controls(MODEL, ("rest", "squeeze"), seconds=0.05, control_step=0.01)
+    ramp = [[0, 1], [-1.25, 1.5], [-2.5, 2], [-3.75, 2.5], [-5, 3]]
+    np.testing.assert_allclose(found, [[0, 1]] * 5 + ramp + [[-5, 3]] * 5)
+
+
+def test_scripted_controls_of_three_and_of_one():
+    found = scripted_controls(MODEL, ("rest", "squeeze", "up"), 0.02, 0.01)
+    rest, squeeze, up = [0, 1], [-5, 3], [1, 1]
+    np.testing.assert_array_equal(found, [rest, rest, rest, squeeze, squeeze, squeeze, squeeze, up, up, up])
+    np.testing.assert_array_equal(scripted_controls(MODEL, ("up",), 0.03, 0.01), [[1, 1]] * 3)
+    np.testing.assert_array_equal(scripted_controls(MODEL, ("up",), 1e-6, 0.01), [[1, 1]])  # never none at all
+
+
+def test_scripted_controls_errors():
+    with pytest.raises(SimulationError) as caught:
+        scripted_controls(MODEL, ("rest", "sqeeze"), 1.0, 0.01)
+    assert str(caught.value) == 'the scene has no keyframe "sqeeze"; did you mean "squeeze"?'
+    bare = mujoco.MjModel.from_xml_string("<mujoco/>")
+    with pytest.raises(SimulationError, match='^the scene has no keyframe "rest"; there are no keyframes$'):
+        scripted_controls(bare, ("rest",), 1.0, 0.01)
+    for keyframes, seconds in (((), 1.0), (("rest",), 0.0), (("rest",), -1.0), (("rest",), np.nan), (("rest",), np.inf)):
+        with pytest.raises(SimulationError, match="expected at least one, and more than 0 s$"):
+            scripted_controls(MODEL, keyframes, seconds, 0.01)
+
+
+@pytest.mark.parametrize("shape", [(4, 2), (4, 3, 2)])
+def test_recorded_controls_come_back(tmp_path, shape):
+    controls = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    np.savez_compressed(tmp_path / "c.npz", ctrl=controls, other=np.zeros(3))
+    found = recorded_controls(tmp_path / "c.npz")
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, controls)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"control": np.zeros((3, 2))}, "expected an .npz file with an array `ctrl`: "),
+        ({"ctrl": np.zeros(3)}, "`ctrl` is float64 of shape (3,), expected floats (step, actuator) or (step, env, actuator)"),
+        ({"ctrl": np.zeros((3, 2), int)}, "`ctrl` is int64 of shape (3, 2), expected floats "),
+        ({"ctrl": np.zeros((0, 2))}, "`ctrl` is float64 of shape (0, 2), expected floats "),
+        ({"ctrl": np.array([["a", "b"]])}, "`ctrl` is <U1 of shape (1, 2), expected floats "),
+        ({"ctrl": np.array([[{}]])}, "expected an .npz file with an array `ctrl`: Object arrays cannot be loaded"),
+    ],
+    ids=["name", "flat", "integers", "no_steps", "text", "objects"],
+)
+def test_recorded_controls_of_other_contents(tmp_path, arrays, message):
+    np.savez(tmp_path / "c.npz", **arrays)
+    with pytest.raises(SimulationError) as caught:
+        recorded_controls(tmp_path / "c.npz")
+    assert str(caught.value).startswith(f"{tmp_path / 'c.npz'}: {message}")
+
+
+def test_recorded_controls_that_are_no_archive(tmp_path):
+    np.savez(tmp_path / "whole.npz", ctrl=np.zeros((3, 2)))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "whole.npz").read_bytes()[:60])
+    (tmp_path / "text.npz").write_text("hello")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    np.save(tmp_path / "array.npy", np.zeros((3, 2)))
+    for name in ("cut.npz", "text.npz", "empty.npz", "array.npy", "none.npz"):
+        with pytest.raises(SimulationError, match=rf"{name}: expected an \.npz file with an array `ctrl`: "):
+            recorded_controls(tmp_path / name)
+
+
+def test_rollout_is_the_loop_that_a_user_writes(document):
+    touch = tgdsl.compile(document)
+    controls = scripted_controls(MODEL, ("rest", "squeeze"), 0.04, 0.01)
+    steps = list(rollout(touch, simulate(touch, 2, substeps=2), controls))
+    assert [step.index for step in steps] == list(range(12))
+    np.testing.assert_allclose([step.time for step in steps], 0.01 * np.arange(1, 13))
+    sim = simulate(touch, 2, substeps=2)
+    for step, control in zip(steps, controls, strict=True):
+        sim.step(control)
+        for name, reading in touch(sim.state()).items():
+            assert torch.equal(reading, step.readings[name])
+    assert steps[-1].readings["depth"].max() > steps[0].readings["depth"].max() > 0
+
+
+def test_controls_for_each_environment(document):
+    touch = tgdsl.compile(document)
+    controls = np.zeros((3, 2, 2))
+    controls[:, 1, 0] = 100.0  # lifts the second cube
+    *_, last = rollout(touch, simulate(touch, 2, substeps=10), controls)
+    depth = last.readings["depth"]
+    assert depth[0].max() > 0
+    assert not depth[1].any()
+
+
+@pytest.mark.parametrize("controls", [np.zeros((3, 2)), np.zeros((3, 4, 2))], ids=["for_all", "for_each"])
+def test_recorder_file(document, tmp_path, controls):
+    touch = tgdsl.compile(document)
+    recorder = Recorder(touch, 3, 4)
+    rng = np.random.default_rng(0)
+    kept = {output.name: rng.normal(size=(3, 4, *output.shape)).astype(np.float32) for output in touch.outputs}
+    for index in range(3):
+        readings = {name: torch.from_numpy(values[index]).double().requires_grad_() for name, values in kept.items()}
+        recorder.add(Step(index, 0.1 * (index + 1), readings))
+    recorder.write(tmp_path / "r.npz", controls)
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as archive:
+        found = dict(archive)
+    units = {f"{name}:{part}" for name in kept for part in ("channels", "units")}
+    assert found.keys() == {"time", "ctrl", "touch", "touch/clean", "depth"} | units
+    np.testing.assert_allclose(found["time"], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(found["ctrl"], controls)
+    for name, values in kept.items():
+        assert found[name].dtype == np.float32
+        np.testing.assert_array_equal(found[name], values)
+    assert found["touch:channels"].tolist() == ["force_x", "force_y", "force_z"]
+    assert found["touch/clean:units"].tolist() == ["N"] * 3
+    assert (found["depth:channels"].tolist(), found["depth:units"].tolist()) == (["depth"], ["m"])
+    assert [path.name for path in tmp_path.iterdir()] == ["r.npz"]
+
+
+def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
+    recorder = Recorder(tgdsl.compile(document), 1, 1)
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("os.replace", fail)
+    with pytest.raises(OSError, match="no space"):
+        recorder.write(tmp_path / "r.npz", np.zeros((1, 2)))
+    assert not list(tmp_path.iterdir())
