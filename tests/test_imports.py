@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "tgdsl"
 FLOORS = {
     5: {"cli", "rl", "report"},
     4: {"compiler", "runtime"},
-    3: {"schema", "module", "scene", "artifact", "explain"},
+    3: {"schema", "module", "state", "scene", "artifact", "explain"},
     2: {"sensors", "observations", "layout", "plan"},
     1: {"geometry", "units", "fields", "errors"},
 }
@@ -19,7 +19,7 @@ EXEMPT = {
     "__main__": "starts the command line",
     "testing": "stands beside the floors: the suite that kinds inherit runs a document all the way through",
 }
-PURE = ("sensors", "geometry", "layout", "plan", "module")
+PURE = ("sensors", "geometry", "layout", "plan", "state", "module")
 """What a compiled module is made of: it knows neither MuJoCo nor YAML."""
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 

@@ -72,9 +72,10 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_a_pipe_gets_the_last_table_only():
+def test_a_pipe_gets_the_last_table_only(monkeypatch):
     stream = io.StringIO()
-    live = LiveTable(stream)
+    monkeypatch.setattr("sys.stdout", stream)
+    live = LiveTable()
     live.show(["a", "b"])
     assert stream.getvalue() == ""
     live.show(["c", "d"], is_last=True)
@@ -85,7 +86,8 @@ def test_a_terminal_is_drawn_over_at_most_once_per_period(monkeypatch):
     now = 100.0
     monkeypatch.setattr(tables.time, "monotonic", lambda: now)
     stream = Terminal()
-    live = LiveTable(stream, period=0.1)
+    monkeypatch.setattr("sys.stdout", stream)
+    live = LiveTable(period=0.1)
     live.show(["a", "b"])
     assert stream.getvalue() == "a\nb\n"
     now = 100.05

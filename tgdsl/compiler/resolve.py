@@ -76,6 +76,9 @@ def resolve(loaded: Loaded) -> Resolved:
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
+    listed_bodies = {target.body for target in loaded.spec.objects.values()}
+    others = [body for body in scene.bodies if body not in robot.bodies[1:] and body not in listed_bodies]
+    unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
     return Resolved(layout, links, objects, scene, robot, tuple(unused))
 
 

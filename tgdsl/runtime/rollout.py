@@ -68,9 +68,9 @@ def recorded_controls(path: Path) -> Controls:
         SimulationError: If the file cannot be read or holds no such array.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             controls = archive["ctrl"]
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
+    except (OSError, EOFError, ValueError, KeyError, TypeError, BadZipFile) as error:  # TypeError: an .npy file
         raise SimulationError(f"{path}: expected an .npz file with an array `ctrl`: {error}") from error
     if controls.ndim not in (2, 3) or not len(controls) or not np.issubdtype(controls.dtype, np.floating):
         raise SimulationError(
