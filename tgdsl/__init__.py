@@ -12,9 +12,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tgdsl.artifact import load as load
     from tgdsl.artifact import save as save
     from tgdsl.compiler.pipeline import compile as compile
-    from tgdsl.compiler.pipeline import load_module as load
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import ArtifactError, RobotError, SimulationError, SpecError, StateError, TgdslError
     from tgdsl.module import TactileModule
@@ -34,7 +34,7 @@ _PLACES = {
     "TgdslError": "errors",
     "compile": "compiler.pipeline",
     "instrument": "compiler.scene",
-    "load": "compiler.pipeline:load_module",
+    "load": "artifact",
     "save": "artifact",
     "simulate": "runtime.batch",
 }
@@ -61,5 +61,4 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that no command waits for what it does not need."""
     if name not in _PLACES:
         raise AttributeError(f"module 'tgdsl' has no attribute {name!r}")
-    module, _, attribute = _PLACES[name].partition(":")
-    return getattr(import_module(f"tgdsl.{module}"), attribute or name)
+    return getattr(import_module(f"tgdsl.{_PLACES[name]}"), name)

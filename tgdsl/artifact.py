@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError
 from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
+from tgdsl.sensors import KINDS, Kind
 
 METADATA_KEY = "tgdsl"
 
@@ -27,6 +30,28 @@ def save(touch: TactileModule, path: str | PathLike[str]) -> int:
         Bytes written.
     """
     return save_plan(touch.plan, path)
+
+
+def load(
+    path: str | PathLike[str],
+    *,
+    kinds: Sequence[Kind] = (),
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> TactileModule:
+    """Return the module of an artefact. Neither MuJoCo nor any file that it was compiled from is needed.
+
+    Args:
+        path: The artefact.
+        kinds: Sensor kinds of your own, if it was compiled with any.
+        dtype: Dtype of the readings, float32 or float64.
+        device: Where the module lives.
+
+    Raises:
+        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+        TgdslError: If it uses a kind that is not given.
+    """
+    return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
 
 
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:

@@ -13,7 +13,6 @@ from typing import Any
 import mujoco
 import torch
 
-from tgdsl.artifact import load_plan
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.robot import xml_files
@@ -75,21 +74,6 @@ def compile(
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
     plan = compile_plan(document, chosen, kinds)
     return TactileModule(plan, (*KINDS, *kinds), dtype).to(device)
-
-
-def load_module(
-    path: str | PathLike[str],
-    *,
-    kinds: Sequence[Kind] = (),
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
-) -> TactileModule:
-    """Return the module of a compiled artefact.
-
-    Raises:
-        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
-    """
-    return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
 
 
 def _origin(loaded: Loaded) -> Origin:
