@@ -177,3 +177,15 @@ def test_the_file_has_the_mode_of_any_other(artifact, tmp_path):
     save_plan(load_plan(artifact), tmp_path / "hand.safetensors")
     assert (tmp_path / "hand.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.safetensors", "plain"]
+
+
+def test_arrays_that_were_tampered_with(artifact, tmp_path):
+    content = artifact.read_bytes()
+    arrays = load(content)
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+    changed = {**arrays, "queries/0/reach": arrays["queries/0/reach"] * 2}
+    lacking = {name: value for name, value in arrays.items() if name != "queries/0/reach"}
+    for bad in (changed, lacking):
+        (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
+        with pytest.raises(ArtifactError, match="the arrays are not those that the plan was written with"):
+            load_plan(tmp_path / "bad.safetensors")

@@ -112,13 +112,18 @@ def test_compile_with_overrides_into_a_new_folder(base, tmp_path, here):
     assert code == 0, error
     assert said.startswith("16 taxels on 1 links at resolution high\n")
     plan = tgdsl.load(out).plan
-    assert 400.0 in [float(value) for name, value in plan.arrays.items() if name.startswith("sensors/touch/") and value.size == 1]
+    assert 400.0 in [
+        float(value) for name, value in plan.arrays.items() if name.startswith("sensors/touch/") and value.size == 1
+    ]
 
 
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("resolution=mid", '--set resolution=mid: resolution: unknown resolution "mid"; known resolutions: high, low\n1 mistake\n'),
+        (
+            "resolution=mid",
+            '--set resolution=mid: resolution: unknown resolution "mid"; known resolutions: high, low\n1 mistake\n',
+        ),
         ("resolution", 'tgdsl: --set resolution: expected KEY=VALUE, such as "resolution=high"\n'),
         ("sensors.bit.threshold=3 kg", '"kg" is not a unit of length, expected one of m, cm, mm, um, µm\n1 mistake\n'),
         ("sensors.bit.treshold=3 mm", 'unknown key "treshold"; did you mean "threshold"?\n1 mistake\n'),
@@ -142,7 +147,10 @@ def test_documents_that_cannot_be_read(base, tmp_path, fails):
 def test_files_that_cannot_be_written(base, tmp_path, fails):
     (tmp_path / "file").write_text("")
     assert fails(base, "compile", "pad.yaml", "-o", str(tmp_path / "file" / "x.safetensors")).startswith("tgdsl: ")
-    assert fails(base, "schema", "-o", str(tmp_path / "none" / "s.json")) == f"tgdsl: {tmp_path}/none/s.json: No such file or directory\n"
+    assert (
+        fails(base, "schema", "-o", str(tmp_path / "none" / "s.json"))
+        == f"tgdsl: {tmp_path}/none/s.json: No such file or directory\n"
+    )
 
 
 def test_commands_that_do_not_exist(base, fails):

@@ -93,7 +93,9 @@ def test_imports_go_down(name):
             assert name in ("cli", "schema.files"), f"{name} imports tgdsl as a whole"
             continue
         assert there in FLOOR_OF, f"{name} imports tgdsl.{imported}, which is on no floor"
-        assert FLOOR_OF[there] <= FLOOR_OF[here], f"{name} (floor {FLOOR_OF[here]}) imports tgdsl.{imported} ({FLOOR_OF[there]})"
+        assert FLOOR_OF[there] <= FLOOR_OF[here], (
+            f"{name} (floor {FLOOR_OF[here]}) imports tgdsl.{imported} ({FLOOR_OF[there]})"
+        )
         assert {here, there} != {"compiler", "runtime"}, f"{name} imports tgdsl.{imported}"
 
 

@@ -16,6 +16,7 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -182,29 +183,32 @@ class Plan:
         return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"])
 
     def to_json(self) -> str:
-        """Return everything but the arrays, with sorted keys."""
+        """Return everything but the arrays, of which only a hash, with sorted keys."""
         plain: dict[str, Any] = {
             field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.name != "arrays"
         }
-        return json.dumps({"format": FORMAT, **plain}, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+        plain |= {"format": FORMAT, "arrays": _digest(self.arrays)}
+        return json.dumps(plain, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
 
     @staticmethod
     def from_json(text: str, arrays: Mapping[str, np.ndarray]) -> Plan:
         """Return the plan that `to_json` wrote.
 
         Raises:
-            ArtifactError: If the text is not a plan of this version.
+            ArtifactError: If the text is not a plan of this version, or the arrays are not its own.
         """
         try:
             plain = json.loads(text)
             version = plain.pop("format", None)
             if version != FORMAT:
                 raise ArtifactError(f"plan format {version} is not {FORMAT}, which this version of tgdsl reads; compile again")
+            if plain.pop("arrays", None) != _digest(arrays):
+                raise ArtifactError("the arrays are not those that the plan was written with")
             types = _field_types()
             if plain.keys() != types.keys():
                 raise ArtifactError(f"a plan has the parts {sorted(types)}, found {sorted(plain)}")
             values = {name: TypeAdapter(kind).validate_python(plain[name]) for name, kind in types.items()}
-        except (ValidationError, ValueError, AttributeError) as error:
+        except (ValidationError, ValueError, TypeError, AttributeError) as error:
             raise ArtifactError(f"not a plan: {error}") from error
         return Plan(**values, arrays=arrays)
 
@@ -212,6 +216,15 @@ class Plan:
 def _field_types() -> dict[str, Any]:
     hints = get_type_hints(Plan)
     return {field.name: hints[field.name] for field in dataclasses.fields(Plan) if field.name != "arrays"}
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return a hash of names, dtypes, shapes and contents."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode())
+        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
+    return digest.hexdigest()
 
 
 def _plain(value: Any) -> Any:

@@ -147,7 +147,9 @@ def test_selections(folder, links, expected):
 
 
 def test_links_that_no_sensor_has_are_not_sampled(folder):
-    found = resolved(folder, DOCUMENT.replace("links: all", "links: palm") .replace("objects: {", "objects: {rest: {body: thumb_1}, "))
+    found = resolved(
+        folder, DOCUMENT.replace("links: all", "links: palm").replace("objects: {", "objects: {rest: {body: thumb_1}, ")
+    )
     assert found.layout.num_taxels == 1
     assert found.unused == (
         ("link index_1", "no sensor is on it"),
@@ -185,7 +187,9 @@ def test_a_pattern_for_several_bodies(folder):
 
 
 def test_two_layouts_for_one_link(folder):
-    assert problems(folder, ("        index_2: " + PLACE + "\n        thumb", f'        "index_*": {PLACE}\n        thumb')) == [
+    assert problems(
+        folder, ("        index_2: " + PLACE + "\n        thumb", f'        "index_*": {PLACE}\n        thumb')
+    ) == [
         'd.yaml:14:9: robot.layout.resolutions.low.index_*: link "index_1" already has a layout, by "index_1"; give each link one'
     ]
 
@@ -201,19 +205,14 @@ def test_layout_keys_that_name_nothing(folder):
 # groups
 
 
-CIRCLES = pytest.mark.xfail(strict=True, reason="schema/select.py keeps silent about groups that contain themselves")
-
-
-@CIRCLES
 def test_a_group_that_contains_itself(folder):
     """By way of another one, and in what that one leaves out."""
     found = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", thumb]'))
-    assert [line.split(": ")[1] for line in found] == ["robot.layout.groups.tips", "robot.layout.groups.thumb"]
+    assert [line.split(": ")[1].split("[")[0] for line in found] == ["robot.layout.groups.tips", "robot.layout.groups.thumb"]
     assert 'group "tips" contains itself' in found[0]
     assert 'group "thumb" contains itself' in found[1]
 
 
-@CIRCLES
 def test_a_group_right_inside_itself(folder):
     found = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", tips]'))
     assert len(found) == 1
@@ -273,7 +272,9 @@ def test_what_can_never_be_in_contact(folder):
         f'{place}"cube" can never be in contact with a link of this sensor: the simulator does not collide them; '
         "let them collide, or use `gate: geometric`"
     ]
-    (folder / "d.yaml").write_text(DOCUMENT.replace("{body: cube}", "{body: ghost}").replace("feels: [cube]", "feels: [cube], gate: geometric"))
+    (folder / "d.yaml").write_text(
+        DOCUMENT.replace("{body: cube}", "{body: ghost}").replace("feels: [cube]", "feels: [cube], gate: geometric")
+    )
     touch = tgdsl.compile(folder / "d.yaml")
     assert touch.inputs.pairs == ()
     assert touch.inputs.bodies == ("ghost", "index_1", "index_2", "palm", "thumb_1")
@@ -325,7 +326,9 @@ def _robots() -> str:
 
 def test_a_placement_that_the_surface_cannot_satisfy(folder):
     grid = "{method: grid, rows: 2, columns: 2, direction: [0, 0, -1], radius: 1 mm, region: {box: {min: [1, 1, 1], max: [2, 2, 2]}}}"
-    found = problems(folder, (f"        palm: {PLACE}", f"        palm: {grid}"), (f"        index_1: {PLACE}", f"        index_1: {grid}"))
+    found = problems(
+        folder, (f"        palm: {PLACE}", f"        palm: {grid}"), (f"        index_1: {PLACE}", f"        index_1: {grid}")
+    )
     assert [line.split(": ")[:3] for line in found] == [
         ["d.yaml:12:15", "robot.layout.resolutions.low.palm", 'link "palm"'],
         ["d.yaml:13:18", "robot.layout.resolutions.low.index_1", 'link "index_1"'],
@@ -334,20 +337,25 @@ def test_a_placement_that_the_surface_cannot_satisfy(folder):
 
 # all at once
 
-EIGHT = DOCUMENT + """  grip: {kind: contact_depth, links: tipps, feels: [cube]}
+EIGHT = (
+    DOCUMENT
+    + """  grip: {kind: contact_depth, links: tipps, feels: [cube]}
   hot: {kind: thermometer, links: palm, feels: [cube]}
   hit: {kind: contact, links: palm, feels: [cub]}
   hat: {kind: contact, links: palm, feels: [cube], threshold: 4 kg}
 observations:
   policy: [{type: depth, of: touhc}]
 """
+)
 
 
 def test_eight_mistakes_are_eight_lines(folder):
     text = EIGHT.replace("        index_1: ", "        index_3: ").replace("objects: {", "objects: {ball: {body: bal}, ")
-    text = text.replace('tips: ["*_2"]', "tips: [tips]")
+    text = text.replace('tips: ["*_2"]', 'tips: ["*_22"]')
     (folder / "bad.yaml").write_text(text)
-    ran = subprocess.run([sys.executable, "-m", "tgdsl", "compile", "bad.yaml"], cwd=folder, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, "-m", "tgdsl", "compile", "bad.yaml"], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 2
     assert ran.stdout == ""
     lines = ran.stderr.splitlines()

@@ -110,7 +110,9 @@ def test_two_meshes_and_a_primitive_on_one_body(tmp_path):
     model = model_of(tmp_path, geoms, "<mesh file='wedge.stl'/><mesh file='brick.obj'/>")
     surface = model.surface(model.touchable("pad"))
     assert surface.geoms == (("wedge",), ("extra", "brick"), ())
-    for index, (low, high) in enumerate([((0.003, 0.001, 0.002), (0.007, 0.004, 0.009)), ((0.045, 0.09, -0.015), (0.055, 0.11, 0.015))]):
+    for index, (low, high) in enumerate(
+        [((0.003, 0.001, 0.002), (0.007, 0.004, 0.009)), ((0.045, 0.09, -0.015), (0.055, 0.11, 0.015))]
+    ):
         corners = surface.corners[surface.face_geom == index].reshape(-1, 3)
         np.testing.assert_allclose([corners.min(axis=0), corners.max(axis=0)], [low, high], atol=MESH_TOLERANCE)
 
@@ -171,7 +173,9 @@ def test_what_mujoco_refuses_is_told_with_file_and_element(tmp_path, text, parts
 
 def test_files_that_a_model_is_made_of(tmp_path):
     (tmp_path / "hand").mkdir()
-    (tmp_path / "hand" / "hand.xml").write_text("<mujoco><worldbody><body name='hand'><geom size='.1'/></body></worldbody></mujoco>")
+    (tmp_path / "hand" / "hand.xml").write_text(
+        "<mujoco><worldbody><body name='hand'><geom size='.1'/></body></worldbody></mujoco>"
+    )
     (tmp_path / "floor.xml").write_text("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
     (tmp_path / "main.xml").write_text(
         "<mujoco><include file='floor.xml'/><asset><model name='h' file='hand/hand.xml'/></asset>"
@@ -202,12 +206,16 @@ def joint_of(name: str, parent: str, child: str, kind: str = "fixed") -> str:
     return f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>{limit}</joint>"
 
 
-@pytest.mark.parametrize("reference", ["wedge.stl", "./meshes/../wedge.stl", "package://hand_pkg/urdf/wedge.stl", "file://wedge.stl"])
+@pytest.mark.parametrize(
+    "reference", ["wedge.stl", "./meshes/../wedge.stl", "package://hand_pkg/urdf/wedge.stl", "file://wedge.stl"]
+)
 def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
     folder = tmp_path / "hand_pkg" / "urdf"
     origin = "<origin xyz='.01 -.02 .03' rpy='.3 -.4 .5'/>"
     mesh = f"<mesh filename='{reference}' scale='.001 .001 .001'/>"
-    path = urdf_of(folder, link_of("palm", mesh, origin=origin) + link_of("tip", "<sphere radius='.01'/>") + joint_of("j", "palm", "tip"))
+    path = urdf_of(
+        folder, link_of("palm", mesh, origin=origin) + link_of("tip", "<sphere radius='.01'/>") + joint_of("j", "palm", "tip")
+    )
     (folder / "meshes").mkdir()
     wedge().export(folder / "wedge.stl")
     model = load_model(path)
@@ -245,7 +253,7 @@ def test_urdf_inertias_are_mended_with_one_warning(tmp_path):
     links = "".join(link_of(name, "<sphere radius='.01'/>", inertia) for name, inertia in inertias.items())
     names = list(inertias)
     path = urdf_of(tmp_path, links + "".join(joint_of(f"j{n}", names[0], n, "revolute") for n in names[1:]))
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="mended") as caught:
         model = load_model(path)
     assert [str(w.message) for w in caught] == [f"{path}: inertias that no body can have were mended: zero, long, skew"]
     moments = {name: model.compiled.body(name).inertia for name in names}
@@ -335,7 +343,10 @@ CASES = {
     ),
     "static_parent_and_child": (two_bodies("", f"|{HINGE}", nested=True), True),
     "welded_child": (two_bodies(FREE, "", nested=True), False),
-    "welded_child_filter_off": (two_bodies(FREE, "", nested=True, rest="<option><flag filterparent='disable'/></option>"), False),
+    "welded_child_filter_off": (
+        two_bodies(FREE, "", nested=True, rest="<option><flag filterparent='disable'/></option>"),
+        False,
+    ),
     "grandchild_through_weld": (
         f"<mujoco><worldbody><body name='a'>{FREE}<geom name='ga' size='.1'/><body name='mid'><geom size='.01' pos='1 0 0'/>"
         f"<body name='b'>{HINGE}<geom name='gb' size='.1'/></body></body></body></worldbody></mujoco>",

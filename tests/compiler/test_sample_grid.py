@@ -141,8 +141,7 @@ def test_grid_errors_say_what_to_change():
         "`columns_along` [0, 0, 2] is parallel to `direction` [0, 0, -1]; choose an axis across it"
     )
     assert str(error_of(surface, placement("grid", rows=10, columns=10, direction=DOWN, count=99))) == (
-        "only 80 of the grid's 100 cells hit the surface, expected `count` 99; "
-        "lower `count`, or give more `rows` and `columns`"
+        "only 80 of the grid's 100 cells hit the surface, expected `count` 99; lower `count`, or give more `rows` and `columns`"
     )
     pads = surface_of(box((0.01, 0.01, 0.01), (0.02, 0, 0)), box((0.01, 0.01, 0.01), (-0.02, 0, 0)))
     assert str(error_of(pads, placement("grid", rows=1, columns=1, direction=DOWN))) == (

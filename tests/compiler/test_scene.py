@@ -22,7 +22,7 @@ TWO = """
 <mujoco>
   <worldbody>
     <body name="pad"><geom type="box" size=".05 .05 .01"/></body>
-    <body name="tip" pos="0 0 1"><freejoint/><geom size=".01"/></body>
+    <body name="tip" pos="5 0 1"><freejoint/><geom size=".01"/></body>
     <body name="cube" pos="0 0 .029"><freejoint/><geom type="box" size=".02 .02 .02" mass=".25"/></body>
   </worldbody>
   <sensor><framepos name="mine" objtype="body" objname="cube"/></sensor>
@@ -87,7 +87,9 @@ def test_the_kept_scene_has_the_same_sensors(tmp_path, case):
 
 
 def test_the_force_is_the_one_on_the_link_and_the_normal_points_out_of_the_object():
-    model = instrument(mujoco.MjSpec.from_string(TWO), inputs("contact_force", "contact_netforce", links=("pad",), slots=1)).compile()
+    model = instrument(
+        mujoco.MjSpec.from_string(TWO), inputs("contact_force", "contact_netforce", links=("pad",), slots=1)
+    ).compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 1000)
     net = data.sensor(contact_sensor_names(Pair("pad", "thing"))[1]).data
@@ -100,7 +102,9 @@ def test_the_force_is_the_one_on_the_link_and_the_normal_points_out_of_the_objec
 
 @pytest.mark.parametrize(("body", "gone"), [("pad", "pad"), ("cube", "cube")])
 def test_instrument_refuses_a_model_without_a_body(body, gone):
-    spec = mujoco.MjSpec.from_string(TWO.replace(f'<body name="{body}"', '<body name="other"').replace(f'objname="{body}"', 'objname="tip"'))
+    spec = mujoco.MjSpec.from_string(
+        TWO.replace(f'<body name="{body}"', '<body name="other"').replace(f'objname="{body}"', 'objname="tip"')
+    )
     with pytest.raises(RobotError) as caught:
         tgdsl.instrument(spec, inputs())
     assert str(caught.value) == f'this model has no body "{gone}", which the module wants contacts of'
@@ -142,7 +146,9 @@ def included(folder: Path) -> Path:
     return written(
         folder,
         scene="<include file='hand/hand.xml'/>" + PLAIN.format("item"),
-        hand__hand="<compiler meshdir='parts'/><asset><mesh file='a.stl'/></asset><worldbody>" + body("pad", "a") + "</worldbody>",
+        hand__hand="<compiler meshdir='parts'/><asset><mesh file='a.stl'/></asset><worldbody>"
+        + body("pad", "a")
+        + "</worldbody>",
     )
 
 
@@ -159,8 +165,24 @@ def main_under_the_included_files_meshdir(folder: Path) -> Path:
     brick(folder / "parts" / "a.stl", 0.02, 0.03, 0.04)
     return written(
         folder,
-        scene="<include file='settings.xml'/><asset><mesh file='a.stl'/></asset><worldbody>" + body("pad", "a") + "</worldbody>",
+        scene="<include file='settings.xml'/><asset><mesh file='a.stl'/></asset><worldbody>"
+        + body("pad", "a")
+        + "</worldbody>",
         settings="<compiler assetdir='parts' angle='radian'/>",
+    )
+
+
+def files_of_one_name_beside_both(folder: Path) -> Path:
+    """MuJoCo takes those beside the main file."""
+    brick(folder / "a.stl", 0.02, 0.03, 0.04)
+    brick(folder / "hand" / "a.stl", 0.05, 0.06, 0.07)
+    inner = "<asset><mesh file='a.stl'/></asset><worldbody>" + body("{}", "a") + "</worldbody>"
+    return written(
+        folder,
+        scene="<include file='hand/hand.xml'/>",
+        hand__hand="<include file='inner.xml'/>",
+        inner=inner.replace("{}", "pad"),
+        hand__inner=inner.replace("{}", "other"),
     )
 
 
@@ -211,6 +233,7 @@ SCENES = {
         included,
         included_under_the_main_files_meshdir,
         main_under_the_included_files_meshdir,
+        files_of_one_name_beside_both,
         attached,
         one_name_in_two_folders,
         textured,
@@ -224,7 +247,17 @@ def same(found: mujoco.MjModel, expected: mujoco.MjModel) -> None:
     for name in ("nbody", "ngeom", "nmesh", "ntex", "nmeshvert", "ntexdata", "nhfielddata"):
         assert getattr(found, name) == getattr(expected, name), name
     assert [found.mesh(i).name for i in range(found.nmesh)] == [expected.mesh(i).name for i in range(expected.nmesh)]
-    for name in ("mesh_vert", "mesh_face", "mesh_pos", "geom_pos", "geom_quat", "geom_size", "body_mass", "tex_data", "hfield_data"):
+    for name in (
+        "mesh_vert",
+        "mesh_face",
+        "mesh_pos",
+        "geom_pos",
+        "geom_quat",
+        "geom_size",
+        "body_mass",
+        "tex_data",
+        "hfield_data",
+    ):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
@@ -267,7 +300,9 @@ def test_assets_that_have_changed_or_gone(tmp_path):
     brick(tmp_path / "right" / "tip.stl", 0.05, 0.06, 0.08)
     with pytest.raises(ArtifactError) as caught:
         scene_model(kept)
-    assert str(caught.value) == f"asset {tmp_path.resolve()}/right/tip.stl has changed since the scene was compiled; compile again"
+    assert (
+        str(caught.value) == f"asset {tmp_path.resolve()}/right/tip.stl has changed since the scene was compiled; compile again"
+    )
     (tmp_path / "right" / "tip.stl").unlink()
     with pytest.raises(ArtifactError) as caught:
         scene_model(kept)
@@ -297,7 +332,10 @@ def test_an_artefact_does_not_depend_on_the_current_folder(tmp_path, monkeypatch
     (project / "deep").mkdir()
     monkeypatch.chdir(project / "deep")
     save_plan(compile_plan("../hand.yaml"), "three.safetensors")
-    contents = [path.read_bytes() for path in (tmp_path / "one.safetensors", project / "two.safetensors", project / "deep" / "three.safetensors")]
+    contents = [
+        path.read_bytes()
+        for path in (tmp_path / "one.safetensors", project / "two.safetensors", project / "deep" / "three.safetensors")
+    ]
     assert contents[0] == contents[1] == contents[2]
     monkeypatch.chdir("/")
     assert tgdsl.simulate(tgdsl.load(tmp_path / "one.safetensors"), 1).model.nmesh == 1

@@ -164,7 +164,9 @@ def test_state_dtypes_and_fields(tmp_path):
 # contacts
 
 
-@pytest.mark.parametrize(("pad", "item"), [("box", "sphere"), ("sphere", "box"), ("capsule", "box"), ("box", "box"), ("sphere", "sphere")])
+@pytest.mark.parametrize(
+    ("pad", "item"), [("box", "sphere"), ("sphere", "box"), ("capsule", "box"), ("box", "box"), ("sphere", "sphere")]
+)
 def test_contacts_are_those_of_mujocos_functions(tmp_path, pad, item):
     """MuJoCo orders the geoms of a contact by type: link and object come in either order, and the force must not care."""
     path = scene(tmp_path, ARM.format(pad=pad, item=item))
@@ -228,7 +230,9 @@ def test_a_resting_cube_weighs_what_it_weighs(tmp_path, angle):
     for _ in range(4):
         sim.step()
     state = sim.state()
-    np.testing.assert_allclose(value(state, "contact_netforce")[0, 0], [0, 0, -WEIGHT], atol=1e-5)  # the object's weight, on the link
+    np.testing.assert_allclose(
+        value(state, "contact_netforce")[0, 0], [0, 0, -WEIGHT], atol=1e-5
+    )  # the object's weight, on the link
     np.testing.assert_allclose(value(state, "contact_force")[0, 0].sum(axis=0), [0, 0, -WEIGHT], atol=1e-5)
     normal = place.apply([0, 0, -1])  # out of the cube, into the pad
     for row in value(state, "contact_normal")[0, 0]:
@@ -279,7 +283,9 @@ def test_many_environments_are_as_many_single_ones(tmp_path):
             np.testing.assert_array_equal(value(state, name)[env], value(one.state(), name)[0], err_msg=name)
 
 
-@pytest.mark.parametrize("ids", [[1, 3], torch.tensor([1, 3]), np.array([1, 3]), [False, True, False, True], torch.tensor([0, 1, 0, 1]).bool()])
+@pytest.mark.parametrize(
+    "ids", [[1, 3], torch.tensor([1, 3]), np.array([1, 3]), [False, True, False, True], torch.tensor([0, 1, 0, 1]).bool()]
+)
 def test_reset_starts_the_named_environments_and_no_others(tmp_path, ids):
     path = scene(tmp_path, ARM.format(pad="box", item="sphere"))
     touch, model = wanting(module(path, ("item",)), path)
@@ -315,7 +321,7 @@ def test_reset_of_none_does_nothing(tmp_path, ids):
 def test_reset_of_what_is_not_there(tmp_path, ids):
     touch, _ = arm(tmp_path)
     sim = BatchSimulation(touch, 3, keyframe="home")
-    with pytest.raises(SimulationError, match="^MuJoCo: "):
+    with pytest.raises(SimulationError, match=r"^MuJoCo: "):
         sim.reset(ids)
 
 
@@ -413,7 +419,7 @@ def test_a_model_of_your_own_needs_the_bodies(tmp_path):
 @pytest.mark.parametrize("keys", [{"num_envs": 0}, {"num_envs": 1, "substeps": 0}])
 def test_nothing_to_step(tmp_path, keys):
     touch, _ = arm(tmp_path)
-    with pytest.raises(SimulationError, match="expected at least 1 of each"):
+    with pytest.raises(SimulationError, match=r"expected at least 1 of each"):
         simulate(touch, **keys)
 
 
@@ -425,11 +431,11 @@ def test_rk4_is_refused_because_its_poses_and_contacts_are_of_two_instants(tmp_p
     data.qvel[0] = 1
     mujoco.mj_step(model, data)
     assert data.body("cube").xpos[0] > 1e-3  # not where the contacts were found: there is the oracle
-    with pytest.raises(SimulationError, match="^with the integrator RK4 MuJoCo's poses and contacts are of two instants"):
+    with pytest.raises(SimulationError, match=r"^with the integrator RK4 MuJoCo's poses and contacts are of two instants"):
         simulate(touch, 1)
 
 
 def test_other_devices(tmp_path):
     touch, _ = arm(tmp_path)
-    with pytest.raises(SimulationError, match='^physics on "cuda" is not supported by this version of tgdsl, expected "cpu"$'):
+    with pytest.raises(SimulationError, match=r'^physics on "cuda" is not supported by this version of tgdsl, expected "cpu"$'):
         simulate(touch, 1, device="cuda")

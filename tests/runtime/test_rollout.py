@@ -33,7 +33,10 @@ def document(tmp_path_factory):
     probes = [{"pos": [x, 0, 0.01], "normal": [0, 0, 1]} for x in (0.0, 0.01, 0.025)]
     return {
         "tgdsl": 1,
-        "robot": {"model": str(path), "layout": {"resolutions": {"o": {"pad": {"method": "points", "points": probes, "radius": 0.004}}}}},
+        "robot": {
+            "model": str(path),
+            "layout": {"resolutions": {"o": {"pad": {"method": "points", "points": probes, "radius": 0.004}}}},
+        },
         "objects": {"cube": {"body": "cube"}},
         "sensors": {
             "touch": {"kind": "kinematic_taxel", "links": "pad", "feels": ["cube"], "outputs": ["force"], "readout": "both"},
@@ -64,10 +67,10 @@ def test_scripted_controls_errors():
         scripted_controls(MODEL, ("rest", "sqeeze"), 1.0, 0.01)
     assert str(caught.value) == 'the scene has no keyframe "sqeeze"; did you mean "squeeze"?'
     bare = mujoco.MjModel.from_xml_string("<mujoco/>")
-    with pytest.raises(SimulationError, match='^the scene has no keyframe "rest"; there are no keyframes$'):
+    with pytest.raises(SimulationError, match=r'^the scene has no keyframe "rest"; there are no keyframes$'):
         scripted_controls(bare, ("rest",), 1.0, 0.01)
     for keyframes, seconds in (((), 1.0), (("rest",), 0.0), (("rest",), -1.0), (("rest",), np.nan), (("rest",), np.inf)):
-        with pytest.raises(SimulationError, match="expected at least one, and more than 0 s$"):
+        with pytest.raises(SimulationError, match=r"expected at least one, and more than 0 s$"):
             scripted_controls(MODEL, keyframes, seconds, 0.01)
 
 
@@ -166,6 +169,6 @@ def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     monkeypatch.setattr("os.replace", fail)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(OSError, match=r"no space"):
         recorder.write(tmp_path / "r.npz", np.zeros((1, 2)))
     assert not list(tmp_path.iterdir())

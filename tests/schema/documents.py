@@ -41,9 +41,7 @@ def write(folder: Path, document: str = DOCUMENT, layout: str = LAYOUT) -> Path:
     return folder / "hand.yaml"
 
 
-def read(
-    folder: Path, document: str = DOCUMENT, layout: str = LAYOUT, overrides: Mapping[str, str] | None = None
-) -> Loaded:
+def read(folder: Path, document: str = DOCUMENT, layout: str = LAYOUT, overrides: Mapping[str, str] | None = None) -> Loaded:
     loaded = load(write(folder, document, layout), overrides)
     loaded.raise_problems()
     return loaded

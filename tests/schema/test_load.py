@@ -90,8 +90,7 @@ def test_many_mistakes_are_sorted_each_once_and_cause_no_others(tmp_path):
         'hand.yaml:13:14: observations.policy[1].type: unknown type "dept"; did you mean "depth"?',
         'hand.yaml:14:25: observations.policy[2].of: unknown sensor "deep"; did you mean "depth"?',
         'hand.yaml:15:13: resolution: unknown resolution "middle"; known resolutions: high, low',
-        'layout.yaml:5:52: resolutions.low.index_tip.radius: "mn" is not a unit of length, '
-        "expected one of m, cm, mm, um, µm",
+        'layout.yaml:5:52: resolutions.low.index_tip.radius: "mn" is not a unit of length, expected one of m, cm, mm, um, µm',
     ]
 
 

@@ -50,8 +50,7 @@ WRONG = {
     ),
     "huge number": (
         after(f"    threshold: {'9' * 400}\n"),
-        "hand.yaml:12:16: sensors.touch.threshold: inf is not finite, "
-        'expected a number in m or a string such as "4 µm"',
+        'hand.yaml:12:16: sensors.touch.threshold: inf is not finite, expected a number in m or a string such as "4 µm"',
     ),
     "two keys at odds": (
         after("    threshold: 1 mm\n    release_threshold: 2 mm\n"),

@@ -11,7 +11,7 @@ from tgdsl.compiler.sample import Samples, sample
 from tgdsl.errors import Problem, SampleError, did_you_mean, listed
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.layout import Layout, Link
-from tgdsl.schema.files import robot_names
+from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, matching, select
@@ -92,9 +92,10 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
     else:
         robot = load_model(loaded.robot_file)
     if loaded.spec.scene is None:
-        return robot, robot
+        is_faulty = loaded.raw(("scene",)) is not None  # and its mistake is reported already
+        return robot, None if is_faulty else robot
     scene_file = loaded.folder / loaded.spec.scene.model
-    if scene_file.is_file():
+    if is_file(scene_file):
         scene = load_model(scene_file)
     else:
         what = f'there is no file "{loaded.spec.scene.model}"'
@@ -110,7 +111,7 @@ def _names(robot: Model) -> list[list[str]]:
 def _check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -> None:
     for group, selection in layout.spec.groups.items():
         path: Path = ("groups", group)
-        select(selection, _names(robot), layout.spec.groups, _reporter(layout, path, problems))
+        select(selection, _names(robot), layout.spec.groups, _reporter(layout, path, problems), group)
 
 
 def _reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:

@@ -53,6 +53,10 @@ COMPARED = (
 """Arrays of the compiled model that a kept scene must reproduce."""
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
 """Elements of an MJCF file's `<asset>` that name a file."""
+FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
+"""How they name it: the sides of a cube's texture have one each."""
+FOLDER_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")
+"""Attributes of `<compiler>` that say in which folder assets lie."""
 
 
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
@@ -140,34 +144,41 @@ class _Kept:
         self.assets: dict[str, Asset] = {}
         self.contents: dict[str, bytes] = {}
 
-    def rewritten(self, root: ET.Element, file: Path, folders: list[Path]) -> ET.Element:
+    def rewritten(
+        self, root: ET.Element, file: Path, folders: list[Path], settings: dict[str, str] | None = None
+    ) -> ET.Element:
         """Rewrite one file.
 
         Args:
             root: Its content, changed in place.
             file: The file, for messages.
-            folders: Where files that it names may lie: an included file's assets are looked up beside the including one.
+            folders: Where files that it names may lie: an included file's assets are looked up beside the including one,
+                and then beside itself.
+            settings: The folder attributes that hold in the including file, if there is one.
         """
         subfolders = {"mesh": "meshdir", "skin": "meshdir", "hfield": "meshdir", "texture": "texturedir"}
-        settings: dict[str, str] = {}
+        settings = _folder_settings(root, file, folders) if settings is None else settings
         for compiler in root.iter("compiler"):
-            for attribute in ("meshdir", "texturedir", "assetdir"):
-                if attribute in compiler.attrib:
-                    settings[attribute] = compiler.attrib.pop(attribute)
+            for attribute in FOLDER_ATTRIBUTES:
+                compiler.attrib.pop(attribute, None)
         for element in root.iter():
             name = element.get("file")
             if element.tag in ("include", "model") and name:
-                element.set("file", self._part(_found(name, [""], folders, file), folders, element.tag))
-            elif element.tag in ASSET_TAGS and name:
-                element.set("name", element.get("name", Path(name).stem))
+                element.set("file", self._part(_found(name, [""], folders, file), folders, element.tag, settings))
+            elif element.tag in ASSET_TAGS:
+                if name:
+                    element.set("name", element.get("name", Path(name).stem))
                 own = [settings.get(subfolders[element.tag], settings.get("assetdir", "")), ""]
-                element.set("file", self._asset(_found(name, own, folders, file)))
+                for attribute in FILE_ATTRIBUTES:
+                    if element.get(attribute):
+                        element.set(attribute, self._asset(_found(element.get(attribute, ""), own, folders, file)))
         return root
 
-    def _part(self, path: Path, folders: list[Path], tag: str) -> str:
-        around = [path.parent, *folders] if tag == "include" else [path.parent]
+    def _part(self, path: Path, folders: list[Path], tag: str, settings: dict[str, str]) -> str:
+        is_include = tag == "include"
+        around = [*folders, path.parent] if is_include else [path.parent]
         try:
-            root = self.rewritten(ET.parse(path).getroot(), path, around)
+            root = self.rewritten(ET.parse(path).getroot(), path, around, settings if is_include else None)
         except ET.ParseError as error:
             raise RobotError(f"{path}: not XML: {error}") from error
         text = ET.tostring(root, encoding="unicode")
@@ -182,6 +193,18 @@ class _Kept:
         self.assets[key] = Asset(key, portable(path), digest)
         self.contents[key] = content
         return key
+
+
+def _folder_settings(root: ET.Element, file: Path, folders: list[Path]) -> dict[str, str]:
+    """Return the folder attributes of a file: MuJoCo reads what it includes as part of it, and the last one counts."""
+    settings: dict[str, str] = {}
+    for element in root.iter():
+        if element.tag == "compiler":
+            settings |= {name: value for name, value in element.attrib.items() if name in FOLDER_ATTRIBUTES}
+        elif element.tag == "include" and (name := element.get("file")):
+            path = _found(name, [""], folders, file)
+            settings |= _folder_settings(ET.parse(path).getroot(), path, [*folders, path.parent])
+    return settings
 
 
 def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) -> Path:

@@ -22,7 +22,7 @@ def select(
     candidates: Sequence[Sequence[str]],
     groups: Mapping[str, Selection],
     report: Report,
-    what: str = "link",
+    group: str | None = None,
 ) -> list[int]:
     """Return the candidates that a selection takes, in the candidates' order.
 
@@ -30,44 +30,49 @@ def select(
         selection: What to include and exclude.
         candidates: The names that each candidate answers to.
         groups: Named selections that may stand in place of names, also within one another.
-        report: Called for each pattern of the selection itself that matches nothing (and for groups that contain
-            themselves); an `exclude` may match nothing.
-        what: What the candidates are, for messages.
+        report: Called for each pattern of the selection itself that matches nothing; an `exclude` may match nothing.
+        group: The selection's own name, if it is a group: that it contains itself is reported too.
 
     Returns:
         Indices of the chosen candidates, ascending.
     """
-    return sorted(_chosen(selection, candidates, groups, report, what, ()))
+    known = [*groups, *(name for names in candidates for name in names)]
+    for pattern in selection.include:
+        if pattern in groups and not _group(pattern, candidates, groups, ()) and pattern != group:
+            report(pattern, f'group "{pattern}" holds no link', "")
+        elif pattern not in groups and not _matched(pattern, candidates):
+            report(pattern, f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
+    if group is not None and (circle := _circle(group, group, groups, ())):
+        report(circle[0], f'group "{group}" contains itself', " → ".join([group, *circle]))
+    return sorted(_chosen(selection, candidates, groups, () if group is None else (group,)))
 
 
 def _chosen(
-    selection: Selection,
-    candidates: Sequence[Sequence[str]],
-    groups: Mapping[str, Selection],
-    report: Report,
-    what: str,
-    inside: tuple[str, ...],
+    selection: Selection, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
 ) -> set[int]:
-    def of(pattern: str) -> set[int]:
-        if pattern in inside:
-            report(pattern, f'group "{pattern}" contains itself', " → ".join([*inside, pattern]))
-            return set()
-        if pattern in groups:
-            return _chosen(groups[pattern], candidates, groups, _silent, what, (*inside, pattern))
-        return {i for i, names in enumerate(candidates) if matching(pattern, names)}
+    def of(patterns: Sequence[str]) -> set[int]:
+        found = [_group(p, candidates, groups, inside) if p in groups else _matched(p, candidates) for p in patterns]
+        return set().union(*found)
 
-    taken: set[int] = set()
-    for pattern in selection.include:
-        found = of(pattern)
-        if not found and pattern not in inside:
-            known = [*groups, *(name for names in candidates for name in names)]
-            problem = f'group "{pattern}" holds no {what}' if pattern in groups else f'no {what} matches "{pattern}"'
-            report(pattern, problem, "" if pattern in groups else did_you_mean(pattern, known, f"{what}s"))
-        taken |= found
-    for pattern in selection.exclude:
-        taken -= of(pattern)
-    return taken
+    return of(selection.include) - of(selection.exclude)
 
 
-def _silent(pattern: str, what: str, hint: str) -> None:
-    """Problems inside a group are reported where the group is defined."""
+def _group(
+    name: str, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
+) -> set[int]:
+    """Return what a group takes; nothing if it is being looked up already: that mistake is reported where it is defined."""
+    return set() if name in inside else _chosen(groups[name], candidates, groups, (*inside, name))
+
+
+def _matched(pattern: str, candidates: Sequence[Sequence[str]]) -> set[int]:
+    return {i for i, names in enumerate(candidates) if matching(pattern, names)}
+
+
+def _circle(name: str, end: str, groups: Mapping[str, Selection], seen: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the groups that lead from one to another through includes and excludes, the last one too; or nothing."""
+    for pattern in (*groups[name].include, *groups[name].exclude):
+        if pattern == end:
+            return (pattern,)
+        if pattern in groups and pattern not in seen and (rest := _circle(pattern, end, groups, (*seen, name, pattern))):
+            return (pattern, *rest)
+    return ()
