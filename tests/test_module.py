@@ -11,7 +11,7 @@ from tgdsl.errors import SpecError, StateError, TgdslError
 from tgdsl.explain import operations_per_env
 from tgdsl.module import TactileModule
 from tgdsl.sensors import KINDS
-from tgdsl.sensors.base import Channel, Kind, Lowered, ProbeSpec
+from tgdsl.sensors.base import Channel, ContactProbeSpec, Kind, Lowered
 from tgdsl.state import SceneState
 
 SCENE = """
@@ -214,7 +214,7 @@ def test_state_moves_between_dtypes(touch):
     assert state.body_pos.dtype == torch.float32 and isinstance(state, SceneState)
 
 
-class InverseSpec(ProbeSpec):
+class InverseSpec(ContactProbeSpec):
     """One over one plus depth: a kind that tgdsl does not have."""
 
     kind: Literal["inverse"]

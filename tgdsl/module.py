@@ -276,12 +276,12 @@ class TactileModule(nn.Module):
         objects = [self._object(index) for index in query.objects]
         if not query.is_gated:
             pairs = pairs._replace(gate=None)
-        return feel(pairs, probes, objects, "normal" in query.needs, "motion" in query.needs), probes
+        return feel(pairs, probes, objects, query.needs), probes
 
     def _object(self, index: int) -> FeltObject:
         target = self.plan.objects[index]
         tensors = self.constants.under(f"objects/{target.name}", ("size", "pos", "rotation"))
-        return FeltObject(target.first_pair, target.num_pairs, target.shapes, target.is_centred, **tensors)
+        return FeltObject(target.name, target.first_pair, target.num_pairs, target.shapes, target.is_centred, **tensors)
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""

@@ -111,12 +111,13 @@ class ReferenceModule:
         parts = []
         for i, link in enumerate(self.layout.links):
             own = self.layout.link_id == i
-            objects = []
+            objects: list[tuple[ReferenceBody, list[ReferenceGeom]] | None] = []
             for target in (self.plan.objects[o] for o in query.objects):
                 pair = gated.get((link.body, target.name))
                 is_found = pair is not None and state.contact_found is not None and state.contact_found[env, pair] > 0
-                if target.body != link.body and (is_found or not query.is_gated):
-                    objects.append((self._body(state, env, target.body, shift), self._geoms(target.name, target.shapes)))
+                is_felt = target.body != link.body and (is_found or not query.is_gated)
+                geoms = self._geoms(target.name, target.shapes)
+                objects.append((self._body(state, env, target.body, shift), geoms) if is_felt else None)
             body = self._body(state, env, link.body, np.zeros(3))
             parts.append(touch(body, self.layout.pos[own], self.layout.radius[own], objects))
         return Touch(*(np.concatenate([getattr(part, name) for part in parts]) for name in Touch.__dataclass_fields__))
@@ -190,6 +191,10 @@ class KindConformance:
     float32_tolerance: ClassVar[float] = FLOAT32_TOLERANCE
     is_differentiable: ClassVar[bool] = True
     """Whether readings follow poses smoothly, away from ties."""
+    rest: ClassVar[float | tuple[float, ...]] = 0.0
+    """Reading where nothing is near, for all channels or for each."""
+    gates: ClassVar[tuple[str, ...]] = ("contact_pair", "geometric")
+    """Gates that the kind knows; empty if it has none."""
 
     @pytest.fixture
     def scene(self, tmp_path: Path) -> Path:
@@ -214,6 +219,9 @@ class KindConformance:
         for step in range(self.num_steps):
             yield module.example_state(num_envs or self.num_envs, seed=step)
 
+    def _gates(self) -> list[dict[str, str]]:
+        return [{"gate": gate} for gate in self.gates] or [{}]
+
     def _known(self) -> tuple[Kind, ...]:
         from tgdsl.sensors import KINDS
 
@@ -227,24 +235,29 @@ class KindConformance:
     def test_something_is_felt(self, scene: Path) -> None:
         """The states of this suite are no empty test: some taxels read, some do not."""
         module, _ = self.build(self.document(scene), torch.float64)
-        share = torch.stack([(module(state)["s"] != 0).any(dim=2).double().mean() for state in self.states(module)])
+        share = torch.stack(
+            [
+                (module(state)["s"] != torch.tensor(self.rest, dtype=torch.float64)).any(dim=2).double().mean()
+                for state in self.states(module)
+            ]
+        )
         assert 0.05 < share.mean() < 0.95
 
-    @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
-    def test_float64_equals_reference(self, scene: Path, gate: str) -> None:
-        """Readings are the reference's to rounding."""
-        module, reference = self.build(self.document(scene, gate=gate), torch.float64)
-        for state in self.states(module):
-            assert_agrees(module(state)["s"], reference, state, FLOAT64_TOLERANCE)
+    def test_float64_equals_reference(self, scene: Path) -> None:
+        """Readings are the reference's to rounding, under each gate."""
+        for gate in self._gates():
+            module, reference = self.build(self.document(scene, **gate), torch.float64)
+            for state in self.states(module):
+                assert_agrees(module(state)["s"], reference, state, FLOAT64_TOLERANCE)
 
-    @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
-    def test_float32_equals_reference(self, scene: Path, gate: str) -> None:
-        """A float32 module that is given float64 poses loses no more than float32 must."""
-        module, reference = self.build(self.document(scene, gate=gate), torch.float32)
-        for state in self.states(module):
-            readings = module(state)["s"]
-            assert readings.dtype == torch.float32
-            assert_agrees(readings, reference, state, self.float32_tolerance)
+    def test_float32_equals_reference(self, scene: Path) -> None:
+        """A float32 module that is given float64 poses loses no more than float32 must, under each gate."""
+        for gate in self._gates():
+            module, reference = self.build(self.document(scene, **gate), torch.float32)
+            for state in self.states(module):
+                readings = module(state)["s"]
+                assert readings.dtype == torch.float32
+                assert_agrees(readings, reference, state, self.float32_tolerance)
 
     @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, FAR_TOLERANCE), (torch.float32, None)])
     @pytest.mark.parametrize("distance", [0.0, 1000.0])
@@ -282,14 +295,14 @@ class KindConformance:
 
     def test_no_contact_gives_the_rest_value(self, scene: Path) -> None:
         """Without contact pairs nothing is felt, and far away neither; inactive taxels never feel."""
-        for gate in ("contact_pair", "geometric"):
-            module, _ = self.build(self.document(scene, gate=gate), torch.float32)
+        for gate in self._gates():
+            module, _ = self.build(self.document(scene, **gate), torch.float32)
+            rest = torch.tensor(self.rest, dtype=torch.float32)
             state = module.example_state(4)
             inactive = torch.from_numpy(module.taxels["s"]["radius"] == 0)
             assert inactive.any()
-            assert not module(state)["s"][:, inactive].any()
-            if gate == "contact_pair":
-                assert state.contact_found is not None
+            assert (module(state)["s"][:, inactive] == rest).all()
+            if state.contact_found is not None:
                 state.contact_found = torch.zeros_like(state.contact_found)
             else:
                 assert state.body_pos is not None and state.body_quat is not None
@@ -297,11 +310,11 @@ class KindConformance:
                 state.body_pos = torch.zeros_like(state.body_pos)
                 state.body_pos[:, [module.inputs.bodies.index(link) for link in ("palm", "tip")], 2] = 5.0
             module.reset()
-            assert not module(state)["s"].any()
+            assert (module(state)["s"] == rest).all()
 
     def test_a_broken_pose_is_seen(self, scene: Path) -> None:
         """Not-a-number in a pose comes out as not-a-number, not as no contact."""
-        module, _ = self.build(self.document(scene, gate="geometric"), torch.float32)
+        module, _ = self.build(self.document(scene, **self._gates()[-1]), torch.float32)
         state = module.example_state(2)
         assert state.body_pos is not None
         state.body_pos[1, module.inputs.bodies.index("item")] = torch.nan

@@ -19,7 +19,7 @@ def module(
     *,
     radius: float = 0.01,
     dtype: torch.dtype = torch.float64,
-    gate: str = "geometric",
+    gate: str | None = "geometric",
     **sensor: Any,
 ) -> TactileModule:
     """Return a module with one sensor, `s`, whose probes [m] are on the body `pad`; the object's geom is MJCF text."""
@@ -34,7 +34,7 @@ def module(
         "tgdsl": 1,
         "robot": {"model": str(path), "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}},
         "objects": {"item": {"body": "item"}},
-        "sensors": {"s": {"links": "pad", "feels": ["item"], "gate": gate, **sensor}},
+        "sensors": {"s": {"links": "pad", "feels": ["item"], **({"gate": gate} if gate else {}), **sensor}},
     }
     return tgdsl.compile(document, dtype=dtype)
 

@@ -26,7 +26,7 @@ def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...]) -> Draft:
         taxels = resolved.layout.taxels_of(resolved.links[name])
         lowered = kind.lower(spec, resolved.layout.take(taxels))
         readings = (name, f"{name}/clean") if spec.readout == "both" else (name,)
-        sensors.append(DraftSensor(name, kind.name, taxels, spec.feels, spec.gate == "contact_pair", lowered, readings))
+        sensors.append(DraftSensor(name, kind.name, taxels, spec.feels, spec.is_gated, lowered, readings))
     return Draft(resolved.layout, sensors, dict(resolved.objects), resolved.scene, list(resolved.unused))
 
 

@@ -6,7 +6,7 @@ small, a taxel's are not, so everything that depends on the pair alone is formed
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import torch
@@ -64,6 +64,7 @@ class FeltObject(NamedTuple):
     """An object's geoms in its body's frame, and where its pairs are.
 
     Attributes:
+        name: Its name.
         first_pair: Index of its first pair.
         num_pairs: Number of its pairs.
         shapes: MuJoCo's name of each geom's type.
@@ -73,6 +74,7 @@ class FeltObject(NamedTuple):
         rotation: Rotates geom vectors into the body frame, row by row.
     """
 
+    name: str
     first_pair: int
     num_pairs: int
     shapes: tuple[str, ...]
@@ -80,6 +82,16 @@ class FeltObject(NamedTuple):
     size: Float[Tensor, "geom 3"]
     pos: Float[Tensor, "geom 3"]
     rotation: Float[Tensor, "geom 9"]
+
+
+class Distance(NamedTuple):
+    """Signed distance of each probe to one object's surface [m], and its gradient in the link's frame: planes (env, taxel).
+
+    The distance is infinite where the pair is out of question: an inactive probe, or a link and itself.
+    """
+
+    value: Tensor
+    gradient: Vec
 
 
 class Felt(NamedTuple):
@@ -90,12 +102,14 @@ class Felt(NamedTuple):
         normal: Unit normal out of the object; zero where the depth is zero. None if no sensor wants it.
         velocity: Velocity of the object's material at the probe relative to the probe [m/s]; None if not wanted.
         angular: Angular velocity of the object relative to the link [rad/s]; None if not wanted.
+        distances: Distance to each object, by its name; empty if not wanted.
     """
 
     depth: Tensor
     normal: Vec | None
     velocity: Vec | None
     angular: Vec | None
+    distances: dict[str, Distance]
 
 
 def relate(
@@ -139,49 +153,58 @@ def relate(
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, gate)
 
 
-def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], with_normal: bool, with_motion: bool) -> Felt:
+def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], needs: Collection[str]) -> Felt:
     """Query all probes against all objects; the deepest geom wins, the first among equals.
 
     Args:
         pairs: Relative poses of all pairs of the plan.
         probes: The probes.
         objects: The objects, in the order of `probes.reach`.
-        with_normal: Whether to return the normal.
-        with_motion: Whether to return velocities.
+        needs: Which optional parts of the answer are wanted: "normal", "motion", "distance".
 
     Returns:
-        Depth, normal and relative motion at each probe. Not-a-number in a pose comes out as not-a-number.
+        Depth and what is wanted besides, at each probe. Not-a-number in a pose comes out as not-a-number.
     """
     num_envs = pairs.offset[0].shape[0]
     zero = pairs.offset[0].new_zeros((num_envs, probes.pos[0].shape[0]))
     depth, normal, linear, angular = zero, (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
+    with_normal, with_motion = "normal" in needs, "motion" in needs and pairs.motion is not None
+    distances: dict[str, Distance] = {}
     for i, target in enumerate(objects):
         own = slice(target.first_pair, target.first_pair + target.num_pairs)
-        pair = probes.pair[i]
-        reach = probes.reach[i]
+        pair, reach = probes.pair[i], probes.reach[i]
         if pairs.gate is not None:
             reach = reach + pairs.gate[:, own][:, pair]
-        best = depth
-        for g in range(len(target.shapes)):
-            rotation, offset = _link_in_geom(pairs, own, target, g)
-            rotation = planes.rot(part[:, pair] for part in rotation)
-            offset = planes.vec(part[:, pair] for part in offset)
-            point = planes.add(planes.rotate(rotation, probes.pos), offset)
-            distance, gradient = SHAPES[target.shapes[g]](point, planes.split(target.size[g]))
-            reached = reach - distance
-            if with_normal:
-                is_deeper = reached > best
-                normal = planes.where(is_deeper, planes.rotate_back(rotation, gradient), normal)
-            best = torch.maximum(best, reached)
+        distance, gradient = _distance(pairs, probes, target, own, pair)
+        reached = reach - distance
+        is_deeper = reached > depth
+        if with_normal:
+            normal = planes.where(is_deeper, gradient, normal)
         if with_motion and pairs.motion is not None:
-            is_deeper = best > depth
             linear = planes.where(is_deeper, _gathered(pairs.motion.linear, own, pair), linear)
             angular = planes.where(is_deeper, _gathered(pairs.motion.angular, own, pair), angular)
-        depth = best
-    if not with_motion:
-        return Felt(depth, normal if with_normal else None, None, None)
-    velocity = planes.add(linear, planes.cross(angular, probes.pos))
-    return Felt(depth, normal if with_normal else None, velocity, angular)
+        if "distance" in needs:
+            distances[target.name] = Distance(torch.where(reach > -torch.inf, distance, torch.inf), gradient)
+        depth = torch.maximum(depth, reached)
+    velocity = planes.add(linear, planes.cross(angular, probes.pos)) if with_motion else None
+    return Felt(depth, normal if with_normal else None, velocity, angular if with_motion else None, distances)
+
+
+def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
+    answers = []
+    for g, shape in enumerate(target.shapes):
+        rotation, offset = _link_in_geom(pairs, own, target, g)
+        rotation = planes.rot(part[:, pair] for part in rotation)
+        offset = planes.vec(part[:, pair] for part in offset)
+        point = planes.add(planes.rotate(rotation, probes.pos), offset)
+        distance, gradient = SHAPES[shape](point, planes.split(target.size[g]))
+        answers.append((distance, planes.rotate_back(rotation, gradient)))
+    least, outward = answers[0]
+    for distance, gradient in answers[1:]:
+        outward = planes.where(distance < least, gradient, outward)
+        least = torch.minimum(least, distance)
+    return least, outward
 
 
 def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple[Rot, Vec]:

@@ -52,40 +52,53 @@ class ReferenceGeom:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """What one link's probes feel, in the link's frame: the fields of `query.Felt`, one row per taxel."""
+    """What one link's probes feel, in the link's frame: the fields of `query.Felt`, one row per taxel.
+
+    `distance` [m] and its gradient `outward` are those of `Felt.distances`, one column per object.
+    """
 
     depth: Float[Array, " taxel"]
     normal: Float[Array, "taxel 3"]
     velocity: Float[Array, "taxel 3"]
     angular: Float[Array, "taxel 3"]
+    distance: Float[Array, "taxel object"]
+    outward: Float[Array, "taxel object 3"]
 
 
 def touch(
     link: ReferenceBody,
     pos: Float[Array, "taxel 3"],
     radius: Float[Array, " taxel"],
-    objects: Sequence[tuple[ReferenceBody, Sequence[ReferenceGeom]]],
+    objects: Sequence[tuple[ReferenceBody, Sequence[ReferenceGeom]] | None],
 ) -> Touch:
-    """Query the probes of one link against the objects that it may feel.
+    """Query the probes of one link against the objects that it may feel; None stands for one that it may not.
 
     The paper's equations word for word: q = p_L + R_L x, d = max(0, max_g (R − φ_g(q))), m = ∇φ at the deepest geom,
     v = R_Lᵀ (v_C(q) − v_L(q)). A probe of zero radius is inactive.
     """
-    felt = Touch(np.zeros(len(pos)), np.zeros((len(pos), 3)), np.zeros((len(pos), 3)), np.zeros((len(pos), 3)))
+    normal, velocity, angular = np.zeros((3, len(pos), 3))
+    distance, outward = np.full((len(pos), len(objects)), np.inf), np.zeros((len(pos), len(objects), 3))
+    felt = Touch(np.zeros(len(pos)), normal, velocity, angular, distance, outward)
     into_link = link.rotation.T
     for j, x in enumerate(pos):
         q = link.pos + link.rotation @ x
-        for body, geoms in objects:
+        for k, target in enumerate(objects):
+            if target is None or radius[j] <= 0:
+                continue
+            body, geoms = target
             for geom in geoms:
                 rotation = body.rotation @ geom.rotation
                 local = rotation.T @ (q - body.pos - body.rotation @ geom.pos)
-                distance, gradient = signed_distance(geom.shape, geom.size, local)
-                depth = radius[j] - distance
-                if radius[j] > 0 and depth > felt.depth[j]:
-                    felt.depth[j] = depth
-                    felt.normal[j] = into_link @ rotation @ gradient
-                    felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
-                    felt.angular[j] = into_link @ (body.angvel - link.angvel)
+                phi, gradient = signed_distance(geom.shape, geom.size, local)
+                if phi < felt.distance[j, k]:
+                    felt.distance[j, k] = phi
+                    felt.outward[j, k] = into_link @ rotation @ gradient
+            depth = radius[j] - felt.distance[j, k]
+            if depth > felt.depth[j]:
+                felt.depth[j] = depth
+                felt.normal[j] = felt.outward[j, k]
+                felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
+                felt.angular[j] = into_link @ (body.angvel - link.angvel)
     return felt
 
 

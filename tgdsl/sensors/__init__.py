@@ -4,8 +4,9 @@ from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
+from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 
-KINDS: tuple[Kind, ...] = (CONTACT_DEPTH, CONTACT, KINEMATIC_TAXEL)
+KINDS: tuple[Kind, ...] = (CONTACT_DEPTH, CONTACT, KINEMATIC_TAXEL, SURFACE_DISTANCE)
 """The kinds that come with tgdsl."""
 
-__all__ = ["CONTACT", "CONTACT_DEPTH", "KINDS", "KINEMATIC_TAXEL", "Kind"]
+__all__ = ["CONTACT", "CONTACT_DEPTH", "KINDS", "KINEMATIC_TAXEL", "SURFACE_DISTANCE", "Kind"]

@@ -40,9 +40,24 @@ class ProbeSpec(SensorSpec):
 
     feels: Annotated[tuple[str, ...], Field(min_length=1)]
     """Objects that the probes can feel."""
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        return False
+
+
+class ContactProbeSpec(ProbeSpec):
+    """Probes that feel what their link touches."""
+
     gate: Literal["contact_pair", "geometric"] = "contact_pair"
     """When an object is felt: `contact_pair` only while the simulator has it in contact with the taxel's link (the paper);
     `geometric` whenever a probe's sphere reaches into it, so a 4 mm probe feels it 4 mm before it touches."""
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        return self.gate == "contact_pair"
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,7 @@ class Lowered:
         channels: What a reading holds, in order.
         constants: Arrays that `forward` gets as tensors: scalars, or shapes that end in (taxel,).
         state: Rest value of each plane (env, taxel) that is carried from one call to the next.
-        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion".
+        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance".
     """
 
     channels: tuple[Channel, ...]

@@ -21,10 +21,10 @@ from tgdsl.fields import Radius
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, scalar
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, scalar
 
 
-class ContactSpec(ProbeSpec):
+class ContactSpec(ContactProbeSpec):
     """Contact bit of each probe."""
 
     kind: Literal["contact"]

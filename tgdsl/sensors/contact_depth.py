@@ -23,10 +23,10 @@ from torch import Tensor
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State
 
 
-class ContactDepthSpec(ProbeSpec):
+class ContactDepthSpec(ContactProbeSpec):
     """Penetration depth of each probe [m]."""
 
     kind: Literal["contact_depth"]

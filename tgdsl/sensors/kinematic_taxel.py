@@ -30,10 +30,10 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, scalar
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, scalar
 
 
-class KinematicTaxelSpec(ProbeSpec):
+class KinematicTaxelSpec(ContactProbeSpec):
     """Force and torque of each taxel from depth, normal and velocity."""
 
     kind: Literal["kinematic_taxel"]

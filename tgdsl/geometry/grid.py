@@ -1,0 +1,117 @@
+"""Signed distance sampled on a regular grid, interpolated between the nodes, and its unit gradient.
+
+A point outside the grid reads the value at the nearest point of the grid's box plus the way there. By the triangle
+inequality that is never less than the true distance, nor less than the way to the box: far points read far. A point that is
+not a number reads NaN and has a fixed gradient; one at infinity counts as `FAR` away from the box along that axis.
+
+Shapes: `x`, `y`, `z` nodes along the axes, two or more each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.geometry.planes import Vec, length_and_direction, vec
+
+FAR = 1e15
+"""The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
+
+Weights = Callable[[Tensor], list[tuple[Tensor, Tensor]]]
+
+
+class Grid(NamedTuple):
+    """Signed distance at the nodes of a grid, negative inside.
+
+    Attributes:
+        values: Signed distance at the nodes [m].
+        origin: Place of node (0, 0, 0) in the geom's frame [m].
+        cell: Spacing of the nodes [m], alike along all axes.
+    """
+
+    values: Float[Tensor, "x y z"]
+    origin: Float[Tensor, "3"]
+    cell: Float[Tensor, ""]
+
+
+def trilinear(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
+    """Return distance [m] and unit gradient from the eight nodes around a point (geom's frame [m]).
+
+    The distance is continuous, its gradient jumps at the faces of the cells. Error O(cell²) where the field is smooth.
+    """
+    return _interpolate(point, grid, _linear_weights, first=0)
+
+
+def tricubic(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
+    """Return distance [m] and unit gradient from the 64 nodes around a point (geom's frame [m]).
+
+    Cubic convolution with a = −1/2, the Catmull-Rom spline along each axis (Keys, *Cubic convolution interpolation for
+    digital image processing*, IEEE Trans. ASSP 29, 1981, equation 15). The distance has a continuous gradient; its error is
+    O(cell³) where the field is smooth. Beyond the border the outermost nodes repeat, so the outermost layer of cells is
+    less precise: grids carry one cell more than their points need.
+    """
+    return _interpolate(point, grid, _cubic_weights, first=-1)
+
+
+def _linear_weights(t: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return weight and its derivative for nodes 0 and 1, at 0 ≤ t ≤ 1 between them."""
+    one = torch.ones_like(t)
+    return [(1 - t, -one), (t, one)]
+
+
+def _cubic_weights(t: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return weight and its derivative for nodes −1, 0, 1 and 2, at 0 ≤ t ≤ 1 between nodes 0 and 1."""
+    return [
+        (0.5 * t * (t * (2 - t) - 1), 0.5 * (t * (4 - 3 * t) - 1)),
+        (0.5 * (t * t * (3 * t - 5) + 2), 0.5 * t * (9 * t - 10)),
+        (0.5 * t * (t * (4 - 3 * t) + 1), 0.5 * (t * (8 - 9 * t) + 1)),
+        (0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)),
+    ]
+
+
+def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[Tensor, Vec]:
+    """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
+    place = [(part - grid.origin[axis]) / grid.cell for axis, part in enumerate(point)]
+    inside = [part.clamp(0, num - 1) for part, num in zip(place, grid.values.shape, strict=True)]
+    # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
+    lower = [part.floor().long().clamp(0, num - 2) for part, num in zip(inside, grid.values.shape, strict=True)]
+    along = [weights(part - corner) for part, corner in zip(inside, lower, strict=True)]
+    value, *slopes = _sum_over_nodes(grid.values, lower, along, first)
+    way, direction = length_and_direction(
+        vec(((part - near) * grid.cell).clamp(-FAR, FAR) for part, near in zip(place, inside, strict=True))
+    )
+    is_far = way > 0
+    gradient = (
+        torch.where(part == near, slope / grid.cell, 0.0) + torch.where(is_far, out, 0.0)
+        for part, near, slope, out in zip(place, inside, slopes, direction, strict=True)
+    )
+    distance = value + way
+    _, gradient = length_and_direction(vec(torch.where(distance.isnan(), 0.0, part) for part in gradient))
+    return distance, gradient
+
+
+def _sum_over_nodes(
+    values: Tensor, lower: list[Tensor], along: list[list[tuple[Tensor, Tensor]]], first: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the weighted sum [m] and its derivatives along the axes [m per cell], one axis after the other."""
+    flat = values.reshape(-1)
+    num_x, num_y, num_z = values.shape
+    strides = (num_y * num_z, num_z, 1)
+    index = [
+        [(corner + first + k).clamp(0, num - 1) * stride for k in range(len(nodes))]
+        for corner, nodes, num, stride in zip(lower, along, (num_x, num_y, num_z), strides, strict=True)
+    ]
+    total = [torch.zeros_like(along[0][0][0]) for _ in range(4)]
+    for (wx, dx), ix in zip(along[0], index[0], strict=True):
+        sheet = [torch.zeros_like(wx) for _ in range(3)]
+        for (wy, dy), iy in zip(along[1], index[1], strict=True):
+            row = [flat[ix + iy + iz] for iz in index[2]]
+            line = sum(wz * value for (wz, _), value in zip(along[2], row, strict=True))
+            slope = sum(dz * value for (_, dz), value in zip(along[2], row, strict=True))
+            sheet = [sheet[0] + wy * line, sheet[1] + dy * line, sheet[2] + wy * slope]
+        total = [total[0] + wx * sheet[0], total[1] + dx * sheet[0], total[2] + wx * sheet[1], total[3] + wx * sheet[2]]
+    return total[0], total[1], total[2], total[3]

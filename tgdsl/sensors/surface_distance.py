@@ -1,0 +1,78 @@
+"""Surface distance: how far each probe's centre is from the surface of each object, before, in and after contact.
+
+    y_jo = min(min_g φ_g(q_j), r_max)                                                         [m]
+    u_jo = −φ m where φ = min_g φ_g(q_j) ≤ r_max, else 0                                      [m]
+
+with q_j the probe's place in the world, g the geoms of object o, φ_g the signed distance [m], negative inside, m its outward
+gradient in the frame of the probe's link, and r_max the range [m]. u points from the probe to the nearest point of the surface.
+There is no gate. Inactive probes (radius 0) read what a probe reads with nothing near: y = r_max and u = 0; the radius of
+others has no effect.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "SurfaceDistanceProbe".
+
+Departures: the range, which makes the reading of a far object independent of how far it is; signed inside; the vector u. Inside
+a compound of overlapping geoms the magnitude is that of the deepest geom alone, which is at most the true one.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.fields import PositiveLength
+from tgdsl.geometry import planes
+from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, scalar
+
+
+class SurfaceDistanceSpec(ProbeSpec):
+    """Distance of each probe to each object's surface [m]."""
+
+    kind: Literal["surface_distance"]
+    """Distance of each probe's centre to each object's surface, negative inside [m]."""
+    max_range: PositiveLength = 0.05
+    """Largest distance that is told apart, r_max [m]."""
+    nearest: bool = False
+    """Whether to read the vectors from the probe to the nearest points too, in the link's frame [m]."""
+
+
+def reference(
+    spec: SurfaceDistanceSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return y of all objects, then u of all objects: (taxel, object) or (taxel, 4 object) [m]."""
+    distance = np.minimum(touch.distance, spec.max_range)
+    if not spec.nearest:
+        return distance, {}
+    in_range = (touch.distance <= spec.max_range)[..., None]
+    vector = np.where(in_range, -distance[..., None] * touch.outward, 0.0)
+    return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
+
+
+def lower(spec: SurfaceDistanceSpec, layout: Layout) -> Lowered:
+    """One channel per object, and three more where the vector is wanted."""
+    channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
+    if spec.nearest:
+        channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
+    constants = {"max_range": scalar(spec.max_range)}
+    return Lowered(tuple(channels), constants, needs=frozenset({"distance"}))
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the distance planes, and the vectors' planes, by object [m]."""
+    max_range = constants["max_range"]
+    readings: dict[str, Tensor] = {}
+    for name, (distance, gradient) in felt.distances.items():
+        capped = torch.minimum(distance, max_range)
+        readings[f"distance_{name}"] = capped
+        reach = torch.where(distance > max_range, 0.0, -capped)
+        vector = planes.scale(reach, gradient)
+        readings |= {f"nearest_{name}_{axis}": part for axis, part in zip("xyz", vector, strict=True)}
+    return readings, {}
+
+
+SURFACE_DISTANCE = Kind(SurfaceDistanceSpec, lower, forward, reference)
