@@ -34,7 +34,7 @@ class Grid(NamedTuple):
     """
 
     values: Float[Tensor, "x y z"]
-    origin: Float[Tensor, "3"]
+    origin: Float[Tensor, " 3"]
     cell: Float[Tensor, ""]
 
 
