@@ -35,7 +35,10 @@ def test_depth_at_the_vertices_is_mujocos(tmp_path, shape, size):
     touch = tgdsl.compile(
         {
             "tgdsl": 1,
-            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}},
+            "robot": {
+                "model": str(tmp_path / "scene.xml"),
+                "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+            },
             "objects": {"item": {"body": "item"}},
             "sensors": {"d": {"kind": "surface_distance", "links": "pad", "feels": ["item"]}},
         },

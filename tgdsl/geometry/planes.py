@@ -14,8 +14,9 @@ from torch import Tensor
 Vec = tuple[Tensor, Tensor, Tensor]
 Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
-TINY = 1e-30
-"""Squared lengths up to this [m²] have no direction: it keeps float32 clear of subnormal numbers."""
+TIE = 1e-7
+"""Lengths that differ by no more than this [m] count as equal, and the first among equals wins: so what is nearest, and which
+way is out, does not alternate with the last digits of a pose at rest. Float32 resolves a few centimetres not much better."""
 
 
 def split(stacked: Tensor) -> Vec:
@@ -105,10 +106,10 @@ def rotation(quat: Tensor) -> Rot:
 
 
 def length_and_direction(a: Vec, fixed: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> tuple[Tensor, Vec]:
-    """Return |a| and a/|a|; where a vanishes, 0 and the fixed unit vector. Derivatives are finite everywhere."""
+    """Return |a| and a/|a|; where |a| ≤ `TIE`, a fixed unit vector and a's part along it. Derivatives are finite everywhere."""
     squared = dot(a, a)
-    is_null = squared <= TINY
+    is_null = squared <= TIE * TIE
     length = torch.sqrt(torch.where(is_null, 1.0, squared))
     inverse = 1.0 / length
     x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, fixed, strict=True))
-    return torch.where(is_null, 0.0, length), (x, y, z)
+    return x * a[0] + y * a[1] + z * a[2], (x, y, z)

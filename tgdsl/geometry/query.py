@@ -177,7 +177,7 @@ def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], needs: Col
             reach = reach + pairs.gate[:, own][:, pair]
         distance, gradient = _distance(pairs, probes, target, own, pair)
         reached = reach - distance
-        is_deeper = reached > depth
+        is_deeper = reached > torch.where(depth > 0, depth + planes.TIE, 0.0)
         if with_normal:
             normal = planes.where(is_deeper, gradient, normal)
         if with_motion and pairs.motion is not None:
@@ -202,7 +202,7 @@ def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair
         answers.append((distance, planes.rotate_back(rotation, gradient)))
     least, outward = answers[0]
     for distance, gradient in answers[1:]:
-        outward = planes.where(distance < least, gradient, outward)
+        outward = planes.where(distance < least - planes.TIE, gradient, outward)
         least = torch.minimum(least, distance)
     return least, outward
 

@@ -12,6 +12,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
+TIE = 1e-7
+"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins; see `planes.TIE`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,12 +92,12 @@ def touch(
                 rotation = body.rotation @ geom.rotation
                 local = rotation.T @ (q - body.pos - body.rotation @ geom.pos)
                 phi, gradient = signed_distance(geom.shape, geom.size, local)
-                if phi < felt.distance[j, k]:
-                    felt.distance[j, k] = phi
+                if phi < felt.distance[j, k] - TIE:
                     felt.outward[j, k] = into_link @ rotation @ gradient
-            depth = radius[j] - felt.distance[j, k]
-            if depth > felt.depth[j]:
-                felt.depth[j] = depth
+                felt.distance[j, k] = min(phi, felt.distance[j, k])
+            depth, before = radius[j] - felt.distance[j, k], felt.depth[j]
+            felt.depth[j] = max(depth, before)
+            if depth > (before + TIE if before > 0 else 0.0):
                 felt.normal[j] = felt.outward[j, k]
                 felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
                 felt.angular[j] = into_link @ (body.angvel - link.angvel)
@@ -107,7 +109,7 @@ def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -
 
     Found by way of the nearest surface point, which the module's own `shapes` never form. Where that is not unique, the
     convention is: +x at a centre or on an axis; x before y before z among equally near faces, a wall before a cap; the
-    positive side on a plane of symmetry.
+    positive side on a plane of symmetry; all of this within `TIE` of such a place.
     """
     if shape == "plane":
         return float(point[2]), np.array([0.0, 0.0, 1.0])
@@ -115,38 +117,42 @@ def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -
         half = size[1] if shape == "capsule" else 0.0
         core = np.array([0.0, 0.0, np.clip(point[2], -half, half)])
         length = float(np.linalg.norm(point - core))
-        return length - size[0], (point - core) / length if length > 0 else np.array([1.0, 0.0, 0.0])
+        if length <= TIE:
+            return float(point[0]) - size[0], np.array([1.0, 0.0, 0.0])
+        return length - size[0], (point - core) / length
     nearest, is_inside, outward = {"box": _box, "cylinder": _cylinder, "ellipsoid": _ellipsoid}[shape](size, point)
     length = float(np.linalg.norm(point - nearest))
-    if length == 0.0 or is_inside:
-        return -length, outward
+    if is_inside or length <= TIE:
+        return -length if is_inside else length, outward
     return length, (point - nearest) / length
 
 
 def _box(size: Array, point: Array) -> tuple[Array, bool, Array]:
-    inside = bool(np.all(np.abs(point) <= size))
-    axis = int(np.argmin(size - np.abs(point)))
-    sign = -1.0 if point[axis] < 0 else 1.0
+    room = size - np.abs(point)
+    inside = bool(np.all(room >= 0))
     nearest = np.clip(point, -size, size)
     if inside:
-        nearest[axis] = sign * size[axis]
+        deepest = int(np.argmin(room))
+        nearest[deepest] = np.copysign(size[deepest], point[deepest])
+    axis = 0 if room[0] <= room[1:].min() + TIE else 1 if room[1] <= room[2] + TIE else 2
     outward = np.zeros(3)
-    outward[axis] = sign
+    outward[axis] = -1.0 if point[axis] < -TIE else 1.0
     return nearest, inside, outward
 
 
 def _cylinder(size: Array, point: Array) -> tuple[Array, bool, Array]:
     radius, half = size[0], size[1]
     radial = float(np.hypot(point[0], point[1]))
-    along = point[:2] / radial if radial > 0 else np.array([1.0, 0.0])
-    sign = -1.0 if point[2] < 0 else 1.0
+    along = point[:2] / radial if radial > TIE else np.array([1.0, 0.0])
+    sign = -1.0 if point[2] < -TIE else 1.0
     to_wall, to_cap = radius - radial, half - abs(point[2])
+    outward = np.array([*along, 0.0]) if to_wall <= to_cap + TIE else np.array([0.0, 0.0, sign])
     if to_wall < 0 or to_cap < 0:
         nearest = np.array([*(along * min(radial, radius)), np.clip(point[2], -half, half)])
-        return nearest, False, np.zeros(3)
+        return nearest, False, outward
     if to_wall <= to_cap:
-        return np.array([*(along * radius), point[2]]), True, np.array([*along, 0.0])
-    return np.array([point[0], point[1], sign * half]), True, np.array([0.0, 0.0, sign])
+        return np.array([*(along * radius), point[2]]), True, outward
+    return np.array([point[0], point[1], np.copysign(half, point[2])]), True, outward
 
 
 def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
@@ -157,7 +163,7 @@ def _ellipsoid(size: Array, point: Array) -> tuple[Array, bool, Array]:
     """
     square = size**2
     least = int(np.argmin(size))
-    sign = np.where(point < 0, -1.0, 1.0)
+    sign = np.where(point < -TIE, -1.0, 1.0)
     y = np.abs(point)
     gap = square - square[least]
     terms = [(part, rest) for part, rest in zip((size * y).tolist(), gap.tolist(), strict=True) if part > 0]

@@ -2,7 +2,8 @@
 
 Every function takes a point in the geom's frame [m] and the geom's size as MuJoCo defines it [m] (tensors that broadcast
 with the point), and returns the distance [m] and the outward gradient. Both are exact, in every place: at centres, on
-axes, edges and corners, where the nearest surface point is not unique, one of the candidates is taken, always the same.
+axes, edges and corners, where the nearest surface point is not unique, one of the candidates is taken, always the same; what is
+within `TIE` of such a place counts as in it.
 Derivatives of the distance are the gradient; all are finite.
 """
 
@@ -14,7 +15,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from tgdsl.geometry.planes import TINY, Vec, length_and_direction
+from tgdsl.geometry.planes import TIE, Vec, length_and_direction
 
 Shape = Callable[[Vec, Vec], tuple[Tensor, Vec]]
 
@@ -45,14 +46,14 @@ def capsule(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
 def box(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     """Box of half-extents `size`."""
     qx, qy, qz = (part.abs() - half for part, half in zip(point, size, strict=True))
-    sx, sy, sz = (torch.where(part < 0, -1.0, 1.0).to(part.dtype) for part in point)
+    sx, sy, sz = (torch.where(part < -TIE, -1.0, 1.0).to(part.dtype) for part in point)
     wx, wy, wz = qx.clamp(min=0), qy.clamp(min=0), qz.clamp(min=0)
     squared = wx * wx + wy * wy + wz * wz
-    is_outside = squared > TINY
+    is_outside = squared > TIE * TIE
     outside = torch.sqrt(torch.where(is_outside, squared, 1.0))
     inside = torch.maximum(torch.maximum(qx, qy), qz)
-    is_x = qx >= torch.maximum(qy, qz)
-    is_y = ~is_x & (qy >= qz)
+    is_x = qx >= torch.maximum(qy, qz) - TIE
+    is_y = ~is_x & (qy >= qz - TIE)
     inverse = 1.0 / outside
     gradient = (
         sx * torch.where(is_outside, wx * inverse, is_x.to(sx.dtype)),
@@ -67,12 +68,12 @@ def cylinder(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     x, y, z = point
     radial, (ux, uy, _) = length_and_direction((x, y, torch.zeros_like(x)))
     qr, qz = radial - size[0], z.abs() - size[1]
-    sz = torch.where(z < 0, -1.0, 1.0).to(z.dtype)
+    sz = torch.where(z < -TIE, -1.0, 1.0).to(z.dtype)
     wr, wz = qr.clamp(min=0), qz.clamp(min=0)
     squared = wr * wr + wz * wz
-    is_outside = squared > TINY
+    is_outside = squared > TIE * TIE
     outside = torch.sqrt(torch.where(is_outside, squared, 1.0))
-    is_wall = qr >= qz
+    is_wall = qr >= qz - TIE
     along_radius = torch.where(is_outside, wr / outside, is_wall.to(wr.dtype))
     along_axis = torch.where(is_outside, wz / outside, (~is_wall).to(wz.dtype))
     distance = torch.where(is_outside, outside, torch.maximum(qr, qz))
@@ -101,7 +102,7 @@ def ellipsoid(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     u = _newton(u, scaled, ratio, offset)  # with derivatives: by the implicit function theorem one step holds them all
     normal = [y / (u + f) for y, f in zip(scaled, offset, strict=True)]
     length = torch.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    x, y, z = (torch.where(part < 0, -n, n) / length for part, n in zip(point, normal, strict=True))
+    x, y, z = (torch.where(part < -TIE, -n, n) / length for part, n in zip(point, normal, strict=True))
     return least * (u - 1.0) * length, (x, y, z)
 
 

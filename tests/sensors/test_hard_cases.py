@@ -1,0 +1,152 @@
+"""Scenes that break touch sensors: contact at rest on a corner, ties, deep overlap, fast spin, careless quaternions."""
+
+import numpy as np
+import pytest
+import torch
+from sensors.scenes import module, state
+from sensors.test_contact_depth import HARD
+
+import tgdsl
+from tgdsl.state import SceneState
+
+JITTER = 1e-9
+"""What a solver leaves of motion at rest [m, and of a unit quaternion]."""
+NUM_STEPS = 10_000
+
+
+def repeated(scene: SceneState, num: int) -> SceneState:
+    """Return an environment many times over."""
+    names = ("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found")
+    values = {name: getattr(scene, name) for name in names}
+    return SceneState(**{k: v.expand(num, *v.shape[1:]).clone() for k, v in values.items() if v is not None})
+
+
+def jittered(scene: SceneState, num: int, seed: int = 0) -> SceneState:
+    """Return as many steps of a scene at rest, all poses trembling."""
+    steps = repeated(scene, num)
+    generator = torch.Generator().manual_seed(seed)
+    assert steps.body_pos is not None and steps.body_quat is not None
+    for tensor in (steps.body_pos, steps.body_quat):
+        tensor += JITTER * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
+    return steps
+
+
+@pytest.mark.parametrize("geom", HARD)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_at_rest_on_a_face_edge_corner_or_centre_the_normal_does_not_alternate(tmp_path, geom, dtype):
+    probes = [place for place, depth in HARD[geom] if depth > 0]
+    touch = module(tmp_path, probes, geom, kind="kinematic_taxel", outputs=["force"], dtype=dtype)
+    force = touch(jittered(state(touch), NUM_STEPS))["s"].double()
+    direction = force / force.norm(dim=2, keepdim=True)
+    spread = (direction - direction[:1]).norm(dim=2).amax(dim=0)
+    # Off a surface of curvature 1/r the normal turns by jitter / r at the most; 1e-3 is far below any jump between faces.
+    assert spread.max() < 1e-3, f"the normal of probe {probes[int(spread.argmax())]} turns by {spread.max():.2f} rad"
+
+
+def two_cubes(tmp_path, dtype=torch.float64, bodies=("left", "right")):
+    """Return a probe half way between two cubes that move in opposite directions, and the scene's rest state."""
+    cube = '<freejoint/><geom type="box" size=".01 .01 .01"/>'
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
+        + "".join(f'<body name="{body}">{cube}</body>' for body in bodies)
+        + "</worldbody></mujoco>"
+    )
+    points = [{"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.004}]
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {
+                "model": str(tmp_path / "scene.xml"),
+                "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+            },
+            "objects": {body: {"body": body} for body in bodies},
+            "sensors": {
+                "s": {
+                    "kind": "kinematic_taxel",
+                    "links": "pad",
+                    "feels": list(bodies),
+                    "gate": "geometric",
+                    "outputs": ["force"],
+                }
+            },
+        },
+        dtype=dtype,
+    )
+    scene = repeated(state(touch), 1)
+    for body, side in (("left", -1.0), ("right", 1.0)):
+        i = touch.inputs.bodies.index(body)
+        scene.body_pos[0, i, 0] = side * 0.012
+        scene.body_linvel[0, i, 1] = side
+    return touch, scene
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_of_two_objects_equally_deep_the_first_one_wins_always(tmp_path, dtype):
+    for bodies in (("left", "right"), ("right", "left")):
+        touch, scene = two_cubes(tmp_path, dtype, bodies)
+        force = touch(jittered(scene, NUM_STEPS))["s"][:, 0].double()
+        side = -1.0 if bodies[0] == "left" else 1.0
+        expected = [-side * 500 * 0.002**1.2, 2 * side, 0]  # pushed away from the winner, dragged along with it
+        np.testing.assert_allclose(force.numpy(), np.tile(expected, (NUM_STEPS, 1)), atol=1e-4)
+
+
+def test_clearly_deeper_wins_whatever_the_order(tmp_path):
+    touch, scene = two_cubes(tmp_path)
+    scene.body_pos[0, touch.inputs.bodies.index("right"), 0] -= 1e-5
+    assert touch(scene)["s"][0, 0, 1].item() == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("geom", HARD)
+def test_deep_overlap_is_bounded(tmp_path, geom):
+    """A whole ball of probes inside: depths are at most radius plus the object's inner radius, forces finite."""
+    rng = np.random.default_rng(0)
+    touch = module(tmp_path, rng.normal(scale=0.004, size=(200, 3)), geom, kind="kinematic_taxel", dtype=torch.float32)
+    for scale in (1e-12, 1e-3, 1.0):
+        scene = state(touch, pos=scale * np.array([0.001, -0.002, 0.0005]))
+        readings = touch(scene)["s"]
+        assert torch.isfinite(readings).all()
+        assert readings[..., :3].norm(dim=-1).max() < 500 * 0.1**1.2
+
+
+def test_a_fast_spin_is_felt_as_it_is(tmp_path):
+    """1,000 rad/s of a ball over a probe 4 mm inside: v = ω × r, exactly, and no heed of the rest."""
+    touch = module(tmp_path, [(0.016, 0, 0)], '<geom type="sphere" size=".02"/>', kind="kinematic_taxel", dtype=torch.float32)
+    reading = touch(state(touch, angvel=[0, 0, 1000.0]))["s"][0, 0].double().numpy()
+    depth = 0.01 + 0.004
+    np.testing.assert_allclose(reading[:3], [500 * depth**1.2, 2 * 1000 * 0.016, 0], rtol=1e-5)
+
+
+def test_quaternions_need_not_have_unit_length(tmp_path):
+    touch = module(tmp_path, [(0.01, 0.004, 0.002)], '<geom type="box" size=".02 .01 .015"/>', kind="kinematic_taxel")
+    unit = state(touch, quat=[0.5, 0.5, -0.5, 0.5], angvel=[1, 2, 3])
+    expected = touch(unit)["s"]
+    for factor in (1e-3, 0.5, 1 + 1e-6, 40.0):
+        scene = state(touch, quat=[factor * part for part in (0.5, 0.5, -0.5, 0.5)], angvel=[1, 2, 3])
+        torch.testing.assert_close(touch(scene)["s"], expected, rtol=1e-12, atol=1e-14)
+
+
+def test_fingers_feel_one_another(tmp_path):
+    """An object may be a link of the robot; no link feels itself."""
+    (tmp_path / "scene.xml").write_text(
+        '<mujoco><worldbody><body name="thumb"><freejoint/><geom size=".01"/></body>'
+        '<body name="index"><freejoint/><geom type="box" size=".01 .01 .01"/></body></worldbody></mujoco>'
+    )
+    point = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"thumb": point, "index": point}}}},
+            "objects": {"thumb": {"body": "thumb"}, "index": {"body": "index"}},
+            "sensors": {"s": {"kind": "contact_depth", "links": "*", "feels": ["thumb", "index"]}},
+        },
+        dtype=torch.float64,
+    )
+    assert {(pair.link, pair.object) for pair in touch.inputs.pairs} == {("thumb", "index"), ("index", "thumb")}
+    scene = touch.example_state(1)
+    rows = {body: i for i, body in enumerate(touch.inputs.bodies)}
+    scene.body_pos[:], scene.body_quat[:] = 0.0, torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    scene.body_pos[0, rows["index"], 2] = 0.019
+    scene.contact_found[:] = True
+    depth = dict(zip(touch.taxels["s"]["link"], touch(scene)["s"][0, :, 0].tolist(), strict=True))
+    # The thumb's probe is 1 mm inside the index's box; the index's probe 19 mm above the thumb's ball.
+    assert depth == {"thumb": pytest.approx(0.005), "index": 0.0}
