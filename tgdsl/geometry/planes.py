@@ -14,6 +14,8 @@ from torch import Tensor
 Vec = tuple[Tensor, Tensor, Tensor]
 Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
+TINY = 1e-30
+"""Squared lengths up to this [m²] count as zero: it keeps float32 clear of subnormal numbers."""
 TIE = 1e-7
 """Lengths that differ by no more than this [m] count as equal, and the first among equals wins: so what is nearest, and which
 way is out, does not alternate with the last digits of a pose at rest. Float32 resolves a few centimetres not much better."""
@@ -106,10 +108,15 @@ def rotation(quat: Tensor) -> Rot:
 
 
 def length_and_direction(a: Vec, fixed: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> tuple[Tensor, Vec]:
-    """Return |a| and a/|a|; where |a| ≤ `TIE`, a fixed unit vector and a's part along it. Derivatives are finite everywhere."""
-    squared = dot(a, a)
-    is_null = squared <= TIE * TIE
-    length = torch.sqrt(torch.where(is_null, 1.0, squared))
-    inverse = 1.0 / length
+    """Return |a| and a/|a|; where |a| ≤ `TIE` the direction is a fixed unit vector. Derivatives are finite everywhere."""
+    length = safe_sqrt(dot(a, a))
+    is_null = length <= TIE
+    inverse = 1.0 / torch.where(is_null, 1.0, length)
     x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, fixed, strict=True))
-    return x * a[0] + y * a[1] + z * a[2], (x, y, z)
+    return length, (x, y, z)
+
+
+def safe_sqrt(squared: Tensor) -> Tensor:
+    """Return the square root of a squared length [m²], with derivative 0 rather than infinite where it vanishes."""
+    is_null = squared <= TINY
+    return torch.where(is_null, 0.0, torch.sqrt(torch.where(is_null, 1.0, squared)))

@@ -118,7 +118,7 @@ def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -
         core = np.array([0.0, 0.0, np.clip(point[2], -half, half)])
         length = float(np.linalg.norm(point - core))
         if length <= TIE:
-            return float(point[0]) - size[0], np.array([1.0, 0.0, 0.0])
+            return length - size[0], np.array([1.0, 0.0, 0.0])
         return length - size[0], (point - core) / length
     nearest, is_inside, outward = {"box": _box, "cylinder": _cylinder, "ellipsoid": _ellipsoid}[shape](size, point)
     length = float(np.linalg.norm(point - nearest))

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from tgdsl.geometry.planes import TIE, Vec, length_and_direction
+from tgdsl.geometry.planes import TIE, Vec, length_and_direction, safe_sqrt
 
 Shape = Callable[[Vec, Vec], tuple[Tensor, Vec]]
 
@@ -48,19 +48,18 @@ def box(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     qx, qy, qz = (part.abs() - half for part, half in zip(point, size, strict=True))
     sx, sy, sz = (torch.where(part < -TIE, -1.0, 1.0).to(part.dtype) for part in point)
     wx, wy, wz = qx.clamp(min=0), qy.clamp(min=0), qz.clamp(min=0)
-    squared = wx * wx + wy * wy + wz * wz
-    is_outside = squared > TIE * TIE
-    outside = torch.sqrt(torch.where(is_outside, squared, 1.0))
+    outside = safe_sqrt(wx * wx + wy * wy + wz * wz)
+    is_outside = outside > TIE
     inside = torch.maximum(torch.maximum(qx, qy), qz)
     is_x = qx >= torch.maximum(qy, qz) - TIE
     is_y = ~is_x & (qy >= qz - TIE)
-    inverse = 1.0 / outside
+    inverse = 1.0 / torch.where(is_outside, outside, 1.0)
     gradient = (
         sx * torch.where(is_outside, wx * inverse, is_x.to(sx.dtype)),
         sy * torch.where(is_outside, wy * inverse, is_y.to(sy.dtype)),
         sz * torch.where(is_outside, wz * inverse, (~is_x & ~is_y).to(sz.dtype)),
     )
-    return torch.where(is_outside, outside, inside), gradient
+    return outside + inside.clamp(max=0), gradient
 
 
 def cylinder(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
@@ -70,13 +69,13 @@ def cylinder(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     qr, qz = radial - size[0], z.abs() - size[1]
     sz = torch.where(z < -TIE, -1.0, 1.0).to(z.dtype)
     wr, wz = qr.clamp(min=0), qz.clamp(min=0)
-    squared = wr * wr + wz * wz
-    is_outside = squared > TIE * TIE
-    outside = torch.sqrt(torch.where(is_outside, squared, 1.0))
+    outside = safe_sqrt(wr * wr + wz * wz)
+    is_outside = outside > TIE
+    inverse = 1.0 / torch.where(is_outside, outside, 1.0)
     is_wall = qr >= qz - TIE
-    along_radius = torch.where(is_outside, wr / outside, is_wall.to(wr.dtype))
-    along_axis = torch.where(is_outside, wz / outside, (~is_wall).to(wz.dtype))
-    distance = torch.where(is_outside, outside, torch.maximum(qr, qz))
+    along_radius = torch.where(is_outside, wr * inverse, is_wall.to(wr.dtype))
+    along_axis = torch.where(is_outside, wz * inverse, (~is_wall).to(wz.dtype))
+    distance = outside + torch.maximum(qr, qz).clamp(max=0)
     return distance, (along_radius * ux, along_radius * uy, along_axis * sz)
 
 
