@@ -116,7 +116,13 @@ def test_no_circles():
 @pytest.mark.parametrize("name", [name for name in MODULES if part_of(name) in PURE])
 def test_what_a_module_is_made_of_knows_neither_mujoco_nor_yaml(name):
     foreign = {part_of(imported) for imported, _ in imports(MODULES[name])}
-    assert not foreign & {"mujoco", "mujoco_warp", "warp", "ruamel", "pymeshlab", "trimesh", "igl"}
+    assert not foreign & {"mujoco", "mujoco_warp", "ruamel", "pymeshlab", "trimesh", "igl"}
+
+
+def test_warp_is_imported_in_one_function():
+    """It is an extra: only a query of triangles at run time may ask for it."""
+    found = [(name, is_inside) for name, file in MODULES.items() for i, is_inside in imports(file) if part_of(i) == "warp"]
+    assert found == [("geometry.bvh", True)]
 
 
 def test_only_schema_reads_yaml():

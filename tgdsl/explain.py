@@ -70,6 +70,7 @@ def explain(touch: TactileModule) -> str:
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
+    lines += _grids(touch)
     lines += ["", "queries (one geometry query serves all sensors with the same probes, objects and gate)"]
     for i, query in enumerate(plan.queries):
         felt = ", ".join(f"{plan.objects[o].name} ({', '.join(plan.objects[o].shapes)})" for o in query.objects)
@@ -97,6 +98,23 @@ def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
     channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(sensor.channels, sensor.units, strict=True))
     memory = f"remembers {', '.join(sensor.state)}" if sensor.state else "no state"
     return [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}", f"  reads {channels}"]
+
+
+def _grids(touch: TactileModule) -> list[str]:
+    """Return what was measured of each baked grid."""
+    lines = []
+    for target in touch.plan.objects:
+        for i, (shape, accuracy) in enumerate(zip(target.shapes, target.accuracy, strict=True)):
+            if accuracy:
+                values = touch.plan.arrays[f"objects/{target.name}/{i}/values"]
+                nodes = " × ".join(map(str, values.shape))
+                lines += [
+                    f"  {target.name}, geom {i}: {shape} grid of {nodes} nodes every {1e3 * accuracy['cell']:.3g} mm, "
+                    f"{values.nbytes} bytes",
+                    f"    distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} mm), "
+                    f"largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges {1e3 * accuracy['edge_max']:.3g} mm",
+                ]
+    return ["", "meshes", *lines] if lines else []
 
 
 def _observations(touch: TactileModule) -> list[str]:

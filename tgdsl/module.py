@@ -20,7 +20,9 @@ from torch import Tensor, nn
 
 from tgdsl import observations
 from tgdsl.errors import StateError, TgdslError, did_you_mean
-from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, relate
+from tgdsl.geometry.bvh import TriangleMesh
+from tgdsl.geometry.grid import Grid
+from tgdsl.geometry.query import GRIDS, Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, relate
 from tgdsl.plan import Inputs, Plan, PlannedQuery, PlannedSensor
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.state import SHAPES, SceneState, shape_of
@@ -91,7 +93,14 @@ class TactileModule(nn.Module):
                 hint = did_you_mean(sensor.kind, known, "kinds")
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
-        self.constants = _Constants({k: v for k, v in plan.arrays.items() if not k.startswith("layout/")}, dtype)
+        self._raycast = {
+            f"{target.name}/{i}": _raycast_surface(plan, f"objects/{target.name}/{i}")
+            for target in plan.objects
+            for i, shape in enumerate(target.shapes)
+            if shape == "raycast"
+        }
+        unused = ("layout/", *(f"objects/{part}/" for part in self._raycast))
+        self.constants = _Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
         self.memory = nn.Module()
         self._compiled_core: Callable[..., Any] | None = None
 
@@ -281,7 +290,14 @@ class TactileModule(nn.Module):
     def _object(self, index: int) -> FeltObject:
         target = self.plan.objects[index]
         tensors = self.constants.under(f"objects/{target.name}", ("size", "pos", "rotation"))
-        return FeltObject(target.name, target.first_pair, target.num_pairs, target.shapes, target.is_centred, **tensors)
+        surfaces = tuple(self._surface(target.name, i, shape) for i, shape in enumerate(target.shapes))
+        placed = (target.name, target.first_pair, target.num_pairs, target.shapes, target.is_centred)
+        return FeltObject(*placed, **tensors, surfaces=surfaces)
+
+    def _surface(self, name: str, geom: int, shape: str) -> Grid | RaycastSurface | None:
+        if shape in GRIDS:
+            return Grid(**self.constants.under(f"objects/{name}/{geom}", ("values", "origin", "cell")))
+        return self._raycast.get(f"{name}/{geom}")
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""
@@ -305,6 +321,11 @@ class TactileModule(nn.Module):
                     buffer = torch.zeros_like(value, dtype=self.dtype, device=self.device)
                     self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _raycast_surface(plan: Plan, path: str) -> RaycastSurface:
+    mesh = TriangleMesh(plan.arrays[f"{path}/vertices"], plan.arrays[f"{path}/faces"])
+    return RaycastSurface(mesh, float(plan.arrays[f"{path}/max_distance"]))
 
 
 def _has_cpp_compiler() -> bool:

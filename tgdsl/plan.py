@@ -1,6 +1,6 @@
 """The Plan: what to compute, with nothing left to decide. Plain values and NumPy arrays; the same input gives the same Plan.
 
-It knows no text, no robot file and no simulator. Its arrays are float64 or int64 and named by path:
+It knows no text, no robot file and no simulator. Its arrays are float64 or int64 (grids float32) and named by path:
 
 | array | shape | holds |
 |---|---|---|
@@ -8,6 +8,8 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `pairs/{link,object}` | (pair,) | body indices of each pair's link and object |
 | `pairs/gate` | (pair,) | index of each pair among `inputs.pairs`; 0 where no query asks |
 | `objects/<name>/{size,pos,rotation}` | (geom, 3 or 9) | geoms in the object's body frame |
+| `objects/<name>/<geom>/{values,origin,cell}` | (x, y, z), (3,), () | baked grid of a geom, float32, see `geometry.grid.Grid` |
+| `objects/<name>/<geom>/{vertices,faces,max_distance}` | (v, 3), (f, 3), () | triangles of a geom that is queried by raycast |
 | `queries/<i>/{taxels,pos,reach,pair}` | (taxel,), (3, taxel), (object, taxel) ×2 | probes, see `geometry.query.Probes` |
 | `sensors/<name>/<constant>` | () or (…, taxel) | what the kind's `lower` folded |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
@@ -61,7 +63,10 @@ class Inputs:
 
 @dataclass(frozen=True)
 class PlannedObject:
-    """An object: its body, the types of its geoms, and which of them share the body's frame."""
+    """An object: its body, how the distance to each of its geoms is found, and which of them share the body's frame.
+
+    `accuracy` holds what was measured of each grid: see `compiler.bake.Errors`; it is empty where distances are exact.
+    """
 
     name: str
     body: str
@@ -69,6 +74,7 @@ class PlannedObject:
     is_centred: tuple[bool, ...]
     first_pair: int
     num_pairs: int
+    accuracy: tuple[Mapping[str, float], ...]
 
 
 @dataclass(frozen=True)

@@ -260,9 +260,8 @@ def test_objects(folder):
     assert problems(folder, ("{body: cube}", "{body: nothing}")) == [
         'd.yaml:18:24: objects.cube.body: body "nothing" has no geoms to feel'
     ]
-    assert problems(folder, ("{body: cube}", "{body: rock}")) == [
-        'd.yaml:18:24: objects.cube.body: geom "pebble" of body "rock" is of type mesh, which cannot be felt yet; '
-        "types that can: plane, sphere, capsule, ellipsoid, cylinder, box"
+    assert problems(folder, ("{body: cube}", "{body: rock, surface: pebbel}")) == [
+        'd.yaml:18:24: objects.cube.body: no geom or mesh of body "rock" matches "pebbel"; it has pebble, skin'
     ]
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from tgdsl import observations
 from tgdsl.compiler import passes
+from tgdsl.compiler.bake import BakeError
+from tgdsl.compiler.felt import settle
 from tgdsl.compiler.passes import Draft, DraftSensor
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import did_you_mean
@@ -41,6 +41,8 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
+    _settle(loaded, work)
+    loaded.raise_problems()
     queries, query_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
@@ -60,6 +62,16 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         arrays={name: _frozen(arrays[name]) for name in sorted(arrays)},
         scene=SceneFile("", {}, ()),
     )
+
+
+def _settle(loaded: Loaded, work: Draft) -> None:
+    """Decide how the distance to each geom is found; a mesh that no grid within its budget suits is a mistake of the document."""
+    for name, geoms in work.objects.items():
+        target = loaded.spec.objects[name]
+        try:
+            work.settled[name] = tuple(settle(felt, target, passes.margin(work, name), name) for felt in geoms)
+        except BakeError as error:
+            loaded.problems.append(loaded.problem(("objects", name), str(error)))
 
 
 def _sensor(part: DraftSensor, query: int, arrays: dict[str, np.ndarray]) -> PlannedSensor:
@@ -115,13 +127,8 @@ def _observations(
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:
-    """Return an array in one of the Plan's two dtypes, row by row in memory and read-only."""
-    kind = np.int64 if array.dtype.kind in "iub" else np.float64
+    """Return an array in one of the Plan's dtypes, row by row in memory and read-only; only grids are float32."""
+    kind = np.int64 if array.dtype.kind in "iub" else np.float32 if array.dtype == np.float32 else np.float64
     array = np.ascontiguousarray(array, dtype=kind).reshape(array.shape)
     array.flags.writeable = False
     return array
-
-
-def sizes(arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
-    """Return the bytes of each array as the module holds it in float32 and int64."""
-    return {name: array.size * (4 if array.dtype == np.float64 else 8) for name, array in arrays.items()}

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tgdsl.compiler.robot import Geom, Model
+from tgdsl.compiler.felt import FeltGeom, Settled
+from tgdsl.compiler.robot import Model
 from tgdsl.layout import Layout
 from tgdsl.plan import Inputs, Pair, PlannedObject, PlannedQuery
 from tgdsl.sensors.base import Lowered
@@ -40,15 +41,17 @@ class Draft:
         objects: Geoms of each object that some sensor feels.
         scene: The model that says what can collide.
         dropped: What is not needed, and why; the passes add to it.
+        settled: How the distance to each geom is found; set once the sensors' ranges are known.
         pairs: The (link body, object) pairs that are needed, sorted by object and link; set by `prune`.
         gated: Those of them whose contacts are needed.
     """
 
     layout: Layout
     sensors: Sequence[DraftSensor]
-    objects: dict[str, tuple[Geom, ...]]
+    objects: dict[str, tuple[FeltGeom, ...]]
     scene: Model
     dropped: list[tuple[str, str]]
+    settled: dict[str, tuple[Settled, ...]] = field(default_factory=dict)
     pairs: list[Pair] = field(default_factory=list)
     gated: list[Pair] = field(default_factory=list)
 
@@ -83,10 +86,10 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
         for target in sensor.feels:
             pairs = {Pair(body, target) for body in bodies}
             if sensor.is_gated:
-                apart = {p for p in pairs if not work.scene.can_meet(p.link, work.objects[target][0].body)}
+                apart = {p for p in pairs if not work.scene.can_meet(p.link, work.objects[target][0].geom.body)}
                 gated |= pairs - apart
             else:
-                apart = {p for p in pairs if p.link == work.objects[target][0].body}
+                apart = {p for p in pairs if p.link == work.objects[target][0].geom.body}
             wanted |= pairs - apart
             never |= apart
             if apart == pairs:
@@ -114,22 +117,30 @@ def share(work: Draft) -> tuple[list[DraftQuery], dict[str, int]]:
     return list(queries.values()), query_of
 
 
+def margin(work: Draft, name: str) -> float:
+    """Return the largest distance from an object's surface that any sensor asks for [m]."""
+    reaches = [max(float(work.layout.radius[s.taxels].max()), s.lowered.range) for s in work.sensors if name in s.feels]
+    return max(reaches)
+
+
 def fold(work: Draft) -> dict[str, np.ndarray]:
     """Return the constant arrays of layout and objects."""
     layout = work.layout
     fields = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
     arrays = {f"layout/{name}": getattr(layout, name) for name in fields}
     for name, geoms in work.objects.items():
-        arrays[f"objects/{name}/size"] = np.stack([geom.size for geom in geoms])
-        arrays[f"objects/{name}/pos"] = np.stack([geom.pos for geom in geoms])
-        arrays[f"objects/{name}/rotation"] = np.stack([geom.rotation.reshape(9) for geom in geoms])
+        arrays[f"objects/{name}/size"] = np.stack([felt.geom.size for felt in geoms])
+        arrays[f"objects/{name}/pos"] = np.stack([felt.geom.pos for felt in geoms])
+        arrays[f"objects/{name}/rotation"] = np.stack([felt.geom.rotation.reshape(9) for felt in geoms])
+        for i, settled in enumerate(work.settled[name]):
+            arrays |= {f"objects/{name}/{i}/{key}": value for key, value in settled.arrays.items()}
     return arrays
 
 
 def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarray]) -> tuple[tuple[PlannedObject, ...], Inputs]:
     """Number bodies, pairs and objects, and write the index tables of pairs and queries into the arrays."""
     names = sorted({pair.object for pair in work.pairs})
-    body_of = {name: work.objects[name][0].body for name in names}
+    body_of = {name: work.objects[name][0].geom.body for name in names}
     bodies = sorted({pair.link for pair in work.pairs} | set(body_of.values()))
     objects = tuple(_object(work, name) for name in names)
     gate = {pair: i for i, pair in enumerate(work.gated)}
@@ -151,11 +162,12 @@ def _object(work: Draft, name: str) -> PlannedObject:
     own = [i for i, pair in enumerate(work.pairs) if pair.object == name]
     return PlannedObject(
         name=name,
-        body=geoms[0].body,
-        shapes=tuple(geom.shape for geom in geoms),
-        is_centred=tuple(bool(not geom.pos.any() and np.array_equal(geom.rotation, np.eye(3))) for geom in geoms),
+        body=geoms[0].geom.body,
+        shapes=tuple(settled.shape for settled in work.settled[name]),
+        is_centred=tuple(bool(not f.geom.pos.any() and np.array_equal(f.geom.rotation, np.eye(3))) for f in geoms),
         first_pair=own[0],
         num_pairs=len(own),
+        accuracy=tuple(dict(settled.accuracy) for settled in work.settled[name]),
     )
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgdsl.compiler.felt import FeltGeom, felt_geoms
 from tgdsl.compiler.robot import Geom, Model, load_model
 from tgdsl.compiler.sample import Samples, sample
 from tgdsl.errors import Problem, SampleError, did_you_mean, listed
-from tgdsl.geometry.shapes import SHAPES
 from tgdsl.layout import Layout, Link
 from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
@@ -43,7 +43,7 @@ class Resolved:
 
     layout: Layout
     links: dict[str, tuple[str, ...]]
-    objects: dict[str, tuple[Geom, ...]]
+    objects: dict[str, tuple[FeltGeom, ...]]
     scene: Model
     robot: Model
     unused: tuple[tuple[str, str], ...]
@@ -59,7 +59,7 @@ def resolve(loaded: Loaded) -> Resolved:
     robot, scene = _models(loaded)
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
-    objects: dict[str, tuple[Geom, ...]] = {}
+    objects: dict[str, tuple[FeltGeom, ...]] = {}
     if robot is not None and loaded.layout is not None:
         _check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
@@ -199,24 +199,22 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
 
 
-def _objects(loaded: Loaded, scene: Model) -> dict[str, tuple[Geom, ...]]:
+def _objects(loaded: Loaded, scene: Model) -> dict[str, tuple[FeltGeom, ...]]:
     """Return the geoms of the objects that some sensor feels."""
     felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.feels}
-    objects: dict[str, tuple[Geom, ...]] = {}
+    objects: dict[str, tuple[FeltGeom, ...]] = {}
     for name, target in loaded.spec.objects.items():
         path: Path = ("objects", name, "body")
         if target.body not in scene.bodies:
             hint = did_you_mean(target.body, scene.bodies, "bodies")
             loaded.problems.append(loaded.problem(path, f'no body is named "{target.body}"', hint))
             continue
-        geoms = scene.touchable(target.body)
-        if not geoms:
-            loaded.problems.append(loaded.problem(path, f'body "{target.body}" has no geoms to feel'))
-        for geom in geoms:
-            if geom.shape not in SHAPES:
-                what = f'{geom.shown} of body "{target.body}" is of type {geom.shape}, which cannot be felt yet'
-                hint = f"types that can: {', '.join(SHAPES)}"
-                loaded.problems.append(loaded.problem(path, what, hint))
+        problems = loaded.problems
+
+        def report(what: str, hint: str, at: Path = path) -> None:
+            problems.append(loaded.problem(at, what, hint))
+
+        geoms = felt_geoms(target, scene, report)
         if name in felt:
             objects[name] = geoms
     return objects

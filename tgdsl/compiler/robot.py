@@ -159,13 +159,32 @@ class Model:
         """
         return Surface.joined([self._triangles(geom) for geom in geoms])
 
+    def mesh(self, geom: Geom) -> Surface:
+        """Return the triangles of a mesh geom, in the geom's own frame."""
+        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
+        first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+        vertices = model.mesh_vert[first : first + count].astype(np.float64)
+        first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+        faces = model.mesh_face[first : first + count].astype(np.int64)
+        return Surface(vertices, faces, np.zeros(count, dtype=np.int64), (geom.names,))
+
+    def hull(self, geom: Geom) -> Surface:
+        """Return the convex hull that MuJoCo collides of a mesh geom, in the geom's own frame; the mesh if it has none."""
+        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
+        first = int(model.mesh_graphadr[mesh])
+        surface = self.mesh(geom)
+        if first < 0:
+            return surface
+        count = int(model.mesh_graph[first])  # a graph starts with its number of vertices, of faces, then two tables of these
+        ids = model.mesh_graph[first + 2 + count : first + 2 + 2 * count]
+        hull = trimesh.convex.convex_hull(surface.vertices[ids])
+        faces = np.asarray(hull.faces, dtype=np.int64)
+        return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
+
     def _triangles(self, geom: Geom) -> Surface:
         if geom.shape == "mesh":
-            model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
-            first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-            vertices = model.mesh_vert[first : first + count].astype(np.float64)
-            first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-            faces = model.mesh_face[first : first + count].astype(np.int64)
+            own = self.mesh(geom)
+            vertices, faces = own.vertices, own.faces
         else:
             vertices, faces = self._tessellated(geom)
         vertices = vertices @ geom.rotation.T + geom.pos

@@ -1,22 +1,20 @@
 """Signed distance to a triangle mesh by nearest-point queries over a bounding-volume hierarchy, with NVIDIA Warp.
 
-Warp's mesh queries run in float32. They only choose the nearest face; the nearest point of that face, the distance and the
-gradient are then computed in float64, about the middle of the mesh. So float32 enters through ties between faces alone:
-the distance is good to about 1e-6 of the mesh's size for points nearby, whatever the precision of the points.
+Warp's queries run in float32. They only choose the nearest face; its nearest point, the distance and the gradient are then
+computed in float64, about the middle of the mesh. Faces too thin for float32 stand in a second hierarchy, of boxes, and are
+compared in float64. So float32 enters through near ties alone: the distance is good to 1e-6 of the mesh's size.
 
-A point is inside where the mesh's generalized winding number exceeds 1/2 (Jacobson, Kavan, Sorkine-Hornung, *Robust
-Inside-Outside Segmentation using Generalized Winding Numbers*, 2013; Warp approximates it as Barill et al., *Fast Winding
-Numbers for Soups and Clouds*, 2018). On closed meshes the sign is exact, at edges and corners too; overlapping closed parts
-form a union, although the distance stays that to the nearest triangle, which may lie inside it. Open meshes:
-
-- A hole reads as if a smooth membrane closed it. Across the membrane the distance jumps from +d to −d, d being the
-  distance to the rim; everywhere else the field is that of the closed mesh.
-- A sheet encloses nothing: where it is flat, or where both orientations coincide, the distance is positive on both sides.
+A point is inside where the mesh's generalized winding number exceeds 1/2 (Jacobson et al., *Robust Inside-Outside
+Segmentation using Generalized Winding Numbers*, 2013; approximated after Barill et al., 2018). On closed meshes the sign is
+exact, at edges and corners too. Closed parts that overlap form a union, but the nearest triangle may lie inside it.
+- A hole reads as if a smooth membrane closed it. Across it the distance jumps from +d to −d, d being that to the nearest face.
+- A flat sheet encloses nothing, nor do two coincident sides: the distance is positive on both sides.
 - Points outside the bounding box are outside. A mesh turned inside out is outside everywhere.
 
-Shapes: `v` vertices, `f` faces, `p` pieces of faces, `n` points.
+Shapes: `v` vertices, `f` faces, `t` thin faces.
 """
 
+# pyright: reportInvalidTypeForm=false
 from __future__ import annotations
 
 import contextlib
@@ -24,7 +22,7 @@ import functools
 import itertools
 import weakref
 from collections.abc import Iterator
-from typing import Any, NamedTuple, no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
@@ -32,18 +30,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import TgdslError
-from tgdsl.geometry.planes import Vec, split, vec
+from tgdsl.geometry.planes import Vec, split
 
 ON_SURFACE = 1e-7
 """Points nearer than this fraction of the mesh's size are on the surface: their gradient is the face's normal."""
 SIGN_OFFSET = 2e-6
 """The winding number is evaluated at least this fraction of the mesh's size off the surface, well clear of rounding."""
 SEARCH_ERROR = 2e-6
-"""Error of the search that is tolerated, as a fraction of the mesh's size; faces too thin for it are split."""
-THINNEST = 1e-7
-"""Faces whose height is below this fraction of the mesh's size are left to their neighbours."""
-MAX_PIECES = 2_000_000
-"""Splitting stops at this number of pieces."""
+"""Error that float32's search may make, as a fraction of the mesh's size; faces too thin for it are compared in float64."""
 
 
 class TriangleMesh:
@@ -64,64 +58,49 @@ class TriangleMesh:
             raise TgdslError(f"mesh: faces name vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
         if not np.isfinite(vertices).all():
             raise TgdslError("mesh: vertices must be finite")
-        self.vertices, self.faces = vertices, faces
-        self.key = next(_KEYS)
+        self.vertices, self.faces, self.key = vertices, faces, next(_KEYS)
         corners = vertices.astype(np.float64)[faces]
+        corners = corners[np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) > 0]
         if not len(corners):
-            raise TgdslError("mesh: no faces")
+            raise TgdslError("mesh: no face has an area")
         lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         self._middle, self._half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        self._size = float(np.linalg.norm(upper - lower))
         self._corners = corners - self._middle
-        self._pieces, self._face = _split(self._corners, self._size)
-        if not len(self._pieces):
-            raise TgdslError("mesh: no face has an area")
-        self._built: dict[str, _Built] = {}
+        self._thin = _thin(self._corners, SEARCH_ERROR * float(np.linalg.norm(upper - lower)))
+        self._built: dict[str, tuple[Any, ...]] = {}
         _MESHES[self.key] = self
 
     def __reduce__(self) -> tuple[type[TriangleMesh], tuple[np.ndarray, np.ndarray]]:
         return TriangleMesh, (self.vertices, self.faces)
 
-    def _on(self, device: Any) -> _Built:
+    def _on(self, device: Any) -> tuple[Any, ...]:
+        """Return Warp's mesh, the corners of its faces, the boxes of the thin ones, and their faces; all about the middle."""
         if str(device) not in self._built:
             wp = _warp()
-            points = wp.array(self._pieces.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
-            indices = wp.array(np.arange(3 * len(self._pieces), dtype=np.int32), dtype=wp.int32, device=device)
-            self._built[str(device)] = _Built(
+            corners = self._corners.reshape(-1, 3)
+            points = wp.array(corners.astype(np.float32), dtype=wp.vec3, device=device)
+            indices = wp.array(np.arange(len(points), dtype=np.int32), device=device)
+            bounds = [end(self._corners[self._thin], axis=1).astype(np.float32) for end in (np.min, np.max)]
+            self._built[str(device)] = (
                 wp.Mesh(points, indices, support_winding_number=True),
-                wp.array(self._face.astype(np.int32), dtype=wp.int32, device=device),
-                wp.array(self._corners.reshape(-1, 3), dtype=wp.vec3d, device=device),
+                wp.array(corners, dtype=wp.vec3d, device=device),
+                wp.Bvh(*(wp.array(end, dtype=wp.vec3, device=device) for end in bounds)) if len(self._thin) else None,
+                wp.array(self._thin.astype(np.int32), dtype=wp.int32, device=device),
             )
             wp.synchronize_device(device)
         return self._built[str(device)]
 
     def _launch(self, point: Tensor, max_distance: float, distance: Tensor, gradient: Tensor) -> None:
-        wp = _warp()
-        with _quiet():
-            built = self._on(wp.device_from_torch(point.device))
-            arrays = [
-                wp.from_torch(point, dtype=wp.vec3d),
-                wp.from_torch(distance, dtype=wp.float64),
-                wp.from_torch(gradient, dtype=wp.vec3d),
-            ]
-            box = [wp.vec3d(*self._middle), wp.vec3d(*self._half)]
-            wp.launch(
-                _kernel(),
-                dim=len(point),
-                inputs=[built.mesh.id, built.face, built.corners, *box, max_distance, *arrays],
-                device=built.mesh.device,
-                stream=wp.stream_from_torch(point.device) if point.is_cuda else None,
-            )
+        with _quiet() as wp:
+            mesh, corners, boxes, faces = self._on(wp.device_from_torch(point.device))
+            inputs = [mesh.id, corners, boxes.id if boxes else 0, faces, wp.vec3d(*self._middle), wp.vec3d(*self._half)]
+            inputs += [max_distance, wp.from_torch(point, dtype=wp.vec3d), wp.from_torch(distance, dtype=wp.float64)]
+            inputs += [wp.from_torch(gradient, dtype=wp.vec3d)]
+            stream = wp.stream_from_torch(point.device) if point.is_cuda else None
+            wp.launch(_kernel(wp), dim=len(point), inputs=inputs, device=mesh.device, stream=stream)
 
 
-class _Built(NamedTuple):
-    """A mesh on a device, centred: Warp's mesh of the pieces, the face of each piece, the corners of each face."""
-
-    mesh: Any
-    face: Any
-    corners: Any
-
-
+_SCHEMA = "(Tensor point, int key, float max_distance) -> (Tensor, Tensor)"
 _KEYS = itertools.count()
 _MESHES: weakref.WeakValueDictionary[int, TriangleMesh] = weakref.WeakValueDictionary()
 
@@ -135,36 +114,34 @@ def nearest(point: Vec, mesh: TriangleMesh, max_distance: float) -> tuple[Tensor
         point: Positions in the mesh's frame [m], planes of one shape.
         mesh: The mesh.
         max_distance: Points farther than this [m] read it, negative if inside; their gradient is (1, 0, 0), and the
-            derivative 0. A small one is fast. NaN points read NaN.
+            derivative 0. NaN points read NaN.
     """
     stacked = torch.stack(point, dim=-1)
     flat = stacked.reshape(-1, 3).to(torch.float64).contiguous()
     distance, gradient = torch.ops.tgdsl.mesh_distance(flat, mesh.key, max_distance)
-    direction = split(gradient.to(stacked.dtype).reshape(stacked.shape))
-    return distance.to(stacked.dtype).reshape(stacked.shape[:-1]), vec(direction)
+    return distance.to(stacked.dtype).reshape(point[0].shape), split(gradient.to(stacked.dtype).reshape(stacked.shape))
 
 
-@torch.library.custom_op("tgdsl::mesh_distance", mutates_args=())
+@torch.library.custom_op("tgdsl::mesh_distance", mutates_args=(), schema=_SCHEMA)
 def mesh_distance(point: Tensor, key: int, max_distance: float) -> tuple[Tensor, Tensor]:
     """Return distances (n,) and gradients (n, 3) of float64 points (n, 3); the mesh goes by its key."""
     mesh = _MESHES.get(key)
     if mesh is None:
         raise TgdslError("this function was compiled with a mesh that no longer exists; keep the TriangleMesh alive")
-    distance, gradient = point.new_empty(len(point)), torch.empty_like(point)
+    distance, gradient = _empty(point, key, max_distance)
     if len(point):
-        mesh._launch(point.detach(), max_distance, distance, gradient)
+        mesh._launch(point.detach().contiguous(), max_distance, distance, gradient)
     return distance, gradient
 
 
 @mesh_distance.register_fake
-def _shapes(point: Tensor, key: int, max_distance: float) -> tuple[Tensor, Tensor]:
-    return point.new_empty(point.shape[0]), torch.empty_like(point)
+def _empty(point: Tensor, key: int, max_distance: float) -> tuple[Tensor, Tensor]:
+    return point.new_empty(point.shape[0]), point.new_empty(point.shape)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-    distance, gradient = output
-    ctx.mark_non_differentiable(gradient)
-    ctx.save_for_backward(distance, gradient)
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(*output)
     ctx.max_distance = inputs[2]
 
 
@@ -177,33 +154,15 @@ def _backward(ctx: Any, of_distance: Tensor, of_gradient: Tensor | None) -> tupl
 mesh_distance.register_autograd(_backward, setup_context=_save)
 
 
-def _split(corners: Float[np.ndarray, "f 3 3"], size: float) -> tuple[Float[np.ndarray, "p 3 3"], Int[np.ndarray, " p"]]:
-    """Bisect the longest edges of thin faces until float32 finds nearest points well enough; return pieces and their faces.
+def _thin(corners: Float[np.ndarray, "f 3 3"], tolerance: float) -> Int[np.ndarray, " t"]:
+    """Return the faces on which float32 may misplace the nearest point by more than a tolerance [m].
 
-    Along a triangle with longest edge L and height h, Warp's nearest point is off by some (L/h)² L of float32's precision,
-    and by no more than L.
+    With longest edge L and height h, Warp's point is off along the face by (L/h)² L of float32's precision, at most by L.
     """
-    face, num_pieces = np.arange(len(corners)), 0
-    done: list[tuple[np.ndarray, np.ndarray]] = []
-    while len(corners):
-        edges = np.roll(corners, -1, axis=1) - corners
-        lengths = np.linalg.norm(edges, axis=2)
-        longest, length = lengths.argmax(axis=1), lengths.max(axis=1)
-        height = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / np.maximum(length, np.finfo(float).tiny)
-        if not done:
-            is_kept = height > THINNEST * size
-            corners, face, longest, length, height = (a[is_kept] for a in (corners, face, longest, length, height))
-        aspect = length / np.maximum(height, np.finfo(float).tiny)
-        error = np.minimum(np.finfo(np.float32).eps * aspect**2, 1.0) * length
-        is_thin = (error > SEARCH_ERROR * size) & (num_pieces + 2 * len(corners) < MAX_PIECES)
-        num_pieces += int((~is_thin).sum())
-        done.append((corners[~is_thin], face[~is_thin]))
-        order = (longest[is_thin, None] + np.arange(3)) % 3
-        a, b, c = np.take_along_axis(corners[is_thin], order[..., None], axis=1).transpose(1, 0, 2)
-        middle = 0.5 * (a + b)
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        face = np.tile(face[is_thin], 2)
-    return np.concatenate([part for part, _ in done]), np.concatenate([part for _, part in done])
+    edges = np.roll(corners, -1, axis=1) - corners
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    aspect = longest**2 / np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return np.flatnonzero(np.minimum(np.finfo(np.float32).eps * aspect**2, 1.0) * longest > tolerance)
 
 
 def _warp() -> Any:
@@ -215,88 +174,110 @@ def _warp() -> Any:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Warp from announcing itself and the kernels it loads."""
+def _quiet() -> Iterator[Any]:
+    """Yield Warp, kept from announcing itself and the kernels that it loads."""
     wp = _warp()
     before = wp.config.log_level
-    wp.config.log_level = max(before, wp.LOG_WARNING)
+    wp.config.log_level = max(before, wp.LOG_ERROR)
     try:
-        yield
+        wp.init()
+        yield wp
     finally:
         wp.config.log_level = before
 
 
 @functools.cache
 @no_type_check
-def _closest() -> Any:
-    """Return Warp's function for the closest point of a triangle (Ericson, *Real-Time Collision Detection*, 5.1.5)."""
-    wp = _warp()
+def _away_from(wp: Any) -> Any:
+    """Return Warp's function from a face's closest point to a point (Ericson, *Real-Time Collision Detection*, 5.1.5)."""
 
     @wp.func
-    def closest(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d):
-        zero = wp.float64(0.0)
+    def away_from(face: wp.int32, corners: Any, p: wp.vec3d):
+        a, b, c, zero = corners[3 * face], corners[3 * face + 1], corners[3 * face + 2], wp.float64(0.0)
         ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
         d1, d2, d3, d4, d5, d6 = wp.dot(ab, ap), wp.dot(ac, ap), wp.dot(ab, bp), wp.dot(ac, bp), wp.dot(ab, cp), wp.dot(ac, cp)
         if d1 <= zero and d2 <= zero:
-            return a
+            return ap
         if d3 >= zero and d4 <= d3:
-            return b
+            return bp
         if d6 >= zero and d5 <= d6:
-            return c
+            return cp
         va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
         if vc <= zero and d1 >= zero and d3 <= zero:
-            return a + ab * (d1 / (d1 - d3))
+            return ap - ab * (d1 / (d1 - d3))
         if vb <= zero and d2 >= zero and d6 <= zero:
-            return a + ac * (d2 / (d2 - d6))
+            return ap - ac * (d2 / (d2 - d6))
         if va <= zero and d4 >= d3 and d5 >= d6:
-            return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
-        return a + ab * (vb / (va + vb + vc)) + ac * (vc / (va + vb + vc))
+            return bp - (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+        return ap - ab * (vb / (va + vb + vc)) - ac * (vc / (va + vb + vc))
 
-    return closest
+    return away_from
 
 
 @functools.cache
 @no_type_check
-def _kernel() -> Any:
+def _nearest_face(wp: Any) -> Any:
+    """Return Warp's function for the nearest face, −1 if none is within reach, and the vector from it to the point."""
+    away_from = _away_from(wp)
+
+    @wp.func
+    def nearest_face(
+        mesh: wp.uint64, corners: Any, boxes: wp.uint64, faces: Any, p: wp.vec3d, size: wp.float64, reach: wp.float64
+    ):
+        face, best, length = wp.int32(-1), wp.vec3d(), wp.float64(reach)
+        slack = wp.float64(1e-5) * size
+        found = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), wp.float32(wp.float64(1.00001) * reach + slack))
+        if found.result:
+            away = away_from(found.face, corners, p)
+            if wp.length(away) < length:
+                face, best, length = wp.int32(found.face), away, wp.length(away)
+        if boxes != wp.uint64(0):
+            near = wp.bvh_query_sphere(boxes, wp.vec3(p), wp.float32(wp.float64(1.00001) * length + slack))
+            item = wp.int32(0)
+            while wp.bvh_query_next(near, item):
+                away = away_from(faces[item], corners, p)
+                if wp.length(away) < length:
+                    face, best, length = wp.int32(faces[item]), away, wp.length(away)
+        return face, best
+
+    return nearest_face
+
+
+@functools.cache
+@no_type_check
+def _kernel(wp: Any) -> Any:
     """Return the kernel: one thread per point."""
-    wp = _warp()
-    closest = _closest()
+    nearest_face = _nearest_face(wp)
     on_surface, sign_offset = wp.constant(wp.float64(ON_SURFACE)), wp.constant(wp.float64(SIGN_OFFSET))
 
     # fmt: off
     @wp.kernel(enable_backward=False)
     def query(
-        mesh: wp.uint64, face: wp.array(dtype=wp.int32), corners: wp.array(dtype=wp.vec3d), middle: wp.vec3d, half: wp.vec3d,
-        max_distance: wp.float64, points: wp.array(dtype=wp.vec3d),
-        distance: wp.array(dtype=wp.float64), gradient: wp.array(dtype=wp.vec3d),
+        mesh: wp.uint64, corners: wp.array(dtype=wp.vec3d), boxes: wp.uint64, faces: wp.array(dtype=wp.int32),
+        middle: wp.vec3d, half: wp.vec3d, max_distance: wp.float64,
+        points: wp.array(dtype=wp.vec3d), distance: wp.array(dtype=wp.float64), gradient: wp.array(dtype=wp.vec3d),
     ):
         # fmt: on
         i = wp.tid()
         p = points[i] - middle
-        size = wp.float64(2.0) * wp.length(half)
-        length, sign, probe = max_distance, wp.float64(1.0), p
-        direction = wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
-        is_outside = wp.abs(p[0]) > half[0] or wp.abs(p[1]) > half[1] or wp.abs(p[2]) > half[2]
-        reach = wp.float32(max_distance * wp.float64(1.00001) + wp.float64(0.00001) * size)
-        found = wp.mesh_query_point_no_sign(mesh, wp.vec3(p), reach)
-        if found.result:
-            k = 3 * face[found.face]
-            away = p - closest(corners[k], corners[k + 1], corners[k + 2], p)
-            if wp.length(away) < max_distance:
-                length = wp.length(away)
-                direction = away / length
-                probe = p + wp.max(sign_offset * size - length, wp.float64(0.0)) * direction
-                if length < on_surface * size:
-                    direction = wp.normalize(wp.cross(corners[k + 1] - corners[k], corners[k + 2] - corners[k]))
-                    sign = wp.where(wp.dot(away, direction) < wp.float64(0.0), wp.float64(-1.0), sign)
-                    direction = sign * direction
-                    is_outside = True
-        if not is_outside:
-            sign = wp.float64(wp.mesh_query_point_sign_winding_number(mesh, wp.vec3(probe), wp.inf).sign)
-        distance[i] = sign * length
-        gradient[i] = wp.where(length < max_distance, sign, wp.float64(1.0)) * direction
-        if wp.isnan(p):
-            distance[i] = wp.float64(wp.nan)
-            gradient[i] = wp.vec3d(wp.float64(wp.nan))
+        size, zero, one = wp.float64(2.0) * wp.length(half), wp.float64(0.0), wp.float64(1.0)
+        face, away = nearest_face(mesh, corners, boxes, faces, p, size, max_distance)
+        length, sign, probe, direction = max_distance, one, p, wp.vec3d(one, zero, zero)
+        is_decided = wp.abs(p[0]) > half[0] or wp.abs(p[1]) > half[1] or wp.abs(p[2]) > half[2]
+        if face >= 0:
+            length = wp.length(away)
+            direction = away / length
+            probe = p + wp.max(sign_offset * size - length, zero) * direction
+            if length < on_surface * size:
+                k = 3 * face
+                direction = wp.normalize(wp.cross(corners[k + 1] - corners[k], corners[k + 2] - corners[k]))
+                sign = wp.where(wp.dot(away, direction) < zero, -one, one)
+                direction = sign * direction
+                is_decided = True
+        if not is_decided:
+            found = wp.mesh_query_point_sign_winding_number(mesh, wp.vec3(probe), wp.inf)
+            sign = wp.where(found.result and found.sign < 0.0, -one, one)
+        distance[i] = wp.where(wp.isnan(p), wp.float64(wp.nan), sign * length)
+        gradient[i] = wp.where(wp.isnan(p), wp.vec3d(wp.float64(wp.nan)), wp.where(face >= 0, sign, one) * direction)
 
     return query

@@ -14,8 +14,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
+from tgdsl.geometry.bvh import TriangleMesh, nearest
+from tgdsl.geometry.grid import Grid, tricubic, trilinear
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.geometry.shapes import SHAPES
+
+GRIDS = {"trilinear": trilinear, "tricubic": tricubic}
+"""How a baked grid is interpolated, by the name that the Plan gives it."""
 
 
 class Motion(NamedTuple):
@@ -60,6 +65,13 @@ class Probes(NamedTuple):
     pair: Int[Tensor, "object taxel"]
 
 
+class RaycastSurface(NamedTuple):
+    """Triangles that are queried at run time, and the distance [m] up to which they are told apart."""
+
+    mesh: TriangleMesh
+    max_distance: float
+
+
 class FeltObject(NamedTuple):
     """An object's geoms in its body's frame, and where its pairs are.
 
@@ -72,6 +84,7 @@ class FeltObject(NamedTuple):
         size: Size of each geom as MuJoCo defines it [m].
         pos: Origin of each geom in the body frame [m].
         rotation: Rotates geom vectors into the body frame, row by row.
+        surfaces: Grid or triangles of each geom that is no primitive.
     """
 
     name: str
@@ -82,6 +95,7 @@ class FeltObject(NamedTuple):
     size: Float[Tensor, "geom 3"]
     pos: Float[Tensor, "geom 3"]
     rotation: Float[Tensor, "geom 9"]
+    surfaces: tuple[Grid | RaycastSurface | None, ...]
 
 
 class Distance(NamedTuple):
@@ -198,7 +212,13 @@ def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair
         rotation = planes.rot(part[:, pair] for part in rotation)
         offset = planes.vec(part[:, pair] for part in offset)
         point = planes.add(planes.rotate(rotation, probes.pos), offset)
-        distance, gradient = SHAPES[shape](point, planes.split(target.size[g]))
+        surface = target.surfaces[g]
+        if isinstance(surface, Grid):
+            distance, gradient = GRIDS[shape](point, surface)
+        elif isinstance(surface, RaycastSurface):
+            distance, gradient = nearest(point, surface.mesh, surface.max_distance)
+        else:
+            distance, gradient = SHAPES[shape](point, planes.split(target.size[g]))
         answers.append((distance, planes.rotate_back(rotation, gradient)))
     least, outward = answers[0]
     for distance, gradient in answers[1:]:

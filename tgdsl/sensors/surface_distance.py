@@ -59,7 +59,7 @@ def lower(spec: SurfaceDistanceSpec, layout: Layout) -> Lowered:
     if spec.nearest:
         channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
     constants = {"max_range": scalar(spec.max_range)}
-    return Lowered(tuple(channels), constants, needs=frozenset({"distance"}))
+    return Lowered(tuple(channels), constants, needs=frozenset({"distance"}), range=spec.max_range)
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
