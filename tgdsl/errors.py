@@ -65,6 +65,10 @@ class SpecError(TgdslError):
         super().__init__("\n".join(map(str, self.problems)))
 
 
+class BakeError(TgdslError):
+    """A surface whose distance no grid within the budget holds to the tolerance, or that has no distance."""
+
+
 class SampleError(TgdslError):
     """A placement that a surface cannot satisfy.
 

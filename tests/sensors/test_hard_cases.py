@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from sensors.scenes import module, state
-from sensors.test_contact_depth import HARD
 
 import tgdsl
+from sensors.scenes import module, state
+from sensors.test_contact_depth import HARD
 from tgdsl.state import SceneState
 
 JITTER = 1e-9

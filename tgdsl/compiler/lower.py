@@ -6,11 +6,10 @@ import numpy as np
 
 from tgdsl import observations
 from tgdsl.compiler import passes
-from tgdsl.compiler.bake import BakeError
 from tgdsl.compiler.felt import settle
 from tgdsl.compiler.passes import Draft, DraftSensor
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.errors import did_you_mean
+from tgdsl.errors import BakeError, did_you_mean
 from tgdsl.plan import Origin, Plan, PlannedObservation, PlannedSensor, SceneFile
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.yaml import Path
@@ -65,7 +64,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
 
 
 def _settle(loaded: Loaded, work: Draft) -> None:
-    """Decide how the distance to each geom is found; a mesh that no grid within its budget suits is a mistake of the document."""
+    """Decide how the distance to each geom is found; a mesh that no grid within its budget suits is a mistake."""
     for name, geoms in work.objects.items():
         target = loaded.spec.objects[name]
         try:

@@ -209,10 +209,9 @@ def _objects(loaded: Loaded, scene: Model) -> dict[str, tuple[FeltGeom, ...]]:
             hint = did_you_mean(target.body, scene.bodies, "bodies")
             loaded.problems.append(loaded.problem(path, f'no body is named "{target.body}"', hint))
             continue
-        problems = loaded.problems
 
         def report(what: str, hint: str, at: Path = path) -> None:
-            problems.append(loaded.problem(at, what, hint))
+            loaded.problems.append(loaded.problem(at, what, hint))
 
         geoms = felt_geoms(target, scene, report)
         if name in felt:

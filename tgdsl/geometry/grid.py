@@ -21,7 +21,10 @@ from tgdsl.geometry.planes import Vec, length_and_direction, vec
 FAR = 1e15
 """The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
 
-Weights = Callable[[Tensor], list[tuple[Tensor, Tensor]]]
+Pair = tuple[Tensor, Tensor]
+Nodes = tuple[Pair, Pair] | tuple[Pair, Pair, Pair, Pair]
+"""Weight of each node along an axis, and the weight's derivative. Tuples of known length: checks of lists do not compile."""
+Weights = Callable[[Tensor], Nodes]
 
 
 class Grid(NamedTuple):
@@ -57,20 +60,20 @@ def tricubic(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
     return _interpolate(point, grid, _cubic_weights, first=-1)
 
 
-def _linear_weights(t: Tensor) -> list[tuple[Tensor, Tensor]]:
+def _linear_weights(t: Tensor) -> Nodes:
     """Return weight and its derivative for nodes 0 and 1, at 0 ≤ t ≤ 1 between them."""
     one = torch.ones_like(t)
-    return [(1 - t, -one), (t, one)]
+    return (1 - t, -one), (t, one)
 
 
-def _cubic_weights(t: Tensor) -> list[tuple[Tensor, Tensor]]:
+def _cubic_weights(t: Tensor) -> Nodes:
     """Return weight and its derivative for nodes −1, 0, 1 and 2, at 0 ≤ t ≤ 1 between nodes 0 and 1."""
-    return [
+    return (
         (0.5 * t * (t * (2 - t) - 1), 0.5 * (t * (4 - 3 * t) - 1)),
         (0.5 * (t * t * (3 * t - 5) + 2), 0.5 * t * (9 * t - 10)),
         (0.5 * t * (t * (4 - 3 * t) + 1), 0.5 * (t * (8 - 9 * t) + 1)),
         (0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)),
-    ]
+    )
 
 
 def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[Tensor, Vec]:
@@ -78,9 +81,9 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     place = [(part - grid.origin[axis]) / grid.cell for axis, part in enumerate(point)]
     inside = [part.clamp(0, num - 1) for part, num in zip(place, grid.values.shape, strict=True)]
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
-    lower = [part.floor().long().clamp(0, num - 2) for part, num in zip(inside, grid.values.shape, strict=True)]
-    along = [weights(part - corner) for part, corner in zip(inside, lower, strict=True)]
-    value, *slopes = _sum_over_nodes(grid.values, lower, along, first)
+    lower = vec(part.floor().long().clamp(0, num - 2) for part, num in zip(inside, grid.values.shape, strict=True))
+    along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
+    value, *slopes = _sum_over_nodes(grid.values, lower, (along_x, along_y, along_z), first)
     way, direction = length_and_direction(
         vec(((part - near) * grid.cell).clamp(-FAR, FAR) for part, near in zip(place, inside, strict=True))
     )
@@ -95,7 +98,7 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
 
 
 def _sum_over_nodes(
-    values: Tensor, lower: list[Tensor], along: list[list[tuple[Tensor, Tensor]]], first: int
+    values: Tensor, lower: Vec, along: tuple[Nodes, Nodes, Nodes], first: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the weighted sum [m] and its derivatives along the axes [m per cell], one axis after the other."""
     flat = values.reshape(-1)

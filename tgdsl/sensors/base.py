@@ -76,7 +76,7 @@ class Lowered:
         channels: What a reading holds, in order.
         constants: Arrays that `forward` gets as tensors: scalars, or shapes that end in (taxel,).
         state: Rest value of each plane (env, taxel) that is carried from one call to the next.
-        range: Distance from an object's surface up to which readings tell it apart [m], if that is more than the probe's radius.
+        range: Distance from an object's surface up to which readings tell it apart [m], if more than the probe's radius.
         needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance".
     """
 
