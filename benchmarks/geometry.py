@@ -5,8 +5,8 @@
 
 The truth is libigl's exact distance to the mesh in float64. A primitive's mesh is as fine as is practical: how far it is
 from the primitive shows in the row "analytic". Points are uniform in a band of 5 mm about the surface, held back from every
-choice of a grid. Error is that of the distance and of the gradient's direction; time is that of one compiled call on 2^18 points
-(raycast: as it is), the median of several, per point.
+choice of a grid. Error is that of the distance and of the gradient's direction; time is that of one compiled call on 2^18
+points (raycast: as it is), the median of several, per point.
 """
 
 from __future__ import annotations
@@ -121,6 +121,8 @@ class Measure:
     """Folder for geometry-DEVICE.md and geometry-DEVICE.png."""
     raycast: bool = True
     """Whether to measure raycast, which needs warp-lang."""
+    compiled: bool = True
+    """Whether to fuse the queries with torch.compile; on a CPU that takes a minute for each tricubic grid."""
     dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64")
     """Which dtypes."""
 
@@ -133,7 +135,7 @@ class Measure:
             own = {key.removeprefix(f"{name}/"): value for key, value in arrays.items() if key.startswith(f"{name}/")}
             for dtype in (getattr(torch, each) for each in self.dtypes):
                 for way, nbytes, query, compiled in ways(name, own, dtype, self.device, self.raycast):
-                    rows.append(row(name, way, nbytes, query, compiled, own, dtype, self.device))
+                    rows.append(row(name, way, nbytes, query, compiled and self.compiled, own, dtype, self.device))
                     print(rows[-1])
         reference = next(r for r in rows if r.shape == "box" and r.way == "analytic" and r.dtype == "float32").nanoseconds
         write(rows, reference, self.device, self.out)
