@@ -150,3 +150,18 @@ def test_fingers_feel_one_another(tmp_path):
     depth = dict(zip(touch.taxels["s"]["link"], touch(scene)["s"][0, :, 0].tolist(), strict=True))
     # The thumb's probe is 1 mm inside the index's box; the index's probe 19 mm above the thumb's ball.
     assert depth == {"thumb": pytest.approx(0.005), "index": 0.0}
+
+
+@pytest.mark.parametrize("geom", HARD)
+def test_depth_follows_sizes(tmp_path, geom):
+    """Derivatives with respect to an object's sizes are those of the readings, where the nearest point is unique."""
+    rng = np.random.default_rng(4)
+    touch = module(tmp_path, rng.normal(scale=0.012, size=(20, 3)) + 0.003, geom, kind="contact_depth")
+    size = touch.constants["objects/item/size"].clone()
+    scene = state(touch)
+
+    def depth(values: torch.Tensor) -> torch.Tensor:
+        touch.constants._buffers["objects/item/size"] = values
+        return touch(scene)["s"]
+
+    assert torch.autograd.gradcheck(depth, size.requires_grad_(), eps=1e-7, atol=1e-5)
