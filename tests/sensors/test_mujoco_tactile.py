@@ -60,3 +60,56 @@ def test_depth_at_the_vertices_is_mujocos(tmp_path, shape, size):
             np.testing.assert_allclose(depth, theirs, atol=TOLERANCE)
             num_touched += int((theirs > 0).sum())
     assert num_touched > 500
+
+
+OURS, THEIRS, FACETS = 5e-5, 5e-4, 3e-5
+"""Distance errors on a ball of 2 cm [m]: the tolerance that we ask of our grid, what MuJoCo's octree of depth 6 has at most (it
+takes the ball for smaller), and how far the ball's facets are from it."""
+
+
+def test_depth_of_a_mesh_is_that_of_mujocos_octree(tmp_path, monkeypatch):
+    """MuJoCo's tactile sensor finds distances to a mesh on an octree, we on a grid: both within their errors of the ball."""
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+    ball = '<mesh name="ball" builtin="sphere" params="4" scale=".02 .02 .02"/>'
+    text = SCENE.format(shape="mesh", size="1").replace("</asset>", f"{ball}</asset>").replace('size="1"', 'mesh="ball"')
+    (tmp_path / "scene.xml").write_text(text)
+    spec = mujoco.MjSpec.from_string(text)
+    next(mesh for mesh in spec.meshes if mesh.name == "ball").needsdf = True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    pad, patch = model.geom("pad"), model.mesh("patch")
+    own = model.mesh_vert[patch.vertadr[0] : patch.vertadr[0] + patch.vertnum[0]]
+    vertices = Rotation.from_quat(pad.quat, scalar_first=True).apply(own) + pad.pos
+    points = [{"pos": v.tolist(), "normal": [0, 0, 1], "radius": 5e-3} for v in vertices]
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {
+                "model": str(tmp_path / "scene.xml"),
+                "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+            },
+            "objects": {"item": {"body": "item", "tolerance": OURS}},
+            "sensors": {"d": {"kind": "surface_distance", "links": "pad", "feels": ["item"], "max_range": 0.01}},
+        },
+        dtype=torch.float64,
+    )
+    rng = np.random.default_rng(1)
+    num_touched = 0
+    for _ in range(10):
+        data.qpos[:3] = np.array([0.01, 0.02, 0.03]) + 0.03 * rng.uniform(-1, 1, 3)
+        mujoco.mj_forward(model, data)
+        bodies = [model.body(name).id for name in touch.inputs.bodies]
+        state = tgdsl.SceneState(
+            body_pos=torch.from_numpy(data.xpos[bodies][None]), body_quat=torch.from_numpy(data.xquat[bodies][None])
+        )
+        distance = touch(state)["d"][0, :, 0].numpy()
+        theirs = data.sensordata.reshape(3, -1)[0]
+        is_shallow = (distance < 0) & (distance > -5e-3)  # within the band that our grid answers for
+        if data.ncon and is_shallow.any():
+            centre = data.geom("item").xpos
+            world = data.geom("pad").xpos + own @ data.geom("pad").xmat.reshape(3, 3).T
+            depth = 0.02 - np.linalg.norm(world - centre, axis=1)[is_shallow]
+            np.testing.assert_allclose(-distance[is_shallow], depth, atol=OURS + FACETS)
+            np.testing.assert_allclose(theirs[is_shallow], depth, atol=THEIRS + FACETS)
+            num_touched += int(is_shallow.sum())
+    assert num_touched > 100
