@@ -25,7 +25,7 @@ import torch
 import tyro
 
 from tgdsl.geometry.bvh import TriangleMesh, nearest
-from tgdsl.geometry.grid import Grid, tricubic, trilinear
+from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import split, vec
 from tgdsl.geometry.shapes import SHAPES
 
@@ -33,7 +33,6 @@ MARGIN = 5e-3
 NUM_ERROR, NUM_TIME = 20_000, 1 << 18
 TOLERANCES = (2e-4, 5e-5, 2e-5)
 PRIMITIVES = {"box": (0.02, 0.015, 0.03), "cylinder": (0.015, 0.03, 0.0), "ellipsoid": (0.02, 0.012, 0.03)}
-METHODS = {"trilinear": trilinear, "tricubic": tricubic}
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from tgdsl import observations
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.geometry.bvh import TriangleMesh
-from tgdsl.geometry.grid import Grid
-from tgdsl.geometry.query import GRIDS, Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, relate
+from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, relate
 from tgdsl.plan import Inputs, Plan, PlannedQuery, PlannedSensor
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.state import SHAPES, SceneState, shape_of
@@ -295,7 +295,7 @@ class TactileModule(nn.Module):
         return FeltObject(*placed, **tensors, surfaces=surfaces)
 
     def _surface(self, name: str, geom: int, shape: str) -> Grid | RaycastSurface | None:
-        if shape in GRIDS:
+        if shape in METHODS:
             return Grid(**self.constants.under(f"objects/{name}/{geom}", ("values", "origin", "cell")))
         return self._raycast.get(f"{name}/{geom}")
 

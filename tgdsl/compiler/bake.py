@@ -28,10 +28,9 @@ from jaxtyping import Float
 
 from tgdsl.compiler.solid import Lattice, Solid
 from tgdsl.errors import BakeError
-from tgdsl.geometry.grid import Grid, tricubic, trilinear
+from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.surface import Surface
 
-METHODS = {"trilinear": trilinear, "tricubic": tricubic}
 FORMAT = b"tgdsl grid 2"
 CHOICE_POINTS, REPORT_POINTS = 4096, 16384
 HEADROOM, CHOICE_PERCENTILE = 0.95, 99.3

@@ -60,6 +60,10 @@ def tricubic(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
     return _interpolate(point, grid, _cubic_weights, first=-1)
 
 
+METHODS = {"trilinear": trilinear, "tricubic": tricubic}
+"""How a grid is interpolated, by the name that a Plan gives it."""
+
+
 def _linear_weights(t: Tensor) -> Nodes:
     """Return weight and its derivative for nodes 0 and 1, at 0 ≤ t ≤ 1 between them."""
     one = torch.ones_like(t)

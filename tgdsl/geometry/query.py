@@ -15,12 +15,9 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
-from tgdsl.geometry.grid import Grid, tricubic, trilinear
+from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.geometry.shapes import SHAPES
-
-GRIDS = {"trilinear": trilinear, "tricubic": tricubic}
-"""How a baked grid is interpolated, by the name that the Plan gives it."""
 
 
 class Motion(NamedTuple):
@@ -214,7 +211,7 @@ def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair
         point = planes.add(planes.rotate(rotation, probes.pos), offset)
         surface = target.surfaces[g]
         if isinstance(surface, Grid):
-            distance, gradient = GRIDS[shape](point, surface)
+            distance, gradient = METHODS[shape](point, surface)
         elif isinstance(surface, RaycastSurface):
             distance, gradient = nearest(point, surface.mesh, surface.max_distance)
         else:
