@@ -25,7 +25,7 @@ import torch
 import tyro
 
 from tgdsl.geometry.bvh import TriangleMesh, nearest
-from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import split, vec
 from tgdsl.geometry.shapes import SHAPES
 
@@ -169,14 +169,14 @@ def ways(
         about = json.loads(str(own[f"{tolerance:g}/about"]))
         values = torch.tensor(own[f"{tolerance:g}/values"], dtype=dtype, device=device)
         origin = torch.tensor(own[f"{tolerance:g}/origin"], dtype=dtype, device=device)
-        grid = Grid(values, origin, torch.tensor(about["cell"], dtype=dtype, device=device))
+        grid = one_grid(values, origin, torch.tensor(about["cell"], dtype=dtype, device=device))
         method = METHODS[about["method"]]
         way = f"{about['method']}, {tolerance * 1e3:g} mm"
         found.append((way, own[f"{tolerance:g}/values"].nbytes, lambda p, m=method, g=grid: m(p, g), True))
     if raycast:
         mesh = TriangleMesh(own["vertices"], own["faces"])
         nbytes = own["vertices"].size * 4 + own["faces"].size * 4
-        found.append(("raycast", nbytes, lambda p, mesh=mesh: nearest(p, mesh, 2 * MARGIN), False))
+        found.append(("raycast", nbytes, lambda p, mesh=mesh: nearest(p, [mesh], 2 * MARGIN), False))
     return found
 
 

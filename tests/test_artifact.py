@@ -183,8 +183,8 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
     content = artifact.read_bytes()
     arrays = load(content)
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
-    changed = {**arrays, "queries/0/reach": arrays["queries/0/reach"] * 2}
-    lacking = {name: value for name, value in arrays.items() if name != "queries/0/reach"}
+    changed = {**arrays, "queries/0/0/reach": arrays["queries/0/0/reach"] * 2}
+    lacking = {name: value for name, value in arrays.items() if name != "queries/0/0/reach"}
     for bad in (changed, lacking):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
         with pytest.raises(ArtifactError, match="the arrays are not those that the plan was written with"):

@@ -138,7 +138,7 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
         "12 taxels",
         "link tip: no sensor is on it",
         "pad – item",
-        "for touch, contact",
+        "touch, contact: depth",
         "remembers bit",
         "contact_found",
     ):

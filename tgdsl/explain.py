@@ -8,7 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.module import TactileModule
-from tgdsl.plan import PlannedSensor
+from tgdsl.plan import PlannedObject, PlannedSensor
 
 
 class _OperationCounter(TorchDispatchMode):
@@ -71,17 +71,24 @@ def explain(touch: TactileModule) -> str:
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
     lines += _grids(touch)
-    lines += ["", "queries (one geometry query serves all sensors with the same probes, objects and gate)"]
+    lines += ["", "queries (each measures its probes once, whatever number of sensors they serve)"]
     for i, query in enumerate(plan.queries):
-        felt = ", ".join(f"{plan.objects[o].name} ({', '.join(plan.objects[o].shapes)})" for o in query.objects)
-        users = ", ".join(sensor.name for sensor in plan.sensors if sensor.query == i)
-        gate = "where MuJoCo has the pair in contact" if query.is_gated else "wherever a probe reaches"
-        extra = " with " + " and ".join(query.needs) if query.needs else ""
-        lines.append(f"  {i}: {query.num_taxels} probes against {felt}: depth{extra}, {gate}; for {users}")
+        lines.append(f"  {i}: {query.num_taxels} probes against {', '.join(_felt(plan.objects[o]) for o in query.objects)}")
+        for a, answer in enumerate(query.answers):
+            users = ", ".join(sensor.name for sensor in plan.sensors if (sensor.query, sensor.answer) == (i, a))
+            gate = "where MuJoCo has the pair in contact" if answer.is_gated else "wherever a probe reaches"
+            extra = " with " + " and ".join(answer.needs) if answer.needs else ""
+            lines.append(f"    {users}: depth{extra}, {gate}")
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     return "\n".join(lines + _costs(touch))
+
+
+def _felt(target: PlannedObject) -> str:
+    variants = [f"{target.num_variants} variants"] if target.num_variants > 1 else []
+    size = ["its size given per environment"] if target.is_sized else []
+    return f"{target.name} ({', '.join([*target.shapes, *variants, *size])})"
 
 
 def _links(touch: TactileModule) -> list[str]:
@@ -104,16 +111,18 @@ def _grids(touch: TactileModule) -> list[str]:
     """Return what was measured of each baked grid."""
     lines = []
     for target in touch.plan.objects:
-        for i, (shape, accuracy) in enumerate(zip(target.shapes, target.accuracy, strict=True)):
-            if accuracy:
-                values = touch.plan.arrays[f"objects/{target.name}/{i}/values"]
-                nodes = " × ".join(map(str, values.shape))
-                lines += [
-                    f"  {target.name}, geom {i}: {shape} grid of {nodes} nodes every {1e3 * accuracy['cell']:.3g} mm, "
-                    f"{values.nbytes} bytes",
-                    f"    distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} mm), "
-                    f"largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges {1e3 * accuracy['edge_max']:.3g} mm",
-                ]
+        for variant, row in enumerate(target.accuracy):
+            for i, accuracy in enumerate(row):
+                if accuracy:
+                    num = touch.plan.arrays[f"objects/{target.name}/{i}/num"][variant]
+                    which = f"variant {variant}, geom {i}" if target.num_variants > 1 else f"geom {i}"
+                    lines += [
+                        f"  {target.name}, {which}: {target.shapes[i]} grid of {' × '.join(map(str, num))} nodes every "
+                        f"{1e3 * accuracy['cell']:.3g} mm, {4 * int(num.prod())} bytes",
+                        f"    distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} "
+                        f"mm), largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges "
+                        f"{1e3 * accuracy['edge_max']:.3g} mm",
+                    ]
     return ["", "meshes", *lines] if lines else []
 
 

@@ -22,8 +22,9 @@ from tgdsl import observations
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.geometry.bvh import TriangleMesh
 from tgdsl.geometry.grid import METHODS, Grid
-from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, relate
-from tgdsl.plan import Inputs, Plan, PlannedQuery, PlannedSensor
+from tgdsl.geometry.planes import split
+from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, measure, relate
+from tgdsl.plan import Inputs, Plan, PlannedObject, PlannedQuery, PlannedSensor
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.state import SHAPES, SceneState, shape_of
 
@@ -94,7 +95,7 @@ class TactileModule(nn.Module):
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
         self._raycast = {
-            f"{target.name}/{i}": _raycast_surface(plan, f"objects/{target.name}/{i}")
+            f"{target.name}/{i}": _raycast_surface(plan, target, i)
             for target in plan.objects
             for i, shape in enumerate(target.shapes)
             if shape == "raycast"
@@ -179,11 +180,12 @@ class TactileModule(nn.Module):
             Readings by name, and the new state.
         """
         pairs = self._pairs(tensors)
-        answers = [self._query(i, query, pairs) for i, query in enumerate(self.plan.queries)]
+        objects = [self._object(target, tensors) for target in self.plan.objects]
+        answers = [self._query(i, query, pairs, objects) for i, query in enumerate(self.plan.queries)]
         readings: dict[str, Tensor] = {}
         updated: dict[str, Tensor] = {}
         for sensor in self.plan.sensors:
-            felt, probes = answers[sensor.query]
+            felt, probes = answers[sensor.query][sensor.answer]
             own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
             constants = self.constants.under(f"sensors/{sensor.name}", sensor.constants)
             result, new = self._kinds[sensor.name].forward(felt, probes, constants, own)
@@ -251,6 +253,10 @@ class TactileModule(nn.Module):
                 value = value / value.norm(dim=-1, keepdim=True)
             elif name == "contact_found":
                 value = value > -1.0
+            elif name == "variant":
+                value = torch.arange(num_envs)[:, None] % torch.tensor(self.inputs.num_variants)
+            elif name == "object_size":
+                value = 0.015 + 0.01 * value.clamp(-1, 1)
             values[name] = value.to(self.device)
         if "dt" in self.inputs.fields:
             values["dt"] = 0.01
@@ -278,26 +284,55 @@ class TactileModule(nn.Module):
             gate,
         )
 
-    def _query(self, i: int, query: PlannedQuery, pairs: Pairs) -> tuple[Felt, Probes]:
-        constants = self.constants.under(f"queries/{i}", ("pos", "reach", "pair"))
-        x, y, z = constants["pos"]
-        probes = Probes((x, y, z), constants["reach"], constants["pair"])
-        objects = [self._object(index) for index in query.objects]
-        if not query.is_gated:
-            pairs = pairs._replace(gate=None)
-        return feel(pairs, probes, objects, query.needs), probes
+    def _query(self, i: int, query: PlannedQuery, pairs: Pairs, objects: Sequence[FeltObject]) -> list[tuple[Felt, Probes]]:
+        """Return the answers to a query, and its probes."""
+        x, y, z = self.constants[f"queries/{i}/pos"]
+        probes = Probes((x, y, z), self.constants[f"queries/{i}/pair"])
+        near = measure(pairs, probes, [objects[index] for index in query.objects])
+        answers = []
+        for a, answer in enumerate(query.answers):
+            own = pairs if answer.is_gated else pairs._replace(gate=None)
+            reach = self.constants[f"queries/{i}/{a}/reach"]
+            answers.append((feel(own, probes, [near[index] for index in answer.objects], reach, answer.needs), probes))
+        return answers
 
-    def _object(self, index: int) -> FeltObject:
-        target = self.plan.objects[index]
-        tensors = self.constants.under(f"objects/{target.name}", ("size", "pos", "rotation"))
-        surfaces = tuple(self._surface(target.name, i, shape) for i, shape in enumerate(target.shapes))
-        placed = (target.name, target.first_pair, target.num_pairs, target.shapes, target.is_centred)
-        return FeltObject(*placed, **tensors, surfaces=surfaces)
+    def _object(self, target: PlannedObject, tensors: dict[str, Tensor]) -> FeltObject:
+        """Return an object as each environment has it."""
+        place = self.inputs.objects.index(target.name) if target.name in self.inputs.objects else None
+        variant = tensors["variant"][:, place].long() if target.num_variants > 1 else None
 
-    def _surface(self, name: str, geom: int, shape: str) -> Grid | RaycastSurface | None:
-        if shape in METHODS:
-            return Grid(**self.constants.under(f"objects/{name}/{geom}", ("values", "origin", "cell")))
-        return self._raycast.get(f"{name}/{geom}")
+        size, is_absent = self._chosen(target, "size", variant), None
+        if target.is_sized:
+            own = tensors["object_size"][:, place, None].to(size.dtype).expand(-1, size.shape[1], -1)
+            size = own if variant is None else torch.where(self._chosen(target, "is_absent", variant)[..., None] > 0, size, own)
+        if variant is not None:
+            is_absent = self._chosen(target, "is_absent", variant) > 0
+        return FeltObject(
+            name=target.name,
+            first_pair=target.first_pair,
+            num_pairs=target.num_pairs,
+            shapes=target.shapes,
+            is_centred=target.is_centred,
+            size=size,
+            pos=self._chosen(target, "pos", variant),
+            rotation=self._chosen(target, "rotation", variant),
+            is_absent=is_absent,
+            variant=variant,
+            surfaces=tuple(self._surface(target, i, variant) for i in range(len(target.shapes))),
+        )
+
+    def _chosen(self, target: PlannedObject, path: str, variant: Tensor | None) -> Tensor:
+        """Return an array of an object with one row per environment, or a single one if it is the same in all."""
+        table = self.constants[f"objects/{target.name}/{path}"]
+        return table if variant is None else table[variant]
+
+    def _surface(self, target: PlannedObject, i: int, variant: Tensor | None) -> Grid | RaycastSurface | None:
+        if target.shapes[i] not in METHODS:
+            return self._raycast.get(f"{target.name}/{i}")
+        first, num, origin, cell = (self._chosen(target, f"{i}/{part}", variant) for part in ("first", "num", "origin", "cell"))
+        nums = num[:, 0, None], num[:, 1, None], num[:, 2, None]
+        values = self.constants[f"objects/{target.name}/{i}/values"]
+        return Grid(values, first[:, None], nums, split(origin[:, None]), cell[:, None])
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""
@@ -323,9 +358,17 @@ class TactileModule(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def _raycast_surface(plan: Plan, path: str) -> RaycastSurface:
-    mesh = TriangleMesh(plan.arrays[f"{path}/vertices"], plan.arrays[f"{path}/faces"])
-    return RaycastSurface(mesh, float(plan.arrays[f"{path}/max_distance"]))
+def _raycast_surface(plan: Plan, target: PlannedObject, i: int) -> RaycastSurface:
+    path = f"objects/{target.name}/{i}"
+    meshes: dict[tuple[bytes, bytes], TriangleMesh] = {}
+    found = []
+    for variant in range(target.num_variants):
+        vertices, faces = plan.arrays[f"{path}/{variant}/vertices"], plan.arrays[f"{path}/{variant}/faces"]
+        key = vertices.tobytes(), faces.tobytes()
+        if key not in meshes:
+            meshes[key] = TriangleMesh(vertices, faces)
+        found.append(meshes[key])
+    return RaycastSurface(tuple(found), float(plan.arrays[f"{path}/max_distance"]))
 
 
 def _has_cpp_compiler() -> bool:

@@ -7,10 +7,14 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `layout/{link_id,pos,normal,tangent,radius,area,cell}` | (taxel, …) | the taxels that some sensor has, see `layout.Layout` |
 | `pairs/{link,object}` | (pair,) | body indices of each pair's link and object |
 | `pairs/gate` | (pair,) | index of each pair among `inputs.pairs`; 0 where no query asks |
-| `objects/<name>/{size,pos,rotation}` | (geom, 3 or 9) | geoms in the object's body frame |
-| `objects/<name>/<geom>/{values,origin,cell}` | (x, y, z), (3,), () | baked grid of a geom, float32, see `geometry.grid.Grid` |
-| `objects/<name>/<geom>/{vertices,faces,max_distance}` | (v, 3), (f, 3), () | triangles of a geom that is queried by raycast |
-| `queries/<i>/{taxels,pos,reach,pair}` | (taxel,), (3, taxel), (object, taxel) ×2 | probes, see `geometry.query.Probes` |
+| `objects/<name>/{size,pos,rotation}` | (variant, geom, 3 or 9) | geoms in the object's body frame |
+| `objects/<name>/is_absent` | (variant, geom) | 1 where a variant lacks a geom; only if the object has variants |
+| `objects/<name>/<geom>/values` | (node,) | its baked grids, float32, see `geometry.grid.Grid` |
+| `objects/<name>/<geom>/{first,num,origin,cell}` | (variant,), (variant, 3) ×2, (variant,) | where each variant's is |
+| `objects/<name>/<geom>/<variant>/{vertices,faces}` | (v, 3), (f, 3) | triangles of a geom that is queried by raycast |
+| `objects/<name>/<geom>/max_distance` | () | how far that query looks |
+| `queries/<i>/{taxels,pos,pair}` | (taxel,), (3, taxel), (object, taxel) | probes, see `geometry.query.Probes` |
+| `queries/<i>/<answer>/reach` | (object, taxel) | what an answer feels, see `geometry.query.feel` |
 | `sensors/<name>/<constant>` | () or (…, taxel) | what the kind's `lower` folded |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
 """
@@ -30,7 +34,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 1
+FORMAT = 2
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -52,6 +56,8 @@ class Inputs:
         pairs: Pairs whose contacts are read.
         bodies_of: Body of each object named in `pairs`.
         slots: Contacts per pair of the slotted contact fields; 0 if none is read.
+        objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
+        num_variants: How many variants each of these objects has; 1 if only its size differs.
     """
 
     fields: tuple[str, ...]
@@ -59,13 +65,25 @@ class Inputs:
     pairs: tuple[Pair, ...]
     bodies_of: Mapping[str, str]
     slots: int
+    objects: tuple[str, ...] = ()
+    num_variants: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class PlannedObject:
-    """An object: its body, how the distance to each of its geoms is found, and which of them share the body's frame.
+    """An object that is felt.
 
-    `accuracy` holds what was measured of each grid: see `compiler.bake.Errors`; it is empty where distances are exact.
+    A geom stands for the geoms of one type that the variants have in its place; a variant may lack it.
+
+    Attributes:
+        name: Its name.
+        body: Its body.
+        shapes: How the distance to each of its geoms is found.
+        is_centred: Which of them share the body's frame.
+        first_pair: Index of its first pair.
+        num_pairs: Number of its pairs.
+        accuracy: What was measured of each variant's geoms: see `compiler.bake.Errors`; empty where distances are exact.
+        is_sized: Whether its size is part of the state.
     """
 
     name: str
@@ -74,26 +92,41 @@ class PlannedObject:
     is_centred: tuple[bool, ...]
     first_pair: int
     num_pairs: int
-    accuracy: tuple[Mapping[str, float], ...]
+    accuracy: tuple[tuple[Mapping[str, float], ...], ...]
+    is_sized: bool
+
+    @property
+    def num_variants(self) -> int:
+        """Number of its variants; 1 if it is the same in all environments."""
+        return len(self.accuracy)
 
 
 @dataclass(frozen=True)
-class PlannedQuery:
-    """One geometry query, shared by all sensors with the same probes, objects and gate."""
+class PlannedAnswer:
+    """What some sensors feel of a query: which of its objects, whether they are gated, and what is wanted of them."""
 
     objects: tuple[int, ...]
     is_gated: bool
     needs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlannedQuery:
+    """One geometry query, shared by all sensors with the same probes, and the answers that are made of it."""
+
+    objects: tuple[int, ...]
     num_taxels: int
+    answers: tuple[PlannedAnswer, ...]
 
 
 @dataclass(frozen=True)
 class PlannedSensor:
-    """One sensor: its kind, its query, the channels of its reading and the state it carries."""
+    """One sensor: its kind, its query and which answer of it, the channels of its reading and the state it carries."""
 
     name: str
     kind: str
     query: int
+    answer: int
     channels: tuple[str, ...]
     units: tuple[str, ...]
     constants: tuple[str, ...]
@@ -124,18 +157,60 @@ class Asset:
 
 
 @dataclass(frozen=True)
+class SceneGeom:
+    """A geom that an object has in some environments.
+
+    Attributes:
+        size: Its size as MuJoCo defines it [m]; nothing for a mesh.
+        pos: Its frame's origin in the body's frame [m].
+        quat: Its orientation there, w, x, y, z.
+        density: Its density [kg/m³].
+        mesh: Key of its mesh's asset, or nothing.
+        scale: Factor from the mesh file's unit to metres.
+    """
+
+    size: tuple[float, ...]
+    pos: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
+    density: float
+    mesh: str
+    scale: float
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """An object whose geometry differs between environments.
+
+    Attributes:
+        name: Its name in the document.
+        body: Its body in the scene.
+        types: MuJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs.
+        variants: Which of these geoms each variant has, and how; None where it lacks one.
+        is_sized: Whether the size of its geom is chosen per environment.
+    """
+
+    name: str
+    body: str
+    types: tuple[str, ...]
+    variants: tuple[tuple[SceneGeom | None, ...], ...]
+    is_sized: bool
+
+
+@dataclass(frozen=True)
 class SceneFile:
     """The instrumented scene, as text, for whoever simulates it.
 
     Attributes:
         mjcf: The scene as MJCF, with the contact sensors that the module wants.
         parts: The MJCF files that it includes or attaches, by the names it has for them.
-        assets: The meshes, textures and other files that they name.
+        assets: The meshes, textures and other files that they or the objects name.
+        objects: Objects that differ between environments.
     """
 
     mjcf: str
     parts: Mapping[str, str]
     assets: tuple[Asset, ...]
+    objects: tuple[SceneObject, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
-from tgdsl.errors import ArtifactError
-from tgdsl.plan import Asset, SceneFile
+from tgdsl.errors import ArtifactError, RobotError
+from tgdsl.plan import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.schema.files import robots_folder
+
+INHERITED = (
+    *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
+    *("group", "rgba", "material"),
+)
+"""What a variant's geoms have of the body's first geom."""
+OFF_CENTER = 2e-6
+"""Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
 
 
 @contextmanager
@@ -33,19 +43,176 @@ def muted_mujoco() -> Iterator[None]:
 
 
 def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
-    """Compile a scene whose assets' contents are at hand."""
+    """Compile a scene whose assets' contents are at hand, its objects as the scene's own text has them."""
     with muted_mujoco():
-        parts = {name: text.encode() for name, text in scene.parts.items()}
-        return mujoco.MjSpec.from_string(scene.mjcf, include=parts, assets=dict(assets)).compile()
+        return _spec(scene, assets).compile()
+
+
+def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
+    parts = {name: text.encode() for name, text in scene.parts.items()}
+    return mujoco.MjSpec.from_string(scene.mjcf, include=parts, assets=dict(assets))
 
 
 def scene_model(scene: SceneFile) -> mujoco.MjModel:
-    """Return the compiled model of a scene, its assets read from where they were found.
+    """Return the compiled model of a scene, its assets read from where they were found; objects have their first variant.
 
     Raises:
         ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
     """
-    return compiled(scene, {asset.key: _content(asset) for asset in scene.assets})
+    return SceneModels(scene).model({})
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What an object is like in one environment.
+
+    Attributes:
+        variant: Which of its variants it has.
+        size: Its size as MuJoCo defines it [m]; None: as the scene or the variant says.
+    """
+
+    variant: int = 0
+    size: tuple[float, float, float] | None = None
+
+
+def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: Mapping[str, Choice]) -> mujoco.MjSpec:
+    """Give objects the geoms of one variant each: the spec is changed in place and returned.
+
+    Whatever is chosen, the same geoms and meshes are there, so that MuJoCo lays its data out alike: those that a variant lacks
+    weigh nothing, are not seen, and collide only with what has a bit of `conaffinity` that nothing has.
+
+    Args:
+        spec: The scene.
+        objects: The objects.
+        choices: What each is like, by its name; default: its first variant.
+    """
+    free = _free_bit(spec) if objects else 0
+    for target in objects:
+        choice = choices.get(target.name, Choice())
+        body = spec.body(target.body)
+        if target.types:
+            template = body.geoms[0]
+            for i in range(len(target.types)):
+                _add_geom(spec, target, i, choice.variant, template, free)
+            for geom in body.geoms[: -len(target.types)]:
+                spec.delete(geom)
+        if choice.size is not None:
+            body.geoms[_sized_geom(target, choice.variant)].size = choice.size
+    return spec
+
+
+def _sized_geom(target: SceneObject, variant: int) -> int:
+    """Return which of its body's geoms an object is whose size is chosen."""
+    return next(i for i, geom in enumerate(target.variants[variant]) if geom is not None) if target.types else 0
+
+
+def geom_name(target: SceneObject, i: int) -> str:
+    """Return the name that geom i of an object has in the scene."""
+    return f"tgdsl/{target.name}/{i}"
+
+
+def is_absent(model: mujoco.MjModel, geom: int) -> bool:
+    """Return whether a geom is one that its object lacks in this model: see `with_choices`."""
+    return bool(model.geom(geom).name.startswith("tgdsl/") and model.geom_rgba[geom, 3] == 0)
+
+
+def _free_bit(spec: mujoco.MjSpec) -> int:
+    """Return a bit that no geom collides with."""
+    used = int(np.bitwise_or.reduce([int(geom.conaffinity) for geom in spec.geoms]))
+    free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
+    if free is None:
+        raise RobotError("the scene's geoms use all bits of `conaffinity`; objects that vary need a free one")
+    return free
+
+
+def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom, free: int) -> None:
+    """Add geom i of an object to its body as one variant has it, and the meshes that it has in any."""
+    meshes = {}
+    for v, geoms in enumerate(target.variants):
+        own = geoms[i]
+        if own is not None and own.mesh:
+            meshes[v] = f"tgdsl/{target.name}/{v}/{i}"
+            spec.add_mesh(name=meshes[v], file=own.mesh, scale=[own.scale] * 3)
+    chosen = target.variants[variant][i]
+    like = chosen or next(geoms[i] for geoms in target.variants if geoms[i] is not None)
+    assert isinstance(like, SceneGeom)
+    geom = spec.body(target.body).add_geom(
+        name=geom_name(target, i),
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{target.types[i].upper()}"),
+        size=[*like.size, 0.0, 0.0, 0.0][:3],
+        pos=like.pos,
+        quat=like.quat,
+        density=like.density,
+    )
+    if meshes:
+        geom.meshname = meshes.get(variant, next(iter(meshes.values())))
+    for name in INHERITED:
+        setattr(geom, name, getattr(template, name))
+    if chosen is None:
+        geom.contype, geom.conaffinity = free, 0
+        geom.mass, geom.density = 0.0, 0.0
+        geom.rgba = [0.0, 0.0, 0.0, 0.0]
+        geom.material = ""
+
+
+class SceneModels:
+    """The models of a scene whose objects differ between environments, all of one layout, each compiled once."""
+
+    def __init__(self, scene: SceneFile):
+        """Read the assets.
+
+        Raises:
+            ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
+        """
+        self.objects = {target.name: target for target in scene.objects}
+        with muted_mujoco():
+            self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
+        self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}
+        self._off_center: tuple[str, ...] = ()
+        for target in scene.objects:
+            own = [self.model({target.name: Choice(v)}) for v in range(len(target.variants))]
+            # MuJoCo stores less of a body whose centre of mass is its origin.
+            if len({(model.nC, model.nM, model.nD, model.nB) for model in own}) > 1:
+                self._off_center += (target.body,)
+        if self._off_center:
+            self._models.clear()
+
+    def model(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
+        """Return the scene with some choices of objects; the others have their first variant.
+
+        Raises:
+            RobotError: If MuJoCo cannot compile it.
+        """
+        key = tuple(choices.get(name, Choice()) for name in self.objects)
+        if key not in self._models:
+            try:
+                with muted_mujoco():
+                    self._models[key] = self._compiled(choices)
+            except ValueError as error:
+                raise RobotError(f"MuJoCo cannot compile the scene with {dict(choices)}: {error}") from error
+        return self._models[key]
+
+    def size(self, name: str, choice: Choice) -> tuple[float, float, float]:
+        """Return the size of an object whose size may be chosen, as MuJoCo defines it [m]."""
+        target, model = self.objects[name], self.model({name: choice})
+        x, y, z = model.geom_size[model.body(target.body).geomadr[0] + _sized_geom(target, choice.variant)]
+        return float(x), float(y), float(z)
+
+    def type(self, name: str, choice: Choice) -> str:
+        """Return MuJoCo's name of its type."""
+        target, model = self.objects[name], self.model({name: choice})
+        kind = model.geom_type[model.body(target.body).geomadr[0] + _sized_geom(target, choice.variant)]
+        return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+
+    def _compiled(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
+        spec = with_choices(self._base.copy(), list(self.objects.values()), choices)
+        model = spec.compile()
+        for name in self._off_center:
+            body, id = spec.body(name), model.body(name).id
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[id], model.body_inertia[id]
+            body.iquat, body.ipos = model.body_iquat[id], model.body_ipos[id] + np.array([OFF_CENTER, 0, 0])
+        return spec.compile() if self._off_center else model
 
 
 def _content(asset: Asset) -> bytes:

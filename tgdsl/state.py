@@ -1,7 +1,7 @@
 """The state of a scene: what a module reads of simulators and hardware.
 
 Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
-pair.
+pair, `object` objects of its `inputs.objects`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import StateError
@@ -27,6 +27,8 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "contact_torque": ("pair", "slot", 3),
     "contact_normal": ("pair", "slot", 3),
     "contact_netforce": ("pair", 3),
+    "variant": ("object",),
+    "object_size": ("object", 3),
 }
 """Shape of each tensor of a `SceneState`, after the leading `env`."""
 
@@ -49,6 +51,8 @@ class SceneState:
         contact_torque: Torque on the link at each point [N·m].
         contact_normal: Unit normal out of the object at each point.
         contact_netforce: The pair's whole force on the link [N].
+        variant: Which of its variants each object has, from 0; 0 for one that has none.
+        object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
         dt: Time since the last state [s].
     """
 
@@ -62,12 +66,16 @@ class SceneState:
     contact_torque: Float[Tensor, "env pair slot 3"] | None = None
     contact_normal: Float[Tensor, "env pair slot 3"] | None = None
     contact_netforce: Float[Tensor, "env pair 3"] | None = None
+    variant: Int[Tensor, "env object"] | None = None
+    object_size: Float[Tensor, "env object 3"] | None = None
     dt: float | None = None
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
-        """Return the state with `torch.Tensor.to` applied to every tensor."""
+        """Return the state with `torch.Tensor.to` applied to every tensor; a dtype applies to what is not an integer."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
+        if moved["variant"] is not None:
+            moved["variant"] = moved["variant"].to(values["variant"].dtype)
         return SceneState(**moved)
 
     def checked(self, inputs: Inputs, device: torch.device) -> dict[str, Tensor]:
@@ -87,12 +95,24 @@ class SceneState:
         for name, count in num_envs.items():
             if count != num_envs["body_pos"]:
                 raise StateError(f"SceneState.{name} holds {count} environments, body_pos {num_envs['body_pos']}")
+        if (
+            "variant" in tensors and device.type == "cpu"
+        ):  # a look at a GPU's numbers would wait for it; there the kernel asserts
+            _check_variants(tensors["variant"], inputs)
         return tensors
+
+
+def _check_variants(variant: Tensor, inputs: Inputs) -> None:
+    for i, (name, num) in enumerate(zip(inputs.objects, inputs.num_variants, strict=True)):
+        own = variant[:, i]
+        if ((own < 0) | (own >= num)).any():
+            found = sorted({int(v) for v in own.tolist() if not 0 <= v < num})
+            raise StateError(f"SceneState.variant of object {name} is {found[0]}, expected 0 to {num - 1}")
 
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
     """Return the shape that a field has for a module, after the leading `env`."""
-    sizes = {"body": len(inputs.bodies), "pair": len(inputs.pairs), "slot": inputs.slots}
+    sizes = {"body": len(inputs.bodies), "pair": len(inputs.pairs), "slot": inputs.slots, "object": len(inputs.objects)}
     return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
 
 
@@ -104,6 +124,9 @@ def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device)
         raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected})")
     if value.device != device:
         raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
-    if name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
+    if name == "variant":
+        if value.dtype not in (torch.int64, torch.int32):
+            raise StateError(f"SceneState.variant is {value.dtype}, expected torch.int64 or torch.int32")
+    elif name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
         raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
     return value

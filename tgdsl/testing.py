@@ -11,6 +11,7 @@ Shapes: `env` environments, `taxel` taxels, `channel` numbers per taxel.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,7 +27,7 @@ from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.geometry.reference import ReferenceBody, ReferenceGeom, Touch, touch
 from tgdsl.module import TactileModule
-from tgdsl.plan import Plan
+from tgdsl.plan import Plan, PlannedObject
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind, SensorSpec
 from tgdsl.state import SHAPES, SceneState
@@ -107,16 +108,17 @@ class ReferenceModule:
 
     def _touch(self, state: SceneState, env: int, shift: np.ndarray) -> Touch:
         inputs, query = self.plan.inputs, self.plan.queries[self.sensor.query]
+        answer = query.answers[self.sensor.answer]
         gated = {(pair.link, pair.object): i for i, pair in enumerate(inputs.pairs)}
         parts = []
         for i, link in enumerate(self.layout.links):
             own = self.layout.link_id == i
             objects: list[tuple[ReferenceBody, list[ReferenceGeom]] | None] = []
-            for target in (self.plan.objects[o] for o in query.objects):
+            for target in (self.plan.objects[query.objects[o]] for o in answer.objects):
                 pair = gated.get((link.body, target.name))
                 is_found = pair is not None and state.contact_found is not None and state.contact_found[env, pair] > 0
-                is_felt = target.body != link.body and (is_found or not query.is_gated)
-                geoms = self._geoms(target.name, target.shapes)
+                is_felt = target.body != link.body and (is_found or not answer.is_gated)
+                geoms = self._geoms(target, state, env)
                 objects.append((self._body(state, env, target.body, shift), geoms) if is_felt else None)
             body = self._body(state, env, link.body, np.zeros(3))
             parts.append(touch(body, self.layout.pos[own], self.layout.radius[own], objects))
@@ -130,9 +132,16 @@ class ReferenceModule:
         )
         return ReferenceBody(pos + shift, quat, linvel, angvel)
 
-    def _geoms(self, name: str, shapes: tuple[str, ...]) -> list[ReferenceGeom]:
-        size, pos, rotation = (self.plan.arrays[f"objects/{name}/{part}"] for part in ("size", "pos", "rotation"))
-        return [ReferenceGeom(shape, size[g], pos[g], rotation[g].reshape(3, 3)) for g, shape in enumerate(shapes)]
+    def _geoms(self, target: PlannedObject, state: SceneState, env: int) -> list[ReferenceGeom]:
+        variant, place = 0, self.plan.inputs.objects.index(target.name) if target.name in self.plan.inputs.objects else -1
+        if target.num_variants > 1 and state.variant is not None:
+            variant = int(state.variant[env, place])
+        size, pos, rotation = (self.plan.arrays[f"objects/{target.name}/{p}"][variant] for p in ("size", "pos", "rotation"))
+        if target.is_sized and state.object_size is not None:
+            size = state.object_size[env, place].double().numpy()[None].repeat(len(size), axis=0)
+        absent = self.plan.arrays.get(f"objects/{target.name}/is_absent", np.zeros((variant + 1, len(size))))[variant]
+        present = [g for g in range(len(size)) if not absent[g]]
+        return [ReferenceGeom(target.shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
 def full_scale_error(found: Tensor, expected: np.ndarray) -> np.ndarray:
@@ -331,7 +340,7 @@ class KindConformance:
 
         def readings(*values: Tensor) -> Tensor:
             module.reset()
-            result = module(SceneState(**{**dict(zip(names, values, strict=True)), "contact_found": state.contact_found}))
+            result = module(dataclasses.replace(state, **dict(zip(names, values, strict=True))))
             return result["s"]
 
         if self.is_differentiable:

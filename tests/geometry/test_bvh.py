@@ -127,7 +127,7 @@ def points_about(vertices, faces, seed=0, num=400):
 
 
 def ask(mesh, points, max_distance=float("inf"), dtype=torch.float64):
-    distance, gradient = nearest(torch.tensor(points, dtype=dtype).unbind(-1), mesh, max_distance)
+    distance, gradient = nearest(torch.tensor(points, dtype=dtype).unbind(-1), [mesh], max_distance)
     return distance.numpy(), torch.stack(gradient, dim=-1).numpy()
 
 
@@ -186,7 +186,7 @@ def test_backward_against_finite_differences():
     mesh = TriangleMesh(vertices, faces)
     points = points_about(vertices, faces, num=80)
     probe = torch.tensor(points, requires_grad=True)
-    distance, gradient = nearest(probe.unbind(-1), mesh, 0.1)
+    distance, gradient = nearest(probe.unbind(-1), [mesh], 0.1)
     assert not any(part.requires_grad for part in gradient)
     (analytic,) = torch.autograd.grad(distance.square().sum(), probe)
     step = 1e-7
@@ -204,7 +204,7 @@ def test_backward_against_finite_differences():
 def test_farther_than_the_reach():
     mesh = TriangleMesh(*cube())
     points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.021], [0.0, 0.0, torch.inf]], requires_grad=True)
-    distance, gradient = nearest(points.unbind(-1), mesh, 0.005)
+    distance, gradient = nearest(points.unbind(-1), [mesh], 0.005)
     distance.sum().backward()
     torch.testing.assert_close(distance, torch.tensor([0.005, -0.005, 0.001, 0.005]), rtol=0, atol=1e-6)
     assert torch.stack(gradient, dim=-1).tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 0]]
@@ -222,8 +222,8 @@ def test_nan():
 def test_batch_shapes(shape):
     mesh = TriangleMesh(*cube())
     points = 0.05 * torch.randn(*shape, 3, generator=torch.Generator().manual_seed(0))
-    distance, gradient = nearest(points.unbind(-1), mesh, 1.0)
-    flat, _ = nearest(points.reshape(-1, 3).unbind(-1), mesh, 1.0)
+    distance, gradient = nearest(points.unbind(-1), [mesh], 1.0)
+    flat, _ = nearest(points.reshape(-1, 3).unbind(-1), [mesh], 1.0)
     assert distance.shape == shape and all(part.shape == shape for part in gradient) and distance.dtype == torch.float32
     assert torch.equal(distance.reshape(-1), flat)
 
@@ -243,18 +243,31 @@ def test_copies_build_anew(copied):
 def test_freed_meshes_are_refused():
     mesh = TriangleMesh(*cube())
     key = mesh.key
-    point = torch.zeros(1, 3, dtype=torch.float64)
-    torch.ops.tgdsl.mesh_distance(point, key, 1.0)
+    point, which = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.int32)
+    torch.ops.tgdsl.mesh_distance(point, which, [key], 1.0)
     del mesh
     gc.collect()
     with pytest.raises(TgdslError, match="no longer exists; keep the TriangleMesh alive"):
-        torch.ops.tgdsl.mesh_distance(point, key, 1.0)
+        torch.ops.tgdsl.mesh_distance(point, which, [key], 1.0)
 
 
 def test_operator_contract():
-    mesh = TriangleMesh(*cube())
+    meshes = [TriangleMesh(*cube()), TriangleMesh(*cube())]
     point = 0.1 * torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    torch.library.opcheck(torch.ops.tgdsl.mesh_distance, (point.requires_grad_(), mesh.key, 1.0))
+    for which in (torch.zeros(0, dtype=torch.int32), torch.tensor([0, 1, 1, 0, 1], dtype=torch.int32)):
+        keys = [mesh.key for mesh in meshes[: 1 + len(which)]]
+        torch.library.opcheck(torch.ops.tgdsl.mesh_distance, (point.requires_grad_(), which, keys, 1.0))
+
+
+def test_each_point_asks_its_own_of_several_meshes():
+    meshes = [TriangleMesh(factor * cube()[0], cube()[1]) for factor in (1.0, 0.5, 2.0)]
+    points = 0.05 * torch.randn(4, 30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    which = torch.tensor([2, 0, 1, 2])
+    distance, gradient = nearest(points.unbind(-1), meshes, 1.0, which[:, None])
+    for row, mesh in enumerate(which.tolist()):
+        own, own_gradient = nearest(points[row].unbind(-1), [meshes[mesh]], 1.0)
+        assert torch.equal(distance[row], own)
+        assert torch.equal(torch.stack(gradient, -1)[row], torch.stack(own_gradient, -1))
 
 
 @pytest.mark.parametrize(
@@ -302,7 +315,7 @@ def test_compiled(monkeypatch):
     mesh = TriangleMesh(*icosphere())
 
     def depth(x, y, z):
-        distance, gradient = nearest((x, y, z), mesh, 0.04)
+        distance, gradient = nearest((x, y, z), [mesh], 0.04)
         return torch.relu(0.01 - distance) * gradient[2], distance
 
     compiled = torch.compile(depth, fullgraph=True, dynamic=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tgdsl.geometry.grid import Grid, tricubic, trilinear
+from tgdsl.geometry.grid import Grid, one_grid, tricubic, trilinear
 
 METHODS = {"trilinear": trilinear, "tricubic": tricubic}
 ORDER = {"trilinear": 2, "tricubic": 3}
@@ -17,7 +17,12 @@ ORIGIN = np.array([-0.01, 0.002, 0.005])
 
 def grid_of(function, shape=SHAPE, cell=CELL, origin=ORIGIN, dtype=torch.float64) -> Grid:
     nodes = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * cell + origin
-    return Grid(torch.tensor(function(nodes), dtype=dtype), torch.tensor(origin, dtype=dtype), torch.tensor(cell, dtype=dtype))
+    values = torch.tensor(function(nodes), dtype=dtype)
+    return one_grid(values, torch.tensor(origin, dtype=dtype), torch.tensor(cell, dtype=dtype))
+
+
+def in_dtype(grid: Grid, dtype: torch.dtype) -> Grid:
+    return grid._replace(values=grid.values.to(dtype), origin=tuple(o.to(dtype) for o in grid.origin), cell=grid.cell.to(dtype))
 
 
 def ask(method: str, grid: Grid, points: np.ndarray, dtype=torch.float64):
@@ -82,7 +87,7 @@ def test_convergence_order_on_a_sphere(method):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_gradient_is_a_unit_vector_everywhere(method, dtype, rough):
     points = np.concatenate([points_in(500), points_in(500) * 3 - 0.02, points_in(5) * 1e8, points_in(5) * np.inf])
-    grid = Grid(*(part.to(dtype) for part in rough))
+    grid = in_dtype(rough, dtype)
     distance, gradient = ask(method, grid, points, dtype)
     assert np.isfinite(distance).all()
     np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-5)
@@ -145,7 +150,7 @@ def test_outside_reads_no_less_than_the_true_distance(method):
 def test_what_is_not_a_number(method, dtype, rough):
     inside = points_in(1)[0]
     table = np.array([np.where(mask, bad, inside) for bad in (np.nan, np.inf, -np.inf) for mask in np.eye(3, dtype=bool)])
-    distance, gradient = ask(method, Grid(*(part.to(dtype) for part in rough)), table, dtype)
+    distance, gradient = ask(method, in_dtype(rough, dtype), table, dtype)
     np.testing.assert_array_equal(np.isnan(distance), [True] * 3 + [False] * 6)
     assert (distance[3:] >= 1e15 * (1 - 1e-6)).all()
     assert (np.sign(gradient[3:]) * np.concatenate([np.eye(3), -np.eye(3)])).sum(axis=1).min() == 1
@@ -158,7 +163,7 @@ def test_float32_differs_by_roundings(method):
     grid = grid_of(lambda nodes: np.linalg.norm(nodes - 0.01, axis=-1))
     points = points_in(1000)
     double, _ = ask(method, grid, points)
-    single, _ = ask(method, Grid(*(part.float() for part in grid)), points, torch.float32)
+    single, _ = ask(method, in_dtype(grid, torch.float32), points, torch.float32)
     assert np.abs(single - double).max() < 1e-7
 
 
@@ -171,13 +176,41 @@ def test_planes_broadcast(method, rough):
     assert distance[2, 1, 3] == alone
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_each_point_asks_its_own_of_several_grids(method):
+    """Grids of different sizes, places and cells in one table give what each gives alone."""
+    balls = [
+        grid_of(lambda nodes, r=r: np.linalg.norm(nodes - 0.01, axis=-1) - r, shape, cell, origin)
+        for r, shape, cell, origin in (
+            (0.004, (6, 7, 8), 0.003, ORIGIN),
+            (0.006, (9, 5, 4), 0.004, ORIGIN + 0.002),
+            (0.002, (4, 4, 12), 0.002, ORIGIN - 0.001),
+        )
+    ]
+    which = torch.arange(300) % 3
+    first = torch.tensor([0, *np.cumsum([len(ball.values) for ball in balls])[:-1]])
+    table = Grid(
+        values=torch.cat([ball.values for ball in balls]),
+        first=first[which],
+        num=tuple(torch.stack(part)[which] for part in zip(*(ball.num for ball in balls), strict=True)),
+        origin=tuple(torch.stack(part)[which] for part in zip(*(ball.origin for ball in balls), strict=True)),
+        cell=torch.stack([ball.cell for ball in balls])[which],
+    )
+    points = points_in(300, rim=-2)
+    distance, gradient = ask(method, table, points)
+    for i, ball in enumerate(balls):
+        own, own_gradient = ask(method, ball, points[i::3])
+        np.testing.assert_array_equal(distance[i::3], own)
+        np.testing.assert_array_equal(gradient[i::3], own_gradient)
+
+
 COMPILE = """
 import sys
 import torch
 from tgdsl.geometry import grid as grids
 torch.manual_seed(0)
 method = getattr(grids, sys.argv[1])
-grid = grids.Grid(torch.rand(6, 7, 8).double(), torch.zeros(3).double(), torch.tensor(0.15).double())
+grid = grids.one_grid(torch.rand(6, 7, 8).double(), torch.zeros(3).double(), torch.tensor(0.15).double())
 compiled = torch.compile(method, fullgraph=True, dynamic=True)
 for count in (300, 7, 1000):
     point = tuple(torch.rand(count, 3).double().mul(2).sub(0.4).T.contiguous().unbind())

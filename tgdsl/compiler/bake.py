@@ -28,7 +28,7 @@ from jaxtyping import Float
 
 from tgdsl.compiler.solid import Lattice, Solid
 from tgdsl.errors import BakeError
-from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.surface import Surface
 
 FORMAT = b"tgdsl grid 2"
@@ -218,7 +218,7 @@ def _choose(solid: Solid, points: _Points, margin: float, tolerance: float, budg
 
 def _errors(points: _Points, values: np.ndarray, lattice: Lattice, method: str, percentile: float = 99.0) -> Errors:
     """Return the errors of a grid, in float64, at points all of whose nodes are there."""
-    grid = Grid(torch.from_numpy(values), torch.from_numpy(lattice.origin), torch.tensor(lattice.cell, dtype=torch.float64))
+    grid = one_grid(torch.from_numpy(values), torch.from_numpy(lattice.origin), torch.tensor(lattice.cell, dtype=torch.float64))
     x, y, z = (torch.from_numpy(np.ascontiguousarray(part)) for part in points.pos.T)
     distance, gradient = METHODS[method]((x, y, z), grid)
     error = np.abs(distance.numpy() - points.distance)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import igl
@@ -15,7 +15,7 @@ from tgdsl.compiler.bake import bake
 from tgdsl.compiler.robot import Geom, Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.geometry.surface import Surface
-from tgdsl.schema.document import ObjectSpec
+from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
 from tgdsl.schema.select import matching
 
 HULL_POINTS = 2000
@@ -59,9 +59,46 @@ class Settled:
     accuracy: Mapping[str, float]
 
 
-def felt_geoms(target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
-    """Return the geoms that are felt of an object: those that collide, those that are seen, or those named."""
-    geoms = _chosen(target, scene, report)
+@dataclass(frozen=True, eq=False)
+class FeltBody:
+    """An object that can be felt.
+
+    Attributes:
+        body: Its body.
+        variants: The geoms that can be felt of each of its variants; of a single one if it is the same everywhere.
+        is_sized: Whether the size of its geom is part of the state.
+    """
+
+    body: str
+    variants: tuple[tuple[FeltGeom, ...], ...]
+    is_sized: bool
+
+
+def felt_body(target: ObjectSpec, scenes: Sequence[tuple[Model, tuple[str, ...]]], report: Report) -> FeltBody:
+    """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its variants' own.
+
+    Args:
+        target: What the document says of it.
+        scenes: The scene; or, if it has variants, the scene with each of them and the names of the variant's geoms.
+        report: Called with mistakes.
+    """
+    variants = []
+    for scene, names in scenes:
+        own = tuple(geom for geom in scene.geoms if geom.name in names)
+        geoms = _chosen(target, scene, report) if target.variants is None else own
+        variants.append(_felt(geoms, target, scene, report))
+    if target.size == "per_env":
+        own = [geom for geom in scenes[0][0].geoms if geom.body == target.body]
+        for felt in [own] if target.variants is None else variants:
+            if len(felt) != 1 or felt[0].shape not in NUM_SIZES:
+                found = ", ".join(geom.shape for geom in felt)
+                hint = f"primitives: {', '.join(NUM_SIZES)}"
+                report(f'with `size: per_env` the body "{target.body}" has one geom, a primitive; found {found}', hint)
+                break
+    return FeltBody(target.body, tuple(variants), target.size == "per_env")
+
+
+def _felt(geoms: Sequence[Geom], target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
     felt = []
     for geom in geoms:
         if geom.shape == "mesh":

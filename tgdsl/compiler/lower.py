@@ -42,10 +42,10 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
     _settle(loaded, work)
     loaded.raise_problems()
-    queries, query_of = passes.share(work)
+    queries, answer_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
-    sensors = tuple(_sensor(part, query_of[part.name], arrays) for part in work.sensors)
+    sensors = tuple(_sensor(part, answer_of[part.name], arrays) for part in work.sensors)
     terms = _observations(loaded, resolved, work, sensors, arrays)
     loaded.raise_problems()
     return Plan(
@@ -65,21 +65,23 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
 
 def _settle(loaded: Loaded, work: Draft) -> None:
     """Decide how the distance to each geom is found; a mesh that no grid within its budget suits is a mistake."""
-    for name, geoms in work.objects.items():
+    for name, felt in work.objects.items():
         target = loaded.spec.objects[name]
+        margin = passes.margin(work, name)
         try:
-            work.settled[name] = tuple(settle(felt, target, passes.margin(work, name), name) for felt in geoms)
+            work.settled[name] = tuple(tuple(settle(geom, target, margin, name) for geom in geoms) for geoms in felt.variants)
         except BakeError as error:
             loaded.problems.append(loaded.problem(("objects", name), str(error)))
 
 
-def _sensor(part: DraftSensor, query: int, arrays: dict[str, np.ndarray]) -> PlannedSensor:
+def _sensor(part: DraftSensor, place: tuple[int, int], arrays: dict[str, np.ndarray]) -> PlannedSensor:
     for name, value in part.lowered.constants.items():
         arrays[f"sensors/{part.name}/{name}"] = value
     return PlannedSensor(
         name=part.name,
         kind=part.kind,
-        query=query,
+        query=place[0],
+        answer=place[1],
         channels=tuple(channel.name for channel in part.lowered.channels),
         units=tuple(channel.unit for channel in part.lowered.channels),
         constants=tuple(sorted(part.lowered.constants)),

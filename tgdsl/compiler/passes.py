@@ -1,7 +1,8 @@
 """The passes from lowered sensors to packed arrays: prune, share, fold, pack.
 
-`prune` drops pairs that can never meet, `share` lets sensors with the same probes, objects and gate share one query, `fold`
-turns geom poses and inactive probes into constants, `pack` numbers bodies and pairs and writes the index tables.
+`prune` drops pairs that can never meet, `share` lets sensors with the same probes share one query, and those with the same
+objects and gate one answer, `fold` turns geom poses and inactive probes into constants, `pack` numbers bodies and pairs and
+writes the index tables.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltGeom, Settled
+from tgdsl.compiler.felt import FeltBody, FeltGeom, Settled
 from tgdsl.compiler.robot import Model
+from tgdsl.compiler.variants import aligned
 from tgdsl.layout import Layout
-from tgdsl.plan import Inputs, Pair, PlannedObject, PlannedQuery
+from tgdsl.plan import Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
 from tgdsl.sensors.base import Lowered
 
 
@@ -38,20 +40,20 @@ class Draft:
     Attributes:
         layout: Taxels of all sensors.
         sensors: The sensors.
-        objects: Geoms of each object that some sensor feels.
+        objects: What is felt of each object that some sensor feels.
         scene: The model that says what can collide.
         dropped: What is not needed, and why; the passes add to it.
-        settled: How the distance to each geom is found; set once the sensors' ranges are known.
+        settled: How the distance to each geom of each variant is found; set once the sensors' ranges are known.
         pairs: The (link body, object) pairs that are needed, sorted by object and link; set by `prune`.
         gated: Those of them whose contacts are needed.
     """
 
     layout: Layout
     sensors: Sequence[DraftSensor]
-    objects: dict[str, tuple[FeltGeom, ...]]
+    objects: dict[str, FeltBody]
     scene: Model
     dropped: list[tuple[str, str]]
-    settled: dict[str, tuple[Settled, ...]] = field(default_factory=dict)
+    settled: dict[str, tuple[tuple[Settled, ...], ...]] = field(default_factory=dict)
     pairs: list[Pair] = field(default_factory=list)
     gated: list[Pair] = field(default_factory=list)
 
@@ -62,12 +64,10 @@ class Draft:
 
 @dataclass(eq=False)
 class DraftQuery:
-    """A query and what is needed to pack it."""
+    """A query and what is needed to pack it: the answers' objects and gates, and what is needed of each."""
 
     taxels: np.ndarray
-    objects: tuple[str, ...]
-    is_gated: bool
-    needs: set[str]
+    answers: dict[tuple[tuple[str, ...], bool], set[str]] = field(default_factory=dict)
     planned: PlannedQuery = field(init=False)
 
 
@@ -86,10 +86,10 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
         for target in sensor.feels:
             pairs = {Pair(body, target) for body in bodies}
             if sensor.is_gated:
-                apart = {p for p in pairs if not work.scene.can_meet(p.link, work.objects[target][0].geom.body)}
+                apart = {p for p in pairs if not work.scene.can_meet(p.link, work.objects[target].body)}
                 gated |= pairs - apart
             else:
-                apart = {p for p in pairs if p.link == work.objects[target][0].geom.body}
+                apart = {p for p in pairs if p.link == work.objects[target].body}
             wanted |= pairs - apart
             never |= apart
             if apart == pairs:
@@ -105,16 +105,16 @@ def _order(pair: Pair) -> tuple[str, str]:
     return pair.object, pair.link
 
 
-def share(work: Draft) -> tuple[list[DraftQuery], dict[str, int]]:
-    """Return the distinct queries, and which of them each sensor uses."""
-    queries: dict[tuple, DraftQuery] = {}
-    query_of: dict[str, int] = {}
+def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
+    """Return the distinct queries, and which of them, and which answer of it, each sensor uses."""
+    queries: dict[bytes, DraftQuery] = {}
+    answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
-        key = (sensor.taxels.tobytes(), sensor.feels, sensor.is_gated)
-        query = queries.setdefault(key, DraftQuery(sensor.taxels, sensor.feels, sensor.is_gated, set()))
-        query.needs |= sensor.lowered.needs
-        query_of[sensor.name] = list(queries).index(key)
-    return list(queries.values()), query_of
+        probes, view = sensor.taxels.tobytes(), (sensor.feels, sensor.is_gated)
+        query = queries.setdefault(probes, DraftQuery(sensor.taxels))
+        query.answers.setdefault(view, set()).update(sensor.lowered.needs)
+        answer_of[sensor.name] = list(queries).index(probes), list(query.answers).index(view)
+    return list(queries.values()), answer_of
 
 
 def margin(work: Draft, name: str) -> float:
@@ -128,19 +128,54 @@ def fold(work: Draft) -> dict[str, np.ndarray]:
     layout = work.layout
     fields = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
     arrays = {f"layout/{name}": getattr(layout, name) for name in fields}
-    for name, geoms in work.objects.items():
-        arrays[f"objects/{name}/size"] = np.stack([felt.geom.size for felt in geoms])
-        arrays[f"objects/{name}/pos"] = np.stack([felt.geom.pos for felt in geoms])
-        arrays[f"objects/{name}/rotation"] = np.stack([felt.geom.rotation.reshape(9) for felt in geoms])
-        for i, settled in enumerate(work.settled[name]):
-            arrays |= {f"objects/{name}/{i}/{key}": value for key, value in settled.arrays.items()}
+    for name in work.objects:
+        _, rows = _geoms(work, name)
+        for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):
+            felt = [[absent if part is None else getattr(part[0].geom, key) for part in row] for row in rows]
+            arrays[f"objects/{name}/{key}"] = np.array(felt).reshape(len(rows), len(rows[0]), -1)
+        if len(rows) > 1:
+            arrays[f"objects/{name}/is_absent"] = np.array([[part is None for part in row] for row in rows])
+        for i, column in enumerate(zip(*rows, strict=True)):
+            arrays |= {f"objects/{name}/{i}/{key}": value for key, value in _surfaces(column).items()}
     return arrays
+
+
+Placed = tuple[FeltGeom, Settled]
+
+
+def _geoms(work: Draft, name: str) -> tuple[tuple[str, ...], list[list[Placed | None]]]:
+    """Return how the distance to each geom of an object is found, and the geoms that its variants have there."""
+    settled = work.settled[name]
+    shapes, tables = aligned([[part.shape for part in variant] for variant in settled])
+    parts = [list(zip(*pair, strict=True)) for pair in zip(work.objects[name].variants, settled, strict=True)]
+    return shapes, [[None if i is None else own[i] for i in table] for own, table in zip(parts, tables, strict=True)]
+
+
+def _surfaces(column: Sequence[Placed | None]) -> dict[str, np.ndarray]:
+    """Return the arrays of a geom's grids or triangles, variant after variant; one that lacks it has another's."""
+    like = next(part[1].arrays for part in column if part is not None)
+    owned = [like if part is None else part[1].arrays for part in column]
+    if "vertices" in like:
+        triangles = {f"{v}/{key}": own[key] for v, own in enumerate(owned) for key in ("vertices", "faces")}
+        return {**triangles, "max_distance": like["max_distance"]}
+    if "values" not in like:
+        return {}
+    distinct = list({id(own): own for own in owned}.values())
+    place = [next(i for i, own in enumerate(distinct) if own is found) for found in owned]
+    starts = np.cumsum([0, *(own["values"].size for own in distinct)])
+    return {
+        "values": np.concatenate([own["values"].reshape(-1) for own in distinct]),
+        "first": starts[place],
+        "num": np.array([own["values"].shape for own in owned]),
+        "origin": np.array([own["origin"] for own in owned]),
+        "cell": np.array([own["cell"] for own in owned]),
+    }
 
 
 def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarray]) -> tuple[tuple[PlannedObject, ...], Inputs]:
     """Number bodies, pairs and objects, and write the index tables of pairs and queries into the arrays."""
     names = sorted({pair.object for pair in work.pairs})
-    body_of = {name: work.objects[name][0].geom.body for name in names}
+    body_of = {name: work.objects[name].body for name in names}
     bodies = sorted({pair.link for pair in work.pairs} | set(body_of.values()))
     objects = tuple(_object(work, name) for name in names)
     gate = {pair: i for i, pair in enumerate(work.gated)}
@@ -149,49 +184,56 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
     arrays["pairs/gate"] = np.array([gate.get(pair, 0) for pair in work.pairs], dtype=np.int64)
     for i, query in enumerate(queries):
         _pack_query(work, query, names, i, arrays)
-    needs = {need for query in queries for need in query.needs}
+    needs = {need for query in queries for own in query.answers.values() for need in own}
+    varied = [target for target in objects if target.is_sized or target.num_variants > 1]
     fields = ["body_pos", "body_quat"]
     fields += ["body_linvel", "body_angvel"] if "motion" in needs else []
     fields += ["contact_found"] if work.gated else []
-    inputs = Inputs(tuple(fields), tuple(bodies), tuple(work.gated), {p.object: body_of[p.object] for p in work.gated}, 0)
+    fields += ["variant"] if any(target.num_variants > 1 for target in varied) else []
+    fields += ["object_size"] if any(target.is_sized for target in varied) else []
+    inputs = Inputs(
+        fields=tuple(fields),
+        bodies=tuple(bodies),
+        pairs=tuple(work.gated),
+        bodies_of={pair.object: body_of[pair.object] for pair in work.gated},
+        slots=0,
+        objects=tuple(target.name for target in varied),
+        num_variants=tuple(target.num_variants for target in varied),
+    )
     return objects, inputs
 
 
 def _object(work: Draft, name: str) -> PlannedObject:
-    geoms = work.objects[name]
+    shapes, rows = _geoms(work, name)
     own = [i for i, pair in enumerate(work.pairs) if pair.object == name]
     return PlannedObject(
         name=name,
-        body=geoms[0].geom.body,
-        shapes=tuple(settled.shape for settled in work.settled[name]),
-        is_centred=tuple(bool(not f.geom.pos.any() and np.array_equal(f.geom.rotation, np.eye(3))) for f in geoms),
+        body=work.objects[name].body,
+        shapes=shapes,
+        is_centred=tuple(all(part is None or part[0].geom.is_centred for part in column) for column in zip(*rows, strict=True)),
         first_pair=own[0],
         num_pairs=len(own),
-        accuracy=tuple(dict(settled.accuracy) for settled in work.settled[name]),
+        accuracy=tuple(tuple({} if part is None else dict(part[1].accuracy) for part in row) for row in rows),
+        is_sized=work.objects[name].is_sized,
     )
 
 
 def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays: dict[str, np.ndarray]) -> None:
-    felt = [name for name in query.objects if name in names]
+    felt = [name for name in dict.fromkeys(name for objects, _ in query.answers for name in objects) if name in names]
     bodies = work.bodies_of(query.taxels)
-    radius = work.layout.radius[query.taxels]
-    reach = np.full((len(felt), len(bodies)), -np.inf)
-    index = np.zeros((len(felt), len(bodies)), dtype=np.int64)
-    allowed = set(work.gated if query.is_gated else work.pairs)
-    for row, name in enumerate(felt):
-        own = [pair for pair in work.pairs if pair.object == name]
-        for column, body in enumerate(bodies):
-            pair = Pair(body, name)
-            if pair in allowed:
-                index[row, column] = own.index(pair)
-                reach[row, column] = radius[column] if radius[column] > 0 else -np.inf
+    own = {name: [pair for pair in work.pairs if pair.object == name] for name in felt}
+    pairs = {name: [Pair(body, name) for body in bodies] for name in felt}
+    index = [[own[name].index(pair) if pair in own[name] else 0 for pair in pairs[name]] for name in felt]
     arrays[f"queries/{i}/taxels"] = query.taxels
     arrays[f"queries/{i}/pos"] = work.layout.pos[query.taxels].T
-    arrays[f"queries/{i}/reach"] = reach
-    arrays[f"queries/{i}/pair"] = index
-    query.planned = PlannedQuery(
-        objects=tuple(names.index(name) for name in felt),
-        is_gated=query.is_gated,
-        needs=tuple(sorted(query.needs)),
-        num_taxels=len(bodies),
-    )
+    arrays[f"queries/{i}/pair"] = np.array(index, dtype=np.int64).reshape(len(felt), len(bodies))
+    radius = work.layout.radius[query.taxels]
+    answers = []
+    for a, ((objects, is_gated), needs) in enumerate(query.answers.items()):
+        chosen = [name for name in objects if name in names]
+        allowed = set(work.gated if is_gated else work.pairs)
+        can_meet = np.array([[pair in allowed for pair in pairs[name]] for name in chosen], dtype=bool)
+        is_felt = can_meet.reshape(len(chosen), len(bodies)) & (radius > 0)
+        arrays[f"queries/{i}/{a}/reach"] = np.where(is_felt, radius, -np.inf)
+        answers.append(PlannedAnswer(tuple(felt.index(name) for name in chosen), is_gated, tuple(sorted(needs))))
+    query.planned = PlannedQuery(tuple(names.index(name) for name in felt), len(bodies), tuple(answers))

@@ -59,6 +59,11 @@ class Geom:
     is_colliding: bool
 
     @property
+    def is_centred(self) -> bool:
+        """Whether its frame is the body's."""
+        return not self.pos.any() and np.array_equal(self.rotation, np.eye(3))
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The names that a selector can find it by."""
         return tuple(name for name in (self.name, self.mesh) if name)

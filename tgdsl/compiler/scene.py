@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 
 from tgdsl.compiler.robot import Model
+from tgdsl.compiler.variants import Meshes
 from tgdsl.errors import RobotError
-from tgdsl.plan import Asset, Inputs, SceneFile, contact_sensor_names
+from tgdsl.plan import Asset, Inputs, SceneFile, SceneObject, contact_sensor_names
 from tgdsl.scene import compiled, portable
 
 SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
@@ -105,8 +106,8 @@ def _contact_sensors(inputs: Inputs) -> Iterator[tuple[str, str, str, tuple[str,
             yield net, inputs.bodies_of[pair.object], pair.link, ("found", "force"), "netforce", 1
 
 
-def scene_file(model: Model, inputs: Inputs) -> SceneFile:
-    """Return a scene with the contact sensors that a module wants, as text.
+def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = (), meshes: Meshes | None = None) -> SceneFile:
+    """Return a scene with the contact sensors that a module wants, as text, and the objects that vary with their meshes.
 
     The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
     the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
@@ -115,6 +116,10 @@ def scene_file(model: Model, inputs: Inputs) -> SceneFile:
         RobotError: If a file cannot be found, or what is kept is not what was loaded.
     """
     kept = _Kept()
+    if meshes is not None:
+        named = {geom.mesh for target in objects for geoms in target.variants for geom in geoms if geom is not None}
+        kept.assets |= {key: asset for key, asset in meshes.assets.items() if key in named}
+        kept.contents |= meshes.contents
     if model.is_urdf:
         main = kept.rewritten(ET.fromstring(model.spec.to_xml()), model.file, [model.file.parent])
     else:
@@ -127,6 +132,7 @@ def scene_file(model: Model, inputs: Inputs) -> SceneFile:
         mjcf=ET.tostring(main, encoding="unicode"),
         parts=dict(sorted(kept.parts.items())),
         assets=tuple(sorted(kept.assets.values(), key=lambda asset: asset.key)),
+        objects=objects,
     )
     try:
         again = compiled(scene, kept.contents)

@@ -21,7 +21,7 @@ import contextlib
 import functools
 import itertools
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, no_type_check
 
 import numpy as np
@@ -90,65 +90,72 @@ class TriangleMesh:
             wp.synchronize_device(device)
         return self._built[str(device)]
 
-    def _launch(self, point: Tensor, max_distance: float, distance: Tensor, gradient: Tensor) -> None:
+    def _launch(self, point: Tensor, own: int, which: Tensor, max_distance: float, out: tuple[Tensor, Tensor]) -> None:
+        """Write distance and gradient of the points whose `which` is `own`; of all if `which` is empty."""
         with _quiet() as wp:
             mesh, corners, boxes, faces = self._on(wp.device_from_torch(point.device))
             inputs = [mesh.id, corners, boxes.id if boxes else 0, faces, wp.vec3d(*self._middle), wp.vec3d(*self._half)]
-            inputs += [max_distance, wp.from_torch(point, dtype=wp.vec3d), wp.from_torch(distance, dtype=wp.float64)]
-            inputs += [wp.from_torch(gradient, dtype=wp.vec3d)]
+            inputs += [max_distance, own, wp.from_torch(which, dtype=wp.int32), wp.from_torch(point, dtype=wp.vec3d)]
+            inputs += [wp.from_torch(out[0], dtype=wp.float64), wp.from_torch(out[1], dtype=wp.vec3d)]
             stream = wp.stream_from_torch(point.device) if point.is_cuda else None
             wp.launch(_kernel(wp), dim=len(point), inputs=inputs, device=mesh.device, stream=stream)
 
 
-_SCHEMA = "(Tensor point, int key, float max_distance) -> (Tensor, Tensor)"
+_SCHEMA = "(Tensor point, Tensor which, int[] keys, float max_distance) -> (Tensor, Tensor)"
 _KEYS = itertools.count()
 _MESHES: weakref.WeakValueDictionary[int, TriangleMesh] = weakref.WeakValueDictionary()
 
 
-def nearest(point: Vec, mesh: TriangleMesh, max_distance: float) -> tuple[Tensor, Vec]:
+def nearest(
+    point: Vec, meshes: Sequence[TriangleMesh], max_distance: float, which: Int[Tensor, ...] | None = None
+) -> tuple[Tensor, Vec]:
     """Return the signed distance [m] of points to a mesh, negative inside, and its outward unit gradient.
 
     The derivative of the distance is the gradient; the gradient itself has none.
 
     Args:
         point: Positions in the mesh's frame [m], planes of one shape.
-        mesh: The mesh.
+        meshes: The mesh, or several of which each point asks one.
         max_distance: Points farther than this [m] read it, negative if inside; their gradient is (1, 0, 0), and the
             derivative 0. NaN points read NaN.
+        which: Which mesh each point asks, broadcast with the points; only if there are several.
     """
     stacked = torch.stack(point, dim=-1)
     flat = stacked.reshape(-1, 3).to(torch.float64).contiguous()
-    distance, gradient = torch.ops.tgdsl.mesh_distance(flat, mesh.key, max_distance)
+    chosen = flat.new_empty(0) if which is None else which.expand(point[0].shape).reshape(-1)
+    keys = [mesh.key for mesh in meshes]
+    distance, gradient = torch.ops.tgdsl.mesh_distance(flat, chosen.to(torch.int32), keys, max_distance)
     return distance.to(stacked.dtype).reshape(point[0].shape), split(gradient.to(stacked.dtype).reshape(stacked.shape))
 
 
 @torch.library.custom_op("tgdsl::mesh_distance", mutates_args=(), schema=_SCHEMA)
-def mesh_distance(point: Tensor, key: int, max_distance: float) -> tuple[Tensor, Tensor]:
-    """Return distances (n,) and gradients (n, 3) of float64 points (n, 3); the mesh goes by its key."""
-    mesh = _MESHES.get(key)
-    if mesh is None:
-        raise TgdslError("this function was compiled with a mesh that no longer exists; keep the TriangleMesh alive")
-    distance, gradient = _empty(point, key, max_distance)
-    if len(point):
-        mesh._launch(point.detach().contiguous(), max_distance, distance, gradient)
-    return distance, gradient
+def mesh_distance(point: Tensor, which: Tensor, keys: list[int], max_distance: float) -> tuple[Tensor, Tensor]:
+    """Return distances (n,) and gradients (n, 3) of float64 points (n, 3); the meshes go by their keys."""
+    out = _empty(point, which, keys, max_distance)
+    for own, key in enumerate(keys):
+        mesh = _MESHES.get(key)
+        if mesh is None:
+            raise TgdslError("this function was compiled with a mesh that no longer exists; keep the TriangleMesh alive")
+        if len(point):
+            mesh._launch(point.detach().contiguous(), own, which.contiguous(), max_distance, out)
+    return out
 
 
 @mesh_distance.register_fake
-def _empty(point: Tensor, key: int, max_distance: float) -> tuple[Tensor, Tensor]:
+def _empty(point: Tensor, which: Tensor, keys: list[int], max_distance: float) -> tuple[Tensor, Tensor]:
     return point.new_empty(point.shape[0]), point.new_empty(point.shape)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
     ctx.mark_non_differentiable(output[1])
     ctx.save_for_backward(*output)
-    ctx.max_distance = inputs[2]
+    ctx.max_distance = inputs[3]
 
 
-def _backward(ctx: Any, of_distance: Tensor, of_gradient: Tensor | None) -> tuple[Tensor, None, None]:
+def _backward(ctx: Any, of_distance: Tensor, of_gradient: Tensor | None) -> tuple[Tensor, None, None, None]:
     distance, gradient = ctx.saved_tensors
     is_near = distance.abs() != ctx.max_distance  # not <: NaN stays NaN
-    return torch.where(is_near, of_distance, 0.0)[:, None] * gradient, None, None
+    return torch.where(is_near, of_distance, 0.0)[:, None] * gradient, None, None, None
 
 
 mesh_distance.register_autograd(_backward, setup_context=_save)
@@ -254,11 +261,14 @@ def _kernel(wp: Any) -> Any:
     @wp.kernel(enable_backward=False)
     def query(
         mesh: wp.uint64, corners: wp.array(dtype=wp.vec3d), boxes: wp.uint64, faces: wp.array(dtype=wp.int32),
-        middle: wp.vec3d, half: wp.vec3d, max_distance: wp.float64,
+        middle: wp.vec3d, half: wp.vec3d, max_distance: wp.float64, own: wp.int32, which: wp.array(dtype=wp.int32),
         points: wp.array(dtype=wp.vec3d), distance: wp.array(dtype=wp.float64), gradient: wp.array(dtype=wp.vec3d),
     ):
         # fmt: on
         i = wp.tid()
+        if which.shape[0] > 0:  # noqa: SIM102 (both sides of Warp's `and` are evaluated)
+            if which[i] != own:
+                return
         p = points[i] - middle
         size, zero, one = wp.float64(2.0) * wp.length(half), wp.float64(0.0), wp.float64(1.0)
         face, away = nearest_face(mesh, corners, boxes, faces, p, size, max_distance)

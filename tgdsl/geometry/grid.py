@@ -4,7 +4,7 @@ A point outside the grid reads the value at the nearest point of the grid's box 
 inequality that is never less than the true distance, nor less than the way to the box: far points read far. A point that is
 not a number reads NaN and has a fixed gradient; one at infinity counts as `FAR` away from the box along that axis.
 
-Shapes: `x`, `y`, `z` nodes along the axes, two or more each.
+Shapes: `node` nodes of all grids; `x`, `y`, `z` nodes of one along the axes, two or more each; `...` broadcasts with points.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.geometry.planes import Vec, length_and_direction, vec
+from tgdsl.geometry.planes import Vec, length_and_direction, split, vec
 
 FAR = 1e15
 """The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
@@ -28,17 +28,27 @@ Weights = Callable[[Tensor], Nodes]
 
 
 class Grid(NamedTuple):
-    """Signed distance at the nodes of a grid, negative inside.
+    """Signed distance at the nodes of a grid, negative inside; or of several, of which each point asks one.
 
     Attributes:
-        values: Signed distance at the nodes [m].
-        origin: Place of node (0, 0, 0) in the geom's frame [m].
-        cell: Spacing of the nodes [m], alike along all axes.
+        values: Signed distance at the nodes [m], grid after grid, z running fastest.
+        first: Index of a point's grid's node (0, 0, 0).
+        num: Number of its nodes along each axis.
+        origin: Place of its node (0, 0, 0) in the geom's frame [m].
+        cell: Spacing of its nodes [m], alike along all axes.
     """
 
-    values: Float[Tensor, "x y z"]
-    origin: Float[Tensor, " 3"]
-    cell: Float[Tensor, ""]
+    values: Float[Tensor, " node"]
+    first: Int[Tensor, ...]
+    num: tuple[Int[Tensor, ...], Int[Tensor, ...], Int[Tensor, ...]]
+    origin: Vec
+    cell: Float[Tensor, ...]
+
+
+def one_grid(values: Float[Tensor, "x y z"], origin: Float[Tensor, " 3"], cell: Float[Tensor, ""]) -> Grid:
+    """Return one grid, from its values at the nodes [m], the place of node (0, 0, 0) [m] and the spacing [m]."""
+    x, y, z = (torch.tensor(num, device=values.device) for num in values.shape)
+    return Grid(values.reshape(-1), torch.zeros_like(x), (x, y, z), split(origin), cell)
 
 
 def trilinear(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
@@ -82,12 +92,12 @@ def _cubic_weights(t: Tensor) -> Nodes:
 
 def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[Tensor, Vec]:
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
-    place = [(part - grid.origin[axis]) / grid.cell for axis, part in enumerate(point)]
-    inside = [part.clamp(0, num - 1) for part, num in zip(place, grid.values.shape, strict=True)]
+    place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
+    inside = [torch.minimum(part.clamp(min=0), (num - 1).to(part.dtype)) for part, num in zip(place, grid.num, strict=True)]
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
-    lower = vec(part.floor().long().clamp(0, num - 2) for part, num in zip(inside, grid.values.shape, strict=True))
+    lower = vec(_within(part.floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
-    value, *slopes = _sum_over_nodes(grid.values, lower, (along_x, along_y, along_z), first)
+    value, *slopes = _sum_over_nodes(grid, lower, (along_x, along_y, along_z), first)
     way, direction = length_and_direction(
         vec(((part - near) * grid.cell).clamp(-FAR, FAR) for part, near in zip(place, inside, strict=True))
     )
@@ -101,22 +111,26 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     return distance, gradient
 
 
+def _within(index: Tensor, last: Tensor) -> Tensor:
+    return torch.minimum(index.clamp(min=0), last)
+
+
 def _sum_over_nodes(
-    values: Tensor, lower: Vec, along: tuple[Nodes, Nodes, Nodes], first: int
+    grid: Grid, lower: Vec, along: tuple[Nodes, Nodes, Nodes], first: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the weighted sum [m] and its derivatives along the axes [m per cell], one axis after the other."""
-    flat = values.reshape(-1)
-    num_x, num_y, num_z = values.shape
-    strides = (num_y * num_z, num_z, 1)
+    _, num_y, num_z = grid.num
+    strides = (num_y * num_z, num_z, torch.ones_like(num_z))
     index = [
-        [(corner + first + k).clamp(0, num - 1) * stride for k in range(len(nodes))]
-        for corner, nodes, num, stride in zip(lower, along, (num_x, num_y, num_z), strides, strict=True)
+        [_within(corner + first + k, num - 1) * stride for k in range(len(nodes))]
+        for corner, nodes, num, stride in zip(lower, along, grid.num, strides, strict=True)
     ]
+    index[0] = [ix + grid.first for ix in index[0]]
     total = [torch.zeros_like(along[0][0][0]) for _ in range(4)]
     for (wx, dx), ix in zip(along[0], index[0], strict=True):
         sheet = [torch.zeros_like(wx) for _ in range(3)]
         for (wy, dy), iy in zip(along[1], index[1], strict=True):
-            row = [flat[ix + iy + iz] for iz in index[2]]
+            row = [grid.values[ix + iy + iz] for iz in index[2]]
             line = sum(wz * value for (wz, _), value in zip(along[2], row, strict=True))
             slope = sum(dz * value for (_, dz), value in zip(along[2], row, strict=True))
             sheet = [sheet[0] + wy * line, sheet[1] + dy * line, sheet[2] + wy * slope]

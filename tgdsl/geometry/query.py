@@ -1,7 +1,11 @@
 """The question every contact sensor asks: how deep is a probe in which object, which way is out, how does it move.
 
-Shapes: `env` environments, `pair` (link, object) pairs, `taxel` probes, `geom` geoms of an object. A pair's planes are
-small, a taxel's are not, so everything that depends on the pair alone is formed first and gathered once.
+Two steps: `measure` finds the distance of every probe to every object, once, and `feel` makes of it what one sensor feels, of
+which there may be several with different gates, objects and needs.
+
+Shapes: `env` environments, `pair` (link, object) pairs, `taxel` probes, `geom` geoms of an object, `case` 1, or `env` if the
+object differs between environments. A pair's planes are small, a taxel's are not, so everything that depends on the pair alone
+is formed first and gathered once.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
@@ -53,19 +57,17 @@ class Probes(NamedTuple):
 
     Attributes:
         pos: Positions [m], planes of shape (taxel,).
-        reach: Radius of each probe towards each object [m]; −∞ where the probe is inactive or the pair cannot meet.
         pair: For each object, index of each probe's pair among the pairs of that object.
     """
 
     pos: Vec
-    reach: Float[Tensor, "object taxel"]
     pair: Int[Tensor, "object taxel"]
 
 
 class RaycastSurface(NamedTuple):
-    """Triangles that are queried at run time, and the distance [m] up to which they are told apart."""
+    """Triangles that are queried at run time, one mesh per variant, and the distance [m] up to which they are told apart."""
 
-    mesh: TriangleMesh
+    meshes: tuple[TriangleMesh, ...]
     max_distance: float
 
 
@@ -81,6 +83,8 @@ class FeltObject(NamedTuple):
         size: Size of each geom as MuJoCo defines it [m].
         pos: Origin of each geom in the body frame [m].
         rotation: Rotates geom vectors into the body frame, row by row.
+        is_absent: Which geoms an environment's object lacks; None if none does.
+        variant: Which variant each environment has; None if all are alike.
         surfaces: Grid or triangles of each geom that is no primitive.
     """
 
@@ -89,10 +93,30 @@ class FeltObject(NamedTuple):
     num_pairs: int
     shapes: tuple[str, ...]
     is_centred: tuple[bool, ...]
-    size: Float[Tensor, "geom 3"]
-    pos: Float[Tensor, "geom 3"]
-    rotation: Float[Tensor, "geom 9"]
+    size: Float[Tensor, "case geom 3"]
+    pos: Float[Tensor, "case geom 3"]
+    rotation: Float[Tensor, "case geom 9"]
+    is_absent: Bool[Tensor, "case geom"] | None
+    variant: Int[Tensor, " env"] | None
     surfaces: tuple[Grid | RaycastSurface | None, ...]
+
+
+class Near(NamedTuple):
+    """How near each probe is to one object's surface.
+
+    Attributes:
+        name: The object's name.
+        pairs: Its pairs among all of the plan.
+        pair: Index of each probe's pair among them.
+        distance: Signed distance [m], a plane (env, taxel).
+        gradient: Its unit gradient in the link's frame.
+    """
+
+    name: str
+    pairs: slice
+    pair: Int[Tensor, " taxel"]
+    distance: Tensor
+    gradient: Vec
 
 
 class Distance(NamedTuple):
@@ -164,38 +188,56 @@ def relate(
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, gate)
 
 
-def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], needs: Collection[str]) -> Felt:
-    """Query all probes against all objects; the deepest geom wins, the first among equals.
+def measure(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject]) -> tuple[Near, ...]:
+    """Return how near all probes are to each object, in the order of `probes.pair`.
+
+    Not-a-number in a pose comes out as not-a-number.
+    """
+    found = []
+    for target, pair in zip(objects, probes.pair, strict=True):
+        own = slice(target.first_pair, target.first_pair + target.num_pairs)
+        distance, gradient = _distance(pairs, probes, target, own, pair)
+        found.append(Near(target.name, own, pair, distance, gradient))
+    return tuple(found)
+
+
+def feel(
+    pairs: Pairs,
+    probes: Probes,
+    near: Sequence[Near],
+    reach: Float[Tensor, "object taxel"],
+    needs: Collection[str],
+) -> Felt:
+    """Return what the probes feel; the deepest object wins, the first among equals.
 
     Args:
         pairs: Relative poses of all pairs of the plan.
         probes: The probes.
-        objects: The objects, in the order of `probes.reach`.
+        near: The objects that are felt, the first of equals first.
+        reach: Radius of each probe towards each of them [m]; −∞ where the probe is inactive or the pair cannot meet.
         needs: Which optional parts of the answer are wanted: "normal", "motion", "distance".
 
     Returns:
-        Depth and what is wanted besides, at each probe. Not-a-number in a pose comes out as not-a-number.
+        Depth and what is wanted besides, at each probe.
     """
     num_envs = pairs.offset[0].shape[0]
     zero = pairs.offset[0].new_zeros((num_envs, probes.pos[0].shape[0]))
     depth, normal, linear, angular = zero, (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     with_normal, with_motion = "normal" in needs, "motion" in needs and pairs.motion is not None
     distances: dict[str, Distance] = {}
-    for i, target in enumerate(objects):
-        own = slice(target.first_pair, target.first_pair + target.num_pairs)
-        pair, reach = probes.pair[i], probes.reach[i]
+    for target, radius in zip(near, reach, strict=True):
         if pairs.gate is not None:
-            reach = reach + pairs.gate[:, own][:, pair]
-        distance, gradient = _distance(pairs, probes, target, own, pair)
-        reached = reach - distance
+            radius = radius + pairs.gate[:, target.pairs][:, target.pair]
+        reached = radius - target.distance
         is_deeper = reached > torch.where(depth > 0, depth + planes.TIE, 0.0)
         if with_normal:
-            normal = planes.where(is_deeper, gradient, normal)
+            normal = planes.where(is_deeper, target.gradient, normal)
         if with_motion and pairs.motion is not None:
-            linear = planes.where(is_deeper, _gathered(pairs.motion.linear, own, pair), linear)
-            angular = planes.where(is_deeper, _gathered(pairs.motion.angular, own, pair), angular)
+            linear = planes.where(is_deeper, _gathered(pairs.motion.linear, target.pairs, target.pair), linear)
+            angular = planes.where(is_deeper, _gathered(pairs.motion.angular, target.pairs, target.pair), angular)
         if "distance" in needs:
-            distances[target.name] = Distance(torch.where(reach > -torch.inf, distance, torch.inf), gradient)
+            value = torch.where(radius > -torch.inf, target.distance, torch.inf)
+            distances[target.name] = Distance(value, target.gradient)
         depth = torch.maximum(depth, reached)
     velocity = planes.add(linear, planes.cross(angular, probes.pos)) if with_motion else None
     return Felt(depth, normal if with_normal else None, velocity, angular if with_motion else None, distances)
@@ -203,25 +245,33 @@ def feel(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject], needs: Col
 
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
     """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
-    answers = []
-    for g, shape in enumerate(target.shapes):
+    least, outward = None, None
+    for g in range(len(target.shapes)):
         rotation, offset = _link_in_geom(pairs, own, target, g)
         rotation = planes.rot(part[:, pair] for part in rotation)
         offset = planes.vec(part[:, pair] for part in offset)
-        point = planes.add(planes.rotate(rotation, probes.pos), offset)
-        surface = target.surfaces[g]
-        if isinstance(surface, Grid):
-            distance, gradient = METHODS[shape](point, surface)
-        elif isinstance(surface, RaycastSurface):
-            distance, gradient = nearest(point, surface.mesh, surface.max_distance)
+        distance, gradient = _to_geom(planes.add(planes.rotate(rotation, probes.pos), offset), target, g)
+        gradient = planes.rotate_back(rotation, gradient)
+        if target.is_absent is not None:
+            distance = torch.where(target.is_absent[:, g, None], torch.inf, distance)
+        if least is None or outward is None:
+            least, outward = distance, gradient
         else:
-            distance, gradient = SHAPES[shape](point, planes.split(target.size[g]))
-        answers.append((distance, planes.rotate_back(rotation, gradient)))
-    least, outward = answers[0]
-    for distance, gradient in answers[1:]:
-        outward = planes.where(distance < least - planes.TIE, gradient, outward)
-        least = torch.minimum(least, distance)
+            outward = planes.where(distance < least - planes.TIE, gradient, outward)
+            least = torch.minimum(least, distance)
+    assert least is not None and outward is not None
     return least, outward
+
+
+def _to_geom(point: Vec, target: FeltObject, g: int) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points in a geom's frame to it, and its gradient there."""
+    shape, surface = target.shapes[g], target.surfaces[g]
+    if isinstance(surface, Grid):
+        return METHODS[shape](point, surface)
+    if isinstance(surface, RaycastSurface):
+        which = target.variant[:, None] if target.variant is not None and len(surface.meshes) > 1 else None
+        return nearest(point, surface.meshes, surface.max_distance, which)
+    return SHAPES[shape](point, planes.split(target.size[:, g, None]))
 
 
 def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple[Rot, Vec]:
@@ -229,8 +279,8 @@ def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple
     offset = planes.vec(part[:, own] for part in pairs.offset)
     if target.is_centred[g]:
         return rotation, offset
-    geom_rotation = planes.rot(target.rotation[g].unbind(0))
-    moved = planes.sub(offset, planes.split(target.pos[g]))
+    geom_rotation = planes.rot(target.rotation[:, g, None].unbind(-1))
+    moved = planes.sub(offset, planes.split(target.pos[:, g, None]))
     return planes.transpose_times(geom_rotation, rotation), planes.rotate_back(geom_rotation, moved)
 
 

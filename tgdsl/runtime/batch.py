@@ -5,7 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -13,13 +13,15 @@ import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module import TactileModule
 from tgdsl.plan import contact_sensor_names
+from tgdsl.runtime.objects import EnvObjects
 from tgdsl.runtime.source import EnvIds
-from tgdsl.scene import scene_model
+from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
 
 Array = np.ndarray
@@ -35,7 +37,7 @@ class BatchSimulation:
     start of the last substep, and so is the state. After `reset` they are those of the start.
 
     Attributes:
-        model: The compiled scene, shared by all environments.
+        model: The compiled scene; where objects differ between environments, that of the first.
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
         substeps: Physics steps per control step.
     """
@@ -59,7 +61,7 @@ class BatchSimulation:
             threads: CPU threads; 0: one per CPU.
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
             model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
-                artefact's scene.
+                artefact's scene. Its objects are the same in all environments.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -68,7 +70,15 @@ class BatchSimulation:
         """
         if num_envs < 1 or substeps < 1:
             raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
-        self.model = scene_model(touch.plan.scene) if model is None else model
+        if model is not None and touch.inputs.objects:
+            what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
+            raise SimulationError(f"{what}; leave `model` out")
+        self._objects: EnvObjects | None = None
+        if model is None:
+            scenes = SceneModels(touch.plan.scene)
+            model = scenes.model({})
+            self._objects = EnvObjects(scenes, touch.inputs, num_envs) if touch.inputs.objects else None
+        self.model: mujoco.MjModel = model
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
         self.substeps = substeps
@@ -83,6 +93,8 @@ class BatchSimulation:
         self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
         for name in _DERIVED:
             self.batch.bind(name)  # an array is filled only by calls that come after its first use
+        if self._objects is not None:
+            self.batch.set_models(self._objects.models())
         self.reset()
 
     @property
@@ -142,6 +154,38 @@ class BatchSimulation:
         if ids is None or len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
             self._touch.reset(None if ids is None else torch.from_numpy(ids.astype(np.int64)))
+
+    def set_objects(
+        self,
+        variants: Mapping[str, ArrayLike] | None = None,
+        sizes: Mapping[str, ArrayLike] | None = None,
+        env_ids: EnvIds | None = None,
+    ) -> None:
+        """Say what objects are like in some environments (default: all), and start these anew.
+
+        At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
+        the XHand1's palm, 10 ms and 3 MB.
+
+        Args:
+            variants: Which variant of an object these environments have: (env,) integers, or one for all.
+            sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
+            env_ids: Indices, or a boolean mask over environments.
+
+        Raises:
+            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
+        """
+        if self._objects is None:
+            raise SimulationError("no object of this module differs between environments")
+        ids = np.arange(self.num_envs)
+        if env_ids is not None:
+            try:
+                ids = ids[np.asarray(torch.as_tensor(env_ids).cpu())]
+            except IndexError as error:
+                raise SimulationError(f"env_ids: {error}") from error
+        self._objects.choose(ids, variants or {}, sizes or {})
+        models = self._objects.models()
+        self._run(lambda: self.batch.set_models(models))
+        self.reset(ids)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:
@@ -210,7 +254,14 @@ _READERS: dict[str, Callable[[BatchSimulation], Array]] = {
     "contact_torque": lambda sim: sim._in_world(4),
     "contact_normal": lambda sim: sim._slot_part(10),
     "contact_netforce": BatchSimulation._contact_netforce,
+    "variant": lambda sim: _present(sim._objects).variant,
+    "object_size": lambda sim: _present(sim._objects).object_size,
 }
+
+
+def _present(objects: EnvObjects | None) -> EnvObjects:
+    assert objects is not None
+    return objects
 
 
 def _bad_rows(values: Array) -> str:

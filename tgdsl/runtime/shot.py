@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.runtime.batch import BatchSimulation
 from tgdsl.runtime.dots import Dots
+from tgdsl.scene import is_absent
 
 Array = np.ndarray
 GeomType = mujoco.mjtGeom
@@ -87,10 +88,10 @@ def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " 
 
 def solid_of(sim: BatchSimulation, env: int, bodies: set[int]) -> Solid:
     """Return the triangles of some bodies in one environment: of their geoms that collide, or else of all; planes not."""
-    model = sim.model
+    model = sim.batch.get_model(env)
     parts = [Solid(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
     for body in sorted(bodies):
-        own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body]
+        own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
         for geom in [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]] or own:
             corners, normals = _triangles(model, geom)
             in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)

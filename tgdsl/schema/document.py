@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import cache
 from typing import Annotated, Any, Literal, Union
 
-from pydantic import Field, StrictInt, StringConstraints, Tag, create_model
+from pydantic import Field, StringConstraints, Tag, create_model
 
-from tgdsl.fields import TEXT_OR_OTHER, PositiveLength, SpecModel, Text
+from tgdsl.fields import TEXT_OR_OTHER, SpecModel, Text
 from tgdsl.observations import ObservationSpec
+from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.base import ProbeSpec
@@ -31,23 +32,6 @@ class SceneSpec(SpecModel):
 
     model: str
     """MJCF file that holds the robot, its body names unchanged, and the objects."""
-
-
-class ObjectSpec(SpecModel):
-    """Something that taxels can feel."""
-
-    body: str
-    """Name of its body in the scene (or in the robot's file, if there is no scene)."""
-    surface: str = "collision"
-    """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
-    the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is."""
-    query: Literal["sdf", "raycast"] = "sdf"
-    """How distances to its meshes are found: on a grid baked at compile time, or to the nearest triangle at run time (needs
-    warp-lang). Primitives are exact either way."""
-    tolerance: PositiveLength = 5e-5
-    """Distance error that a grid may have, 99th percentile away from sharp edges [m]."""
-    max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
-    """Largest size of a grid [bytes]."""
 
 
 class Spec(SpecModel):

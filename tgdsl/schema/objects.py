@@ -1,0 +1,118 @@
+"""What taxels can feel: bodies of the scene, and geoms that differ between environments."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, StrictInt, Tag, model_validator
+
+from tgdsl.fields import Number, Position, Positive, PositiveLength, SpecModel
+
+NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
+"""How many sizes a primitive has, as MuJoCo defines them: radius; radius and half-length; half-lengths."""
+
+
+def _oriented(quat: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if not any(quat):
+        raise ValueError("[0, 0, 0, 0] is no orientation, expected a quaternion w, x, y, z of non-zero length")
+    return quat
+
+
+class _PlacedGeom(SpecModel):
+    pos: Position = (0.0, 0.0, 0.0)
+    """Origin of its frame in the body's frame [m]."""
+    quat: tuple[Number, Number, Number, Number] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation of its frame in the body's frame, w, x, y, z."""
+    density: Positive = 1000.0
+    """Its density [kg/m³]; counts unless the body's inertia is given in the scene."""
+
+    @model_validator(mode="after")
+    def _check_quat(self) -> _PlacedGeom:
+        _oriented(self.quat)
+        return self
+
+
+class PrimitiveGeom(_PlacedGeom):
+    """A primitive."""
+
+    type: Literal["sphere", "capsule", "cylinder", "ellipsoid", "box"]
+    """Its type, by MuJoCo's name."""
+    size: Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=3)]
+    """Its size as MuJoCo defines it: radius; radius and half-length; half-lengths along x, y, z [m]."""
+
+    @model_validator(mode="after")
+    def _check_size(self) -> PrimitiveGeom:
+        if len(self.size) != NUM_SIZES[self.type]:
+            raise ValueError(f"a {self.type} has {NUM_SIZES[self.type]} sizes, found {len(self.size)}")
+        return self
+
+
+class MeshGeom(_PlacedGeom):
+    """A mesh of a file."""
+
+    mesh: str
+    """Mesh file (.stl, .obj), relative to this document."""
+    scale: Positive = 1.0
+    """Factor from the file's unit to metres: 0.001 for millimetres."""
+
+
+class CompoundGeoms(SpecModel):
+    """Several geoms that move as one."""
+
+    geoms: Annotated[tuple[Geom, ...], Field(min_length=1)]
+    """The geoms."""
+
+
+def _geom_tag(value: Any) -> str:
+    return "a mesh" if isinstance(value, MeshGeom) or (isinstance(value, dict) and "mesh" in value) else "a primitive"
+
+
+def _variant_tag(value: Any) -> str:
+    is_compound = isinstance(value, CompoundGeoms) or (isinstance(value, dict) and "geoms" in value)
+    return "a compound" if is_compound else _geom_tag(value)
+
+
+Geom = Annotated[
+    Annotated[PrimitiveGeom, Tag("a primitive")] | Annotated[MeshGeom, Tag("a mesh")],
+    Discriminator(_geom_tag),
+]
+Variant = Annotated[
+    Annotated[PrimitiveGeom, Tag("a primitive")]
+    | Annotated[MeshGeom, Tag("a mesh")]
+    | Annotated[CompoundGeoms, Tag("a compound")],
+    Discriminator(_variant_tag),
+]
+CompoundGeoms.model_rebuild()
+
+
+class ObjectSpec(SpecModel):
+    """Something that taxels can feel."""
+
+    body: str
+    """Name of its body in the scene (or in the robot's file, if there is no scene)."""
+    variants: Annotated[tuple[Variant, ...], Field(min_length=1)] | None = None
+    """Geoms that the body has instead of its own, of which each environment takes one: see `SceneState.variant`. What else
+    the scene says of the body's first geom, such as friction, holds for all of them."""
+    size: Literal["fixed", "per_env"] = "fixed"
+    """`per_env` if its size is part of the state: see `SceneState.object_size`. It (and each variant) is then one primitive."""
+    surface: str = "collision"
+    """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
+    the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is."""
+    query: Literal["sdf", "raycast"] = "sdf"
+    """How distances to its meshes are found: on a grid baked at compile time, or to the nearest triangle at run time (needs
+    warp-lang). Primitives are exact either way."""
+    tolerance: PositiveLength = 5e-5
+    """Distance error that a grid may have, 99th percentile away from sharp edges [m]."""
+    max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
+    """Largest size of a grid [bytes]."""
+
+    @model_validator(mode="after")
+    def _check_surface(self) -> ObjectSpec:
+        if self.variants is not None and self.surface not in ("collision", "visual"):
+            raise ValueError(f'surface "{self.surface}" names a geom; with variants it is `collision` or `visual`')
+        return self
+
+    @property
+    def compounds(self) -> tuple[tuple[PrimitiveGeom | MeshGeom, ...], ...]:
+        """The geoms of each variant."""
+        return tuple(part.geoms if isinstance(part, CompoundGeoms) else (part,) for part in self.variants or ())
