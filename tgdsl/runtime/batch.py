@@ -13,13 +13,12 @@ import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.module import TactileModule
 from tgdsl.plan import contact_sensor_names
-from tgdsl.runtime.objects import EnvObjects
+from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.source import EnvIds
 from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
@@ -157,8 +156,8 @@ class BatchSimulation:
 
     def set_objects(
         self,
-        variants: Mapping[str, ArrayLike] | None = None,
-        sizes: Mapping[str, ArrayLike] | None = None,
+        variants: Mapping[str, Values] | None = None,
+        sizes: Mapping[str, Values] | None = None,
         env_ids: EnvIds | None = None,
     ) -> None:
         """Say what objects are like in some environments (default: all), and start these anew.

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import ArrayLike
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.plan import Inputs
 from tgdsl.scene import Choice, SceneModels
 from tgdsl.schema.objects import NUM_SIZES
+
+Values = int | float | Sequence[Any] | np.ndarray
+"""Numbers, one per environment or one for all."""
 
 
 class EnvObjects:
@@ -29,7 +32,7 @@ class EnvObjects:
         self._num_variants = dict(zip(inputs.objects, inputs.num_variants, strict=True))
         self._choices = [{name: Choice(env % num) for name, num in self._num_variants.items()} for env in range(num_envs)]
 
-    def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, ArrayLike], sizes: Mapping[str, ArrayLike]) -> None:
+    def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
         """Say what objects are like in some environments: see `BatchSimulation.set_objects`."""
         chosen = [dict(self._choices[env]) for env in ids]
         for name, value in variants.items():
@@ -67,14 +70,14 @@ class EnvObjects:
             hint = did_you_mean(name, self._num_variants, "objects that do")
             raise SimulationError(f'no object "{name}" differs between environments; {hint}')
 
-    def _variants(self, name: str, value: ArrayLike, count: int) -> Int[np.ndarray, " n"]:
+    def _variants(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
         self._known(name)
         found, num = np.asarray(value), self._num_variants[name]
         if found.shape not in ((), (count,)) or found.dtype.kind not in "iu" or (found < 0).any() or (found >= num).any():
             raise SimulationError(f"variants of object {name}: expected {count} integers from 0 to {num - 1}, found {value}")
         return np.broadcast_to(found, count)
 
-    def _sizes(self, name: str, value: ArrayLike, count: int) -> Float[np.ndarray, "n size"]:
+    def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
         self._known(name)
         if not self._scenes.objects[name].is_sized:
             raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
