@@ -1,0 +1,82 @@
+"""One query for several sensors: what two kinds on the same probes cost together, and in modules of their own.
+
+    python benchmarks/sharing.py [--device cuda] [--num-envs 512] [--repeats 20] [--compiled]
+
+The XHand1 at medium resolution (199 taxels) with a ball of triangles in its palm, felt by way of a baked grid; the sensors are
+`kinematic_taxel`, felt while in contact, and `contact_depth`, felt by reach alone. Medians of calls made in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+import trimesh
+import tyro
+from module import median_ms
+
+import tgdsl
+from tgdsl.explain import operations_per_env
+from tgdsl.module import TactileModule
+
+ROOT = Path(__file__).parent.parent
+SENSORS = {
+    "force": {"kind": "kinematic_taxel", "links": "hand", "feels": ["cube"], "outputs": ["force"]},
+    "depth": {"kind": "contact_depth", "links": "hand", "feels": ["cube"], "gate": "geometric"},
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time."""
+
+    device: str = "cpu"
+    """Where."""
+    num_envs: int = 512
+    """Environments."""
+    repeats: int = 20
+    """Timed calls of each module."""
+    compiled: bool = False
+    """Whether to fuse the modules with torch.compile first."""
+
+
+def module(folder: Path, sensors: tuple[str, ...], device: str) -> TactileModule:
+    """Return a module with some of the sensors."""
+    mesh = folder / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=4, radius=0.02).export(mesh)
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": "xhand1"},
+        "scene": {"model": str(ROOT / "examples" / "palm_cube.xml")},
+        "objects": {"cube": {"body": "cube", "variants": [{"mesh": str(mesh)}]}},
+        "resolution": "med",
+        "sensors": {name: SENSORS[name] for name in sensors},
+    }
+    return tgdsl.compile(document, device=device)
+
+
+def main(options: Options) -> None:
+    """Time all three modules."""
+    where = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {where}, {options.num_envs} environments, medians of {options.repeats}")
+    with TemporaryDirectory() as folder:
+        names = {"force": ("force",), "depth": ("depth",), "both": ("force", "depth")}
+        modules = {name: module(Path(folder), sensors, options.device) for name, sensors in names.items()}
+    assert len(modules["both"].plan.queries) == 1
+    operations = {name: operations_per_env(touch) for name, touch in modules.items()}
+    state = modules["both"].example_state(options.num_envs, dtype=torch.float32, spread=0.01)
+    if options.compiled:
+        for touch in modules.values():
+            touch.compile()
+    calls = {name: lambda touch=touch: touch(state) for name, touch in modules.items()}
+    times = median_ms(calls, options.repeats, options.device)
+    for name in names:
+        print(f"  {name:<8}{operations[name]:>10} operations per environment{times[name]:>10.3f} ms")
+    print(f"  both / dearer of the two {times['both'] / max(times['force'], times['depth']):.2f}")
+    print(f"  both / sum of the two    {times['both'] / (times['force'] + times['depth']):.2f}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
