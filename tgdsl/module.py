@@ -329,10 +329,12 @@ class TactileModule(nn.Module):
     def _surface(self, target: PlannedObject, i: int, variant: Tensor | None) -> Grid | RaycastSurface | None:
         if target.shapes[i] not in METHODS:
             return self._raycast.get(f"{target.name}/{i}")
-        first, num, origin, cell = (self._chosen(target, f"{i}/{part}", variant) for part in ("first", "num", "origin", "cell"))
-        nums = num[:, 0, None], num[:, 1, None], num[:, 2, None]
         values = self.constants[f"objects/{target.name}/{i}/values"]
-        return Grid(values, first[:, None], nums, split(origin[:, None]), cell[:, None])
+        first, num, origin, cell = (self._chosen(target, f"{i}/{part}", variant) for part in ("first", "num", "origin", "cell"))
+        if variant is None:
+            x, y, z = self.plan.arrays[f"objects/{target.name}/{i}/num"][0].tolist()
+            return Grid(values, 0, (x, y, z), split(origin[:, None]), cell[:, None])
+        return Grid(values, first[:, None], split(num[:, None]), split(origin[:, None]), cell[:, None])
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""

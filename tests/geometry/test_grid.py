@@ -192,7 +192,7 @@ def test_each_point_asks_its_own_of_several_grids(method):
     table = Grid(
         values=torch.cat([ball.values for ball in balls]),
         first=first[which],
-        num=tuple(torch.stack(part)[which] for part in zip(*(ball.num for ball in balls), strict=True)),
+        num=tuple(torch.tensor(part)[which] for part in zip(*(ball.num for ball in balls), strict=True)),
         origin=tuple(torch.stack(part)[which] for part in zip(*(ball.origin for ball in balls), strict=True)),
         cell=torch.stack([ball.cell for ball in balls])[which],
     )

@@ -107,7 +107,7 @@ _MESHES: weakref.WeakValueDictionary[int, TriangleMesh] = weakref.WeakValueDicti
 
 
 def nearest(
-    point: Vec, meshes: Sequence[TriangleMesh], max_distance: float, which: Int[Tensor, ...] | None = None
+    point: Vec, meshes: Sequence[TriangleMesh], max_distance: float, which: Int[Tensor, "*point"] | None = None
 ) -> tuple[Tensor, Vec]:
     """Return the signed distance [m] of points to a mesh, negative inside, and its outward unit gradient.
 

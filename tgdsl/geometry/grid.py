@@ -4,7 +4,7 @@ A point outside the grid reads the value at the nearest point of the grid's box 
 inequality that is never less than the true distance, nor less than the way to the box: far points read far. A point that is
 not a number reads NaN and has a fixed gradient; one at infinity counts as `FAR` away from the box along that axis.
 
-Shapes: `node` nodes of all grids; `x`, `y`, `z` nodes of one along the axes, two or more each; `...` broadcasts with points.
+Shapes: `node` nodes of all grids; `x`, `y`, `z` nodes of one along the axes, two or more each; `*point` broadcasts with points.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from tgdsl.geometry.planes import Vec, length_and_direction, split, vec
 FAR = 1e15
 """The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
 
+Count = int | Int[Tensor, "*point"]
 Pair = tuple[Tensor, Tensor]
 Nodes = tuple[Pair, Pair] | tuple[Pair, Pair, Pair, Pair]
 """Weight of each node along an axis, and the weight's derivative. Tuples of known length: checks of lists do not compile."""
@@ -29,6 +30,8 @@ Weights = Callable[[Tensor], Nodes]
 
 class Grid(NamedTuple):
     """Signed distance at the nodes of a grid, negative inside; or of several, of which each point asks one.
+
+    Counts that are the same for all points may be Python's: a compiler then makes them part of the code.
 
     Attributes:
         values: Signed distance at the nodes [m], grid after grid, z running fastest.
@@ -39,16 +42,16 @@ class Grid(NamedTuple):
     """
 
     values: Float[Tensor, " node"]
-    first: Int[Tensor, ...]
-    num: tuple[Int[Tensor, ...], Int[Tensor, ...], Int[Tensor, ...]]
+    first: Count
+    num: tuple[Count, Count, Count]
     origin: Vec
-    cell: Float[Tensor, ...]
+    cell: Float[Tensor, "*point"]
 
 
 def one_grid(values: Float[Tensor, "x y z"], origin: Float[Tensor, " 3"], cell: Float[Tensor, ""]) -> Grid:
     """Return one grid, from its values at the nodes [m], the place of node (0, 0, 0) [m] and the spacing [m]."""
-    x, y, z = (torch.tensor(num, device=values.device) for num in values.shape)
-    return Grid(values.reshape(-1), torch.zeros_like(x), (x, y, z), split(origin), cell)
+    x, y, z = values.shape
+    return Grid(values.reshape(-1), 0, (x, y, z), split(origin), cell)
 
 
 def trilinear(point: Vec, grid: Grid) -> tuple[Tensor, Vec]:
@@ -93,7 +96,7 @@ def _cubic_weights(t: Tensor) -> Nodes:
 def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[Tensor, Vec]:
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
     place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
-    inside = [torch.minimum(part.clamp(min=0), (num - 1).to(part.dtype)) for part, num in zip(place, grid.num, strict=True)]
+    inside = [_within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
     lower = vec(_within(part.floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
@@ -111,8 +114,8 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     return distance, gradient
 
 
-def _within(index: Tensor, last: Tensor) -> Tensor:
-    return torch.minimum(index.clamp(min=0), last)
+def _within(place: Tensor, last: Count) -> Tensor:
+    return place.clamp(0, last) if isinstance(last, int) else torch.minimum(place.clamp(min=0), last.to(place.dtype))
 
 
 def _sum_over_nodes(
@@ -120,7 +123,7 @@ def _sum_over_nodes(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the weighted sum [m] and its derivatives along the axes [m per cell], one axis after the other."""
     _, num_y, num_z = grid.num
-    strides = (num_y * num_z, num_z, torch.ones_like(num_z))
+    strides = (num_y * num_z, num_z, 1)
     index = [
         [_within(corner + first + k, num - 1) * stride for k in range(len(nodes))]
         for corner, nodes, num, stride in zip(lower, along, grid.num, strides, strict=True)
