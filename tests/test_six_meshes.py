@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from brute import brute_force, to_segment
 
 import tgdsl
-from brute import brute_force, to_segment
 from tgdsl.state import SceneState
 
 TOLERANCE = 1e-4

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from brute import brute_force
 
-from brute import brute_force, solid_angles
 from tgdsl.errors import TgdslError
 from tgdsl.geometry.bvh import ON_SURFACE, TriangleMesh, nearest
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.geometry.planes import Vec, length_and_direction, split, vec
+from tgdsl.geometry.planes import TIE, Vec, length_and_direction, split, vec
 
 FAR = 1e15
 """The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
@@ -97,8 +97,10 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
     place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
     inside = [_within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
+    # What is within TIE of the next cell counts as in it, so that a point at rest on a face of cells keeps its gradient.
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
-    lower = vec(_within(part.floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
+    tie = TIE / grid.cell
+    lower = vec(_within((part + tie).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
     value, *slopes = _sum_over_nodes(grid, lower, (along_x, along_y, along_z), first)
     way, direction = length_and_direction(

@@ -1,0 +1,112 @@
+"""Meshes that break distance queries: no thickness, needles, faces that coincide. Readings stay finite, right and steady."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from brute import brute_force
+
+import tgdsl
+from sensors.test_hard_cases import NUM_STEPS, jittered
+from tgdsl.state import SceneState
+
+R = 0.006
+TOLERANCE = 1e-4
+
+
+def plate():
+    """A sheet of two sides that coincide."""
+    corners = np.array([[-0.02, -0.015, 0], [0.02, -0.015, 0], [0.02, 0.015, 0], [-0.02, 0.015, 0]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]], process=False)
+
+
+def needles():
+    """A wedge 40 mm long whose sides are triangles as thin as 1 to 4,000."""
+    low = np.array([[0, 0, 0], [0.04, 0, 0], [0.04, 1e-5, 0]])
+    faces = [[2, 1, 0], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
+    return trimesh.Trimesh(np.concatenate([low, low + [0, 0, 0.02]]), faces, process=False)
+
+
+def twins():
+    """Two boxes that share a face, both of whose copies are there."""
+    return trimesh.util.concatenate(
+        [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (-0.01, 0.01)]
+    )
+
+
+CASES = {
+    "plate": (plate, [(0.003, 0.002, 0.004), (0.003, 0.002, -0.004), (0.0215, 0.004, 0.0), (0.021, 0.016, 0.001)]),
+    "needles": (needles, [(0.03, -0.003, 0.01), (0.03, 0.004, 0.01), (0.042, 0.0, 0.01), (0.0425, 0.0, 0.022)]),
+    "twins": (twins, [(0.0, 0.004, 0.013), (0.0, 0.013, 0.0), (0.003, 0.002, 0.014), (0.0215, 0.0115, 0.0115)]),
+}
+"""The mesh, and probes beside it: over its middle, its edges and its corners."""
+
+
+def compiled(folder, mesh, probes, dtype, **target):
+    mesh.export(folder / "item.stl")
+    (folder / "scene.xml").write_text(
+        '<mujoco><compiler balanceinertia="true"/><asset><mesh name="item" file="item.stl" inertia="shell"/></asset>'
+        '<worldbody><body name="pad"><freejoint/><geom size=".05"/></body><body name="item"><freejoint/>'
+        '<geom type="mesh" mesh="item" contype="0" conaffinity="0"/></body></worldbody></mujoco>'
+    )
+    points = [{"pos": list(map(float, probe)), "normal": [0, 0, 1], "radius": R} for probe in probes]
+    sensor = {"links": "pad", "feels": ["item"], "gate": "geometric"}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {
+                "model": str(folder / "scene.xml"),
+                "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+            },
+            "objects": {"item": {"body": "item", "surface": "visual", **target}},
+            "sensors": {
+                "depth": {"kind": "contact_depth", **sensor},
+                "force": {"kind": "kinematic_taxel", "outputs": ["force"], **sensor},
+            },
+        },
+        dtype=dtype,
+    )
+    rest = torch.zeros(1, 2, 3, dtype=torch.float64)
+    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(1, 2, 1)
+    return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("query", ["sdf", "raycast"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_at_rest_the_reading_is_right_and_does_not_alternate(tmp_path, name, query, dtype):
+    make, probes = CASES[name]
+    touch, state = compiled(tmp_path, make(), probes, dtype, query=query, tolerance=TOLERANCE)
+    readings = touch(jittered(state, NUM_STEPS))
+    depth, force = readings["depth"][..., 0].double(), readings["force"].double()
+    distance, _ = brute_force(np.asarray(make().triangles), np.array(probes))  # all outside: no sign
+    bound = 5 * TOLERANCE if query == "sdf" else 1e-6  # near creases a grid is held to five times its tolerance
+    np.testing.assert_allclose(depth.numpy(), np.tile(R - distance, (NUM_STEPS, 1)), atol=bound)
+    direction = force / force.norm(dim=2, keepdim=True)
+    assert torch.isfinite(direction).all()
+    spread = (direction - direction[:1]).norm(dim=2).max()
+    assert spread < 1e-3, f"a normal turns by {spread:.2g} rad"
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("query", ["sdf", "raycast"])
+def test_deep_inside_and_on_the_surface_it_is_bounded(tmp_path, name, query):
+    """Probes all through the mesh, on its vertices and edges too: finite, and no deeper than its inner radius allows."""
+    make, _ = CASES[name]
+    mesh = make()
+    rng = np.random.default_rng(0)
+    along = rng.uniform(size=(20, 1))
+    edges = mesh.vertices[mesh.edges[rng.integers(0, len(mesh.edges), 20)]]
+    lower, upper = mesh.bounds
+    probes = [*mesh.vertices, *(along * edges[:, 0] + (1 - along) * edges[:, 1]), *rng.uniform(lower, upper, (60, 3))]
+    touch, state = compiled(tmp_path, mesh, probes, torch.float32, query=query, tolerance=TOLERANCE)
+    readings = touch(jittered(state, 50))
+    assert torch.isfinite(readings["depth"]).all() and torch.isfinite(readings["force"]).all()
+    inner = min(mesh.extents) / 2
+    assert readings["depth"].max() < R + inner + 10 * TOLERANCE
+    assert readings["depth"][:, : len(mesh.vertices)].min() > R - 10 * TOLERANCE
