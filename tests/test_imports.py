@@ -125,6 +125,12 @@ def test_warp_is_imported_in_one_function():
     assert found == [("geometry.bvh", True)]
 
 
+def test_pxr_is_imported_in_functions():
+    """It takes a quarter of a second and is wanted for USD alone."""
+    found = {name for name, file in MODULES.items() for i, is_inside in imports(file) if part_of(i) == "pxr" and not is_inside}
+    assert not found
+
+
 def test_only_schema_reads_yaml():
     readers = {part_of(name) for name, file in MODULES.items() if any(part_of(i) == "ruamel" for i, _ in imports(file))}
     assert readers == {"schema"}

@@ -32,6 +32,39 @@ def test_columns_and_rows_are_right_handed_and_follow_columns_along():
     np.testing.assert_allclose(found.tangent, np.tile([1.0, 0, 0], (4, 1)), atol=TOLERANCE)
 
 
+def test_reversed_rows_on_a_mirrored_pad_give_the_mirror_images_in_order():
+    # An off-centre box on a flat pad; mirrored along y, and columns follow x on both, so rows run along −y, then along y.
+    flip = np.array([1.0, -1, 1])
+    pad = surface_of(box((0.04, 0.04, 0.01)))
+    keys = {"rows": 3, "columns": 4, "count": 5, "direction": DOWN, "columns_along": [1, 0, 0]}
+    one, other = (
+        sample(pad, placement("grid", **keys, rows_reversed=is_mirrored, region={"box": bounds}), HERE)
+        for is_mirrored, bounds in (
+            (False, {"min": [-0.008, -0.003, 0], "max": [0.012, 0.015, 1]}),
+            (True, {"min": [-0.008, -0.015, 0], "max": [0.012, 0.003, 1]}),
+        )
+    )
+    # Cells of 5 mm × 6 mm: after the middle two, four are as far out as each other, and the first three of them are kept.
+    cell = [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1)]
+    x, y = np.array([-0.0055, -0.0005, 0.0045, 0.0095]), np.array([0.012, 0.006, 0.0])
+    row, column = np.array(cell).T
+    np.testing.assert_array_equal(one.cell, cell)
+    np.testing.assert_allclose(one.pos, np.stack([x[column], y[row], np.full(5, 0.005)], axis=1), rtol=0, atol=TOLERANCE)
+    np.testing.assert_array_equal(other.cell, one.cell)
+    np.testing.assert_allclose(other.pos, one.pos * flip, rtol=0, atol=TOLERANCE)
+    for name in ("normal", "tangent"):
+        np.testing.assert_allclose(getattr(other, name), getattr(one, name) * flip, atol=TOLERANCE)
+    np.testing.assert_allclose(other.area, one.area, rtol=1e-12)
+
+
+def test_reversed_rows_turn_the_tangent_of_a_face_that_stands_across_the_columns():
+    surface = surface_of(plate(np.array([1, 0, 5e-4]) / np.hypot(1, 5e-4)))
+    keys = {"rows": 1, "columns": 1, "direction": DOWN, "columns_along": [1, 0, 0]}
+    for is_mirrored, expected in ((False, [0, -1, 0]), (True, [0, 1, 0])):
+        found = sample(surface, placement("grid", **keys, rows_reversed=is_mirrored), HERE)
+        np.testing.assert_allclose(found.tangent, [expected], atol=TOLERANCE)
+
+
 @pytest.mark.parametrize("direction", [(0, 0, -1), (1, 2, -3), (-0.3, 0.1, 0.2)])
 def test_grid_on_a_sphere_hits_inside_its_disc(direction):
     radius, rows, columns = 0.01, 15, 10

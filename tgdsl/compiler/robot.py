@@ -1,4 +1,4 @@
-"""Robots and scenes in: MJCF and URDF through `mujoco.MjSpec`, geoms as triangles in their body's frame."""
+"""Robots and scenes in: MJCF, URDF and USD through `mujoco.MjSpec`, geoms as triangles in their body's frame."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.urdf import as_mujoco_text
+from tgdsl.compiler.usd import USD_SUFFIXES, usd_to_mjcf
 from tgdsl.errors import RobotError
 from tgdsl.geometry.surface import Surface
 from tgdsl.scene import muted_mujoco
@@ -82,13 +83,15 @@ class Model:
         file: The file it came from.
         spec: MuJoCo's editable model.
         compiled: MuJoCo's compiled model.
-        is_urdf: Whether it is URDF rather than MJCF.
+        is_urdf: Whether it is URDF.
+        mjcf: The MJCF that it was turned into, if it is USD; else empty.
     """
 
     file: Path
     spec: mujoco.MjSpec
     compiled: mujoco.MjModel
     is_urdf: bool
+    mjcf: str = ""
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -213,13 +216,17 @@ class Model:
 
 
 def load_model(path: Path) -> Model:
-    """Read and compile an MJCF or URDF file.
+    """Read and compile an MJCF, URDF or USD file.
 
     Raises:
-        RobotError: If MuJoCo cannot read or compile it, with MuJoCo's own account of the element at fault.
+        RobotError: If it cannot be read or compiled, with MuJoCo's own account of the element at fault, or the prim's path.
     """
     try:
         with muted_mujoco():
+            if path.suffix.lower() in USD_SUFFIXES:
+                text = usd_to_mjcf(path)
+                spec = mujoco.MjSpec.from_string(text)
+                return Model(path, spec, spec.compile(), False, text)
             is_urdf = _is_urdf(path)
             text, files = as_mujoco_text(path) if is_urdf else ("", {})
             spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(path))

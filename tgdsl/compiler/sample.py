@@ -71,7 +71,8 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
 
     Columns, rows and direction are a right-handed frame (rows run along direction × columns): seen from where the rays
     start, columns run to the right and rows run down, as on a page. The side that a ray comes from is outside, so the
-    normal is the hit face's, turned against the ray should the mesh be inside out.
+    normal is the hit face's, turned against the ray should the mesh be inside out. With `rows_reversed` rows run up: the
+    frame is left-handed, as the mirror image of a grid is.
     """
     view = View.of(surface, _grid_axes(placement))
     region = _region(surface, placement)
@@ -83,7 +84,8 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
     num = np.array([placement.columns, placement.rows])
     low, high = rectangle
     pitch = (high - low) / num
-    uv = low + (cell[:, ::-1] + 0.5) * pitch
+    step = np.column_stack([placement.rows - 1 - cell[:, 0], cell[:, 1]]) if placement.rows_reversed else cell
+    uv = low + (step[:, ::-1] + 0.5) * pitch
     hits = first_hits(view, uv)
     chosen = np.flatnonzero(hits.face >= 0)
     pos = np.column_stack([uv[chosen], hits.depth[chosen]]) @ view.axes
@@ -95,7 +97,7 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
     return Samples(
         pos=pos[kept],
         normal=normal,
-        tangent=_tangent(normal, view.axes[0], view.axes[1]),
+        tangent=_tangent(normal, view.axes[0], -view.axes[1] if placement.rows_reversed else view.axes[1]),
         radius=np.full(len(kept), placement.radius),
         area=pitch.prod() / np.maximum(cosine, MIN_COSINE),
         cell=cell[chosen[kept]],

@@ -120,7 +120,9 @@ def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = 
         named = {geom.mesh for target in objects for geoms in target.variants for geom in geoms if geom is not None}
         kept.assets |= {key: asset for key, asset in meshes.assets.items() if key in named}
         kept.contents |= meshes.contents
-    if model.is_urdf:
+    if model.mjcf:
+        main = kept.rewritten(ET.fromstring(model.mjcf), model.file, [model.file.parent])
+    elif model.is_urdf:
         main = kept.rewritten(ET.fromstring(model.spec.to_xml()), model.file, [model.file.parent])
     else:
         main = kept.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])

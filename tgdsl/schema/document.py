@@ -22,7 +22,7 @@ class RobotSpec(SpecModel):
     """The robot and where its taxels sit."""
 
     model: str
-    """MJCF or URDF file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
+    """MJCF, URDF or USD file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
     layout: Annotated[Text | Annotated[LayoutSpec, Tag("other")], TEXT_OR_OTHER] | None = None
     """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name."""
 

@@ -38,3 +38,10 @@ def robot_file(model: str, folder: Path) -> Path | None:
         return known[model]
     path = folder / model
     return path if is_file(path) else None
+
+
+def layout_file(model: Path) -> Path | None:
+    """Return the layout beside a model file: of `hand_left.xml` in `hand/` it is `layout_left.yaml`, or else `layout.yaml`."""
+    side = model.stem.removeprefix(f"{model.parent.name}_")
+    names = (f"layout_{side}.yaml", "layout.yaml")
+    return next((model.parent / name for name in names if (model.parent / name).is_file()), None)

@@ -155,8 +155,8 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
         loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', hint))
         return None
     known = files.robot_names().get(loaded.spec.robot.model)
-    if known is not None and (known.parent / "layout.yaml").is_file():
-        return known.parent / "layout.yaml"
+    if known is not None and (path := files.layout_file(known)) is not None:
+        return path
     loaded.problems.append(
         loaded.source.problem(
             ("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True

@@ -117,6 +117,8 @@ class Grid(_Sampled):
     columns_along: Direction | None = None
     """Axis along which the columns follow one another, link frame; default: the first of the link's z, y, x axes that is
     not near parallel (|cos| < 0.7) to `direction`."""
+    rows_reversed: bool = False
+    """Whether row 0 is at the far end of the rows' axis: on a mirrored hand taxel i is then the mirror image of taxel i."""
     count: Count | None = None
     """Keep this many of the cells that hit the surface, those nearest the centre of the grid; default: all that hit."""
 

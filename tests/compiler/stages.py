@@ -1,0 +1,162 @@
+"""Small USD stages for tests, and what they should come to, in NumPy."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
+from scipy.spatial.transform import Rotation
+
+from tgdsl.compiler.usd import usd_to_mjcf
+
+ONE = (1.0, 0.0, 0.0, 0.0)
+JOINTS = {
+    "hinge": UsdPhysics.RevoluteJoint,
+    "slide": UsdPhysics.PrismaticJoint,
+    "ball": UsdPhysics.SphericalJoint,
+    "fixed": UsdPhysics.FixedJoint,
+    "distance": UsdPhysics.DistanceJoint,
+    "generic": UsdPhysics.Joint,
+}
+
+
+def new_stage(folder: Path, name: str = "robot.usda", metres: float = 1.0, up: str = "Z") -> Usd.Stage:
+    stage = Usd.Stage.CreateNew(str(folder / name))
+    UsdGeom.SetStageMetersPerUnit(stage, metres)
+    UsdGeom.SetStageUpAxis(stage, up)
+    return stage
+
+
+def placed(prim: Usd.Prim, pos: Sequence[float] = (0, 0, 0), quat: Sequence[float] = ONE, scale: Sequence[float] = (1, 1, 1)):
+    """Give a prim a transform: translate, orient (w, x, y, z), scale."""
+    xform = UsdGeom.Xformable(prim)
+    xform.AddTranslateOp().Set(Gf.Vec3d(*map(float, pos)))
+    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(*map(float, quat)).GetNormalized())
+    xform.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*map(float, scale)))
+    return prim
+
+
+def add_body(
+    stage: Usd.Stage, path: str, pos=(0, 0, 0), quat=ONE, scale=(1, 1, 1), mass: float = 1.0, kind=UsdGeom.Xform
+) -> Usd.Prim:
+    """Add a rigid body with an authored mass (unless that is 0) and the inertia diag(0.02, 0.03, 0.04)."""
+    prim = placed(kind.Define(stage, path).GetPrim(), pos, quat, scale)
+    UsdPhysics.RigidBodyAPI.Apply(prim)
+    if mass:
+        api = UsdPhysics.MassAPI.Apply(prim)
+        api.CreateMassAttr(mass)
+        api.CreateDiagonalInertiaAttr((0.02, 0.03, 0.04))
+        api.CreateCenterOfMassAttr((0, 0, 0))
+    return prim
+
+
+def move(prim: Usd.Prim, pose: np.ndarray) -> None:
+    """Move a prim that `placed` has placed."""
+    prim.GetAttribute("xformOp:translate").Set(Gf.Vec3d(*pose[:3, 3].tolist()))
+    quat = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True).tolist()
+    prim.GetAttribute("xformOp:orient").Set(Gf.Quatd(*quat))
+
+
+def call(prim: Usd.Prim, name: str) -> None:
+    """Author the name that a prim shall have in MJCF."""
+    prim.CreateAttribute("tgdsl:name", Sdf.ValueTypeNames.String, custom=True).Set(name)
+
+
+def add_shape(
+    stage: Usd.Stage, path: str, kind=UsdGeom.Cube, pos=(0, 0, 0), quat=ONE, scale=(1, 1, 1), collides: bool = True, **values
+):
+    """Add a geometry prim; `values` are its attributes."""
+    prim = placed(kind.Define(stage, path).GetPrim(), pos, quat, scale)
+    for name, value in values.items():
+        prim.GetAttribute(name).Set(value)
+    if collides:
+        UsdPhysics.CollisionAPI.Apply(prim)
+    return prim
+
+
+def add_mesh(stage: Usd.Stage, path: str, points, faces, approximation: str = "convexHull", **keywords) -> Usd.Prim:
+    prim = add_shape(stage, path, UsdGeom.Mesh, **keywords)
+    mesh = UsdGeom.Mesh(prim)
+    mesh.CreatePointsAttr([tuple(map(float, point)) for point in points])
+    mesh.CreateFaceVertexCountsAttr([len(face) for face in faces])
+    mesh.CreateFaceVertexIndicesAttr([int(i) for face in faces for i in face])
+    if prim.HasAPI(UsdPhysics.CollisionAPI):
+        UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(approximation)
+    return prim
+
+
+def add_joint(
+    stage: Usd.Stage, path: str, kind: str, bodies, pos0=(0, 0, 0), rot0=ONE, pos1=(0, 0, 0), rot1=ONE, **values
+) -> Usd.Prim:
+    """Add a joint; of `bodies`, None is the world; `values` are attributes under `physics:`."""
+    joint = JOINTS[kind].Define(stage, path)
+    for relationship, body in zip((joint.CreateBody0Rel(), joint.CreateBody1Rel()), bodies, strict=True):
+        if body:
+            relationship.SetTargets([body])
+    joint.CreateLocalPos0Attr(tuple(map(float, pos0)))
+    joint.CreateLocalPos1Attr(tuple(map(float, pos1)))
+    joint.CreateLocalRot0Attr(Gf.Quatf(*map(float, rot0)).GetNormalized())
+    joint.CreateLocalRot1Attr(Gf.Quatf(*map(float, rot1)).GetNormalized())
+    for name, value in values.items():
+        joint.GetPrim().GetAttribute(f"physics:{name}").Set(value)
+    return joint.GetPrim()
+
+
+def add_material(stage: Usd.Stage, path: str, prim: Usd.Prim, purpose: str = "physics", **values: float) -> Usd.Prim:
+    material = UsdShade.Material.Define(stage, path)
+    UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    for name, value in values.items():
+        material.GetPrim().GetAttribute(f"physics:{name}").Set(value)
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, materialPurpose=purpose)
+    return material.GetPrim()
+
+
+def path_of(stage: Usd.Stage) -> Path:
+    """Save a stage and return its file."""
+    stage.Save()
+    return Path(stage.GetRootLayer().realPath)
+
+
+def compiled(stage: Usd.Stage) -> mujoco.MjModel:
+    """Save a stage, and return what MuJoCo makes of its MJCF."""
+    return mujoco.MjModel.from_xml_string(usd_to_mjcf(path_of(stage)))
+
+
+def matrix(pos=(0, 0, 0), quat=ONE) -> np.ndarray:
+    """Return a homogeneous transform; its numbers are rounded as USD's float32 attributes are."""
+    result = np.eye(4)
+    result[:3, 3] = np.float32(pos)
+    result[:3, :3] = Rotation.from_quat(quat, scalar_first=True).as_matrix()
+    return result
+
+
+def turn(axis: str, angle: float) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(angle * np.eye(3)["XYZ".index(axis)]).as_matrix()
+    return result
+
+
+def shift(axis: str, distance: float) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, 3] = distance * np.eye(3)["XYZ".index(axis)]
+    return result
+
+
+def world_pose(model: mujoco.MjModel, body: str, qpos: Sequence[float] | None = None, key: str | None = None) -> np.ndarray:
+    """Return MuJoCo's world pose of a body."""
+    data = mujoco.MjData(model)
+    if key:
+        mujoco.mj_resetDataKeyframe(model, data, model.key(key).id)
+    if qpos is not None:
+        data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = data.body(body).xmat.reshape(3, 3), data.body(body).xpos
+    return result
+
+
+def inertia(model: mujoco.MjModel, body: str) -> np.ndarray:
+    """Return a body's inertia about its centre of mass, in its frame."""
+    turned = Rotation.from_quat(model.body(body).iquat, scalar_first=True).as_matrix()
+    return turned @ np.diag(model.body(body).inertia) @ turned.T

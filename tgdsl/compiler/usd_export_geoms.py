@@ -1,0 +1,129 @@
+"""MuJoCo's geoms as USD's shapes, with colours, colliders and the friction of their surfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tgdsl.compiler.robot import SHAPE_NAMES
+from tgdsl.compiler.usd_export_draft import Draft, note, place, usd
+from tgdsl.errors import RobotError
+
+PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
+"""MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
+
+
+def add_geoms(draft: Draft, body: int, materials: str) -> None:
+    """Write the geoms of a body below its prim.
+
+    Args:
+        draft: The stage.
+        body: MuJoCo's index.
+        materials: Path of the scope that holds the physics materials.
+
+    Raises:
+        RobotError: If USD has no such shape.
+    """
+    model = draft.model
+    first = int(model.body_geomadr[body])
+    for geom in range(first, first + int(model.body_geomnum[body])):
+        shape, scale = _define(draft, geom)
+        prim = shape.GetPrim()
+        place(prim, model.geom_pos[geom], model.geom_quat[geom], scale)
+        note(prim, "name", model.geom(geom).name)
+        _colour(draft, geom, shape)
+        contype, conaffinity = int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])
+        if (contype, conaffinity) != (1, 1):
+            note(prim, "contype", contype)
+            note(prim, "conaffinity", conaffinity)
+        if contype or conaffinity:
+            _collide(draft, geom, prim, materials)
+
+
+def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
+    """Define a geom's prim without its pose; return its schema, and the scale that it wants."""
+    model, shapes = draft.model, usd().UsdGeom
+    kind, size = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown"), model.geom_size[geom]
+    name = model.geom(geom).name
+    mesh = model.mesh(model.geom_dataid[geom]).name if kind == "mesh" else ""
+    schemas = {"box": "Cube", "sphere": "Sphere", "ellipsoid": "Sphere", "capsule": "Capsule", "cylinder": "Cylinder"}
+    schema = (schemas | {"plane": "Plane", "mesh": "Mesh"}).get(kind)
+    body = int(model.geom_bodyid[geom])
+    if schema is None:
+        shown = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
+        raise RobotError(f"{draft.file}: {shown} of body {draft.body_name(body)} is of type {kind}, which USD does not have")
+    shape = getattr(shapes, schema).Define(draft.stage, draft.path(draft.bodies[body], name or mesh or kind))
+    scale = size if kind in ("box", "ellipsoid") else None
+    if kind == "box":
+        shape.CreateSizeAttr(2.0)
+    elif kind == "ellipsoid":
+        shape.CreateRadiusAttr(1.0)
+    elif kind == "mesh":
+        _fill(draft, geom, shape)
+    elif kind == "plane":
+        shape.CreateAxisAttr("Z")
+        for create, half in ((shape.CreateWidthAttr, size[0]), (shape.CreateLengthAttr, size[1])):
+            if half > 0:  # MuJoCo draws a half size of 0 without end, and collides every plane so, as UsdPhysics does
+                create(2.0 * float(half))
+    else:
+        shape.CreateRadiusAttr(float(size[0]))
+    if kind in ("capsule", "cylinder"):
+        shape.CreateAxisAttr("Z")
+        shape.CreateHeightAttr(2.0 * float(size[1]))
+    shape.CreateExtentAttr(shapes.Boundable.ComputeExtentFromPlugins(shape, usd().Usd.TimeCode.Default()))
+    return shape, scale
+
+
+def _fill(draft: Draft, geom: int, shape: Any) -> None:
+    """Write a mesh's triangles, in the geom's frame: MuJoCo's own vertices, bit by bit."""
+    model, mesh, u = draft.model, int(draft.model.geom_dataid[geom]), usd()
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.mesh_vert[first : first + count])))
+    first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
+    shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
+    shape.CreateSubdivisionSchemeAttr("none")
+
+
+def _colour(draft: Draft, geom: int, shape: Any) -> None:
+    model = draft.model
+    rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
+        rgba = model.mat_rgba[material]
+    *colour, opacity = rgba.tolist()
+    shape.CreateDisplayColorAttr([usd().Gf.Vec3f(*colour)])
+    if opacity != 1.0:
+        shape.CreateDisplayOpacityAttr([opacity])
+
+
+def _collide(draft: Draft, geom: int, prim: Any, materials: str) -> None:
+    u = usd()
+    u.UsdPhysics.CollisionAPI.Apply(prim)
+    if prim.IsA(u.UsdGeom.Mesh):
+        u.UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")  # as MuJoCo collides it
+    friction = float(draft.model.geom_friction[geom, 0])
+    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(draft, friction, materials), materialPurpose="physics")
+
+
+def _material(draft: Draft, friction: float, scope: str) -> Any:
+    """Return the physics material of a sliding friction; geoms of the same friction share it."""
+    u = usd()
+    if friction not in draft.frictions:
+        material = u.UsdShade.Material.Define(draft.stage, draft.path(scope, f"friction_{friction!r}"))
+        surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+        surface.CreateStaticFrictionAttr(friction)
+        surface.CreateDynamicFrictionAttr(friction)
+        draft.frictions[friction] = material
+    return draft.frictions[friction]
+
+
+def add_sites(draft: Draft, body: int) -> None:
+    """Write the sites of a body below its prim, as frames."""
+    model = draft.model
+    for site in np.flatnonzero(model.site_bodyid == body).tolist():
+        name = model.site(site).name
+        prim = usd().UsdGeom.Xform.Define(draft.stage, draft.path(draft.bodies[body], name or "site")).GetPrim()
+        place(prim, model.site_pos[site], model.site_quat[site])
+        note(prim, "site", True)
+        note(prim, "name", name)

@@ -1,0 +1,240 @@
+"""An opened USD stage: what failed to resolve, its units and up-axis, poses in metres with Z up, names, and what is dropped."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.errors import RobotError, listed
+
+Prim = Any
+"""A `pxr.Usd.Prim`: usd-core has no type stubs, and is only there if it is installed."""
+Matrix = Float[np.ndarray, "4 4"]
+"""A homogeneous transform of column vectors."""
+SHEAR = 1e-5
+"""Cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32."""
+NAME_ATTRIBUTE = "tgdsl:name"
+"""A custom string attribute of a prim: the name that it has in MJCF."""
+
+
+def pxr() -> Any:
+    """Return the modules of usd-core that this package uses.
+
+    Raises:
+        RobotError: If it is not installed.
+    """
+    try:
+        from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils
+    except ImportError as error:
+        raise RobotError("reading USD needs usd-core: pip install usd-core") from error
+    return SimpleNamespace(
+        Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, UsdUtils=UsdUtils
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A composed stage.
+
+    Attributes:
+        file: The file that it came from.
+        usd: The `pxr.Usd.Stage`.
+        pxr: The modules of usd-core.
+        dropped: Prim paths by what was not kept of them, in the order met.
+    """
+
+    file: Path
+    usd: Any
+    pxr: Any
+    dropped: dict[str, list[str]] = field(default_factory=dict)
+
+    @cached_property
+    def metres(self) -> float:
+        """Length of the stage's unit [m]."""
+        return float(self.pxr.UsdGeom.GetStageMetersPerUnit(self.usd))
+
+    @cached_property
+    def kilograms(self) -> float:
+        """Mass of the stage's unit [kg]."""
+        return float(self.pxr.UsdPhysics.GetStageKilogramsPerUnit(self.usd))
+
+    @cached_property
+    def prims(self) -> tuple[Prim, ...]:
+        """All defined, active, loaded prims, those inside instances too, in stage order."""
+        usd = self.pxr.Usd
+        return tuple(usd.PrimRange(self.usd.GetPseudoRoot(), usd.TraverseInstanceProxies()))[1:]
+
+    @cached_property
+    def world(self) -> Matrix:
+        """From the stage's own space and unit to metres with Z up."""
+        matrix = np.eye(4)
+        if self.pxr.UsdGeom.GetStageUpAxis(self.usd) == self.pxr.UsdGeom.Tokens.y:
+            matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+        matrix[:3, :3] *= self.metres
+        return matrix
+
+    @cached_property
+    def _time(self) -> Any:
+        # What is only authored as time samples starts where they start.
+        return self.pxr.Usd.TimeCode.EarliestTime()
+
+    @cached_property
+    def _poses(self) -> Any:
+        return self.pxr.UsdGeom.XformCache(self._time)
+
+    def value(self, prim: Prim, name: str) -> Any:
+        """Return an attribute's value, the schema's own where none is authored, or None where there is no such attribute."""
+        attribute = prim.GetAttribute(name)
+        return attribute.Get(self._time) if attribute else None
+
+    def authored(self, prim: Prim, name: str) -> Any:
+        """Return an attribute's value if it is authored, or else None."""
+        attribute = prim.GetAttribute(name)
+        return attribute.Get(self._time) if attribute and attribute.HasAuthoredValue() else None
+
+    def number(self, prim: Prim, name: str, default: float = 0.0) -> float:
+        """Return the value of a scalar attribute."""
+        value = self.value(prim, name)
+        if value is not None and np.isnan(value):
+            raise self.error(prim, f"{name} is not a number")
+        return default if value is None else float(value)
+
+    def pose(self, prim: Prim) -> Matrix:
+        """Return the transform from a prim's space to the world in metres with Z up, scale and shear included.
+
+        Raises:
+            RobotError: If it is not finite.
+        """
+        own = np.eye(4) if prim.IsPseudoRoot() else np.array(self._poses.GetLocalToWorldTransform(prim), dtype=np.float64).T
+        if not np.isfinite(own).all():
+            raise self.error(prim, "its transform is not finite")
+        return self.world @ own
+
+    def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, 3]]:
+        """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes.
+
+        Raises:
+            RobotError: If the prim is sheared or flat, and so has no frame.
+        """
+        pose = self.pose(prim)
+        split = rotation_and_scale(pose[:3, :3])
+        if split is None:
+            raise self.error(prim, "its transform is sheared or flat, so that it has no rigid frame")
+        rigid = pose.copy()
+        rigid[:3, :3], scale = split
+        return rigid, scale
+
+    def error(self, prim: Prim, what: str) -> RobotError:
+        """Return an error that names the file and the prim."""
+        return RobotError(f"{self.file}: {prim.GetPath()}: {what}")
+
+    def drop(self, what: str, prim: Prim) -> None:
+        """Take note of something that is not kept."""
+        paths = self.dropped.setdefault(what, [])
+        if (path := str(prim.GetPath())) not in paths:
+            paths.append(path)
+
+
+def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, 3]] | None:
+    """Split a linear map into a rotation after a scale along the axes (negative where it mirrors), or None if it shears."""
+    lengths = np.linalg.norm(linear, axis=0)
+    if not (lengths > 0).all():
+        return None
+    axes = linear / lengths
+    if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:
+        return None
+    u, _, v = np.linalg.svd(axes)  # the nearest orthogonal matrix: authored rotations are rounded
+    rotation = u @ v
+    return (rotation, lengths) if np.linalg.det(rotation) > 0 else (-rotation, -lengths)
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Stage]:
+    """Open a stage, with all that it refers to; at the end warn once of each kind of thing that was dropped.
+
+    USD's own printing is turned into warnings.
+
+    Raises:
+        RobotError: If it is not USD, or something that it refers to does not resolve.
+    """
+    modules = pxr()
+    printed = modules.UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        if not path.is_file():
+            raise RobotError(f"{path}: there is no such file")
+        try:
+            usd = modules.Usd.Stage.Open(str(path))
+        except modules.Tf.ErrorException as error:
+            raise RobotError(f"{path}: not a USD file: {_told(error)}") from error
+        stage = Stage(path, usd, modules)
+        _check_composition(stage)
+        yield stage
+        for what, paths in stage.dropped.items():
+            warnings.warn(f"{path}: {what}: {listed(paths)}", stacklevel=4)
+        for diagnostic in printed.TakeUncoalescedDiagnostics():
+            warnings.warn(f"{path}: USD: {' '.join(diagnostic.commentary.split())}", stacklevel=4)
+    finally:
+        printed.TakeUncoalescedDiagnostics()  # what is left in the delegate is printed when it goes
+        del printed
+
+
+def _told(error: Exception) -> str:
+    """Return USD's own account of an error, without the places in its sources."""
+    lines = [line.partition(" : ")[2].strip("' ") for line in str(error).splitlines() if " : " in line]
+    return " ".join("; ".join(dict.fromkeys(lines)).split())
+
+
+def _check_composition(stage: Stage) -> None:
+    """Refuse a stage with references, payloads or sublayers that do not resolve: USD only prints a line."""
+    problems = sorted(
+        {f"{error.rootSite.path}: {' '.join(str(error).split()).rstrip('.')}" for error in stage.usd.GetCompositionErrors()}
+    )
+    if problems:
+        raise RobotError(f"{stage.file}: {listed(problems)}")
+
+
+def unique_names(stage: Stage, prims: Iterable[Prim], reserved: Iterable[str] = ()) -> dict[str, str]:
+    """Return a name for each prim path: the authored `tgdsl:name`, or the end of the path, as long as it takes to be unique.
+
+    Args:
+        stage: The stage.
+        prims: What to name, in stage order.
+        reserved: Names that are taken.
+    """
+    prims, taken = list(prims), Counter(reserved)
+    names: dict[str, str] = {}
+    for prim in prims:
+        name = stage.authored(prim, NAME_ATTRIBUTE)
+        if name and taken[str(name)]:
+            stage.drop(f"names in {NAME_ATTRIBUTE} were dropped that are taken", prim)
+        elif name:
+            names[str(prim.GetPath())] = str(name)
+            taken[str(name)] += 1
+    parts = {path: path.strip("/").split("/") for prim in prims if (path := str(prim.GetPath())) not in names}
+    depth = dict.fromkeys(parts, 1)
+    while True:
+        ends = {path: "_".join(parts[path][-depth[path] :]) for path in parts}
+        counts = taken + Counter(ends.values())
+        longer = [path for path in parts if counts[ends[path]] > 1 and depth[path] < len(parts[path])]
+        if not longer:
+            break
+        for path in longer:
+            depth[path] += 1
+    for path, name in ends.items():  # only `/a/b_c` beside `/a_b/c` still share one
+        free, number = name, 1
+        while taken[free]:
+            number += 1
+            free = f"{name}_{number}"
+        names[path] = free
+        taken[free] += 1
+    return names
