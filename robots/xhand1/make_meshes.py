@@ -8,66 +8,14 @@ Run `python robots/xhand1/make_meshes.py` to write `assets/*.stl` again (metres;
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
 from pathlib import Path
 
-import numpy as np
-import trimesh
-from scipy.interpolate import PchipInterpolator
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # as a script, this sees only its own folder
 
-ASSETS = Path(__file__).parent / "assets"
-ROUNDING = 6
-"""Decimals of the coordinates in metres: rounding to micrometres makes the files the same on every machine."""
+from robots.loft import Shape, Station, write
 
-
-@dataclass(frozen=True)
-class Station:
-    """A cross section of a link; lengths in millimetres, in the link's (body) frame.
-
-    Attributes:
-        at: Position along the link's long axis.
-        center: Middle of the section on the lateral axis.
-        half_width: Half of its extent on the lateral axis.
-        front: Coordinate of its summit on the pad's side.
-        back: Coordinate of its summit on the other side.
-    """
-
-    at: float
-    center: float
-    half_width: float
-    front: float
-    back: float
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A link's outer surface.
-
-    Attributes:
-        along: Index of the long axis: 1 for y, 2 for z.
-        facing: Index of the axis that the pad faces.
-        middle: Coordinate on the facing axis where sections are widest [mm].
-        front_exponent: Exponent of the sections' front halves: 2 is an ellipse, more is boxier.
-        back_exponent: The same of their back halves.
-        num_rings: Sections in the mesh.
-        num_around: Vertices of a section, a multiple of four.
-        stations: The sections that are given, in ascending order; those between follow a monotone curve through them.
-    """
-
-    along: int
-    facing: int
-    middle: float
-    front_exponent: float
-    back_exponent: float
-    num_rings: int
-    num_around: int
-    stations: tuple[Station, ...]
-
-    @property
-    def lateral(self) -> int:
-        """Index of the axis across the link."""
-        return 3 - self.along - self.facing
-
+ASSETS = Path(__file__).resolve().parent / "assets"
 
 # The fist-sized part from the wrist's flange (z = 0) to the knuckles; the slot of the thumb's base is filled.
 PALM = Shape(
@@ -263,62 +211,5 @@ SHAPES = {
     "thumb_link2": THUMB_LINK2,
 }
 
-
-def rings(shape: Shape) -> np.ndarray:
-    """Return at, center, half_width, front and back of every ring of the mesh, shape (num_rings, 5) [mm].
-
-    Rings are spread evenly over the length of the outline, so that the rounded ends get enough of them.
-    """
-    rows = np.array([(s.at, s.center, s.half_width, s.front, s.back) for s in shape.stations])
-    steps = np.linalg.norm(np.diff(rows[:, [0, 2, 3]], axis=0), axis=1)
-    distance = np.concatenate([[0.0], np.cumsum(steps)])
-    return PchipInterpolator(distance, rows)(np.linspace(0.0, distance[-1], shape.num_rings))
-
-
-def section(shape: Shape, ring: np.ndarray) -> np.ndarray:
-    """Return the vertices of a ring in the body frame, counter-clockwise about the long axis or against it [mm]."""
-    at, center, half_width, front, back = ring
-    angle = 2 * np.pi * np.arange(shape.num_around) / shape.num_around
-    is_front = np.sin(angle) >= 0
-    power = 2 / np.where(is_front, shape.front_exponent, shape.back_exponent)
-    vertices = np.empty((shape.num_around, 3))
-    vertices[:, shape.along] = at
-    vertices[:, shape.lateral] = center + half_width * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** power
-    depth = np.where(is_front, front - shape.middle, shape.middle - back)
-    vertices[:, shape.facing] = shape.middle + depth * np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** power
-    return vertices
-
-
-def loft(shape: Shape) -> trimesh.Trimesh:
-    """Return the closed surface through all rings, ends capped, faces outward [m]."""
-    sections = [section(shape, ring) for ring in rings(shape)]
-    num = shape.num_around
-    vertices = np.concatenate([*sections, [sections[0].mean(axis=0)], [sections[-1].mean(axis=0)]]) / 1000
-    here, following = np.arange(num), np.roll(np.arange(num), -1)
-    faces = []
-    for k in range(len(sections) - 1):
-        low, high = k * num, (k + 1) * num
-        faces.append(np.stack([low + here, low + following, high + following], axis=1))
-        faces.append(np.stack([low + here, high + following, high + here], axis=1))
-    last = (len(sections) - 1) * num
-    faces.append(np.stack([following, here, np.full(num, len(vertices) - 2)], axis=1))
-    faces.append(np.stack([last + here, last + following, np.full(num, len(vertices) - 1)], axis=1))
-    mesh = trimesh.Trimesh(vertices.round(ROUNDING), np.concatenate(faces), process=False)
-    if mesh.volume < 0:
-        mesh.invert()
-    return mesh
-
-
-def main() -> None:
-    """Write all meshes."""
-    ASSETS.mkdir(exist_ok=True)
-    for name, shape in SHAPES.items():
-        mesh = loft(shape)
-        if not (mesh.is_watertight and mesh.is_winding_consistent):
-            raise SystemExit(f"{name} is not a closed surface")
-        mesh.export(ASSETS / f"{name}.stl")
-        print(f"{name}: {len(mesh.faces)} triangles, {mesh.volume * 1e6:.1f} cm³")
-
-
 if __name__ == "__main__":
-    main()
+    write(SHAPES, ASSETS)

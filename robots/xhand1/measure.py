@@ -6,84 +6,12 @@ Exits with 1 if the mean distance is 1 mm or more, the mean angle 20° or more, 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-import igl
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # as a script, this sees only its own folder
 
-from tgdsl.compiler.robot import Model, load_model
-from tgdsl.compiler.sample import Samples, sample
-from tgdsl.geometry.surface import Surface
-from tgdsl.schema import yaml
-from tgdsl.schema.placement import LayoutSpec, Placement
-
-HERE = Path(__file__).resolve().parent
-MAX_DISTANCE = 1e-3
-"""The mean distance must be below this [m]."""
-MAX_ANGLE = 20.0
-"""The mean angle between normals must be below this [deg]."""
-
-
-def layout() -> dict[str, dict[str, Placement]]:
-    """Return how each link is sampled, by resolution and link name."""
-    file = HERE / "layout.yaml"
-    return LayoutSpec.model_validate(yaml.parse(file.read_text(encoding="utf-8"), file.name).value).resolutions
-
-
-def surface(robot: Model, link: str) -> Surface:
-    """Return the surface of a link, in its body frame."""
-    return robot.surface(robot.touchable(link))
-
-
-def taxels(robot: Model, placements: dict[str, Placement]) -> dict[str, Samples]:
-    """Return each link's taxels, in its body frame."""
-    return {link: sample(surface(robot, link), placement, HERE) for link, placement in placements.items()}
-
-
-def errors(samples: Samples, reference: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance [m] of each taxel to a surface, and the angle [deg] to its normal at the nearest point."""
-    squared, face, _ = igl.point_mesh_squared_distance(samples.pos, reference.vertices, reference.faces)
-    cosine = (reference.face_normals[np.asarray(face)] * samples.normal).sum(axis=1)
-    return np.sqrt(squared), np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def row(name: str, distance: np.ndarray, angle: np.ndarray) -> str:
-    """Return a line of the report."""
-    return (
-        f"{name:<30} {len(distance):6d} {1e3 * distance.mean():8.3f} {1e3 * distance.max():7.3f}"
-        f" {angle.mean():9.2f} {angle.max():8.2f}"
-    )
-
-
-def same_counts(ours: Model, reference: Model) -> bool:
-    """Print the number of taxels at each resolution; return whether each link has as many on both surfaces."""
-    is_same = True
-    for resolution, placements in layout().items():
-        mine, theirs = (
-            {link: len(samples.pos) for link, samples in taxels(robot, placements).items()} for robot in (ours, reference)
-        )
-        print(f"{resolution}: {sum(mine.values())} taxels on our surfaces, {sum(theirs.values())} on the vendor's")
-        is_same &= mine == theirs
-    return is_same
-
-
-def main() -> None:
-    """Print the comparison at the highest resolution, per link and in total."""
-    parser = argparse.ArgumentParser(description="Compare our surfaces with the vendor's.")
-    parser.add_argument("reference_dir", type=Path, help="folder that holds the vendor's URDF and meshes")
-    [urdf] = parser.parse_args().reference_dir.glob("*.urdf")
-    ours, reference = load_model(HERE / "xhand1_right.xml"), load_model(urdf)
-    is_good = same_counts(ours, reference)
-    found = {link: errors(samples, surface(reference, link)) for link, samples in taxels(ours, layout()["high"]).items()}
-    print(f"{'link':<30} taxels  mean mm  max mm  mean deg  max deg")
-    for link, (distance, angle) in found.items():
-        print(row(link, distance, angle))
-    distance, angle = (np.concatenate(parts) for parts in zip(*found.values(), strict=True))
-    print(row("all", distance, angle))
-    sys.exit(0 if is_good and distance.mean() < MAX_DISTANCE and angle.mean() < MAX_ANGLE else 1)
-
+from robots.measure import compare
 
 if __name__ == "__main__":
-    main()
+    compare(Path(__file__).resolve().parent, "xhand1_right.xml")
