@@ -300,10 +300,13 @@ def test_what_a_state_may_hold(tmp_path):
         ({"variants": [{"type": "sphere", "size": ["1 kg"]}]}, "objects.item.variants[0].size[0]: "),
         ({"variants": [{"geoms": [{"type": "sphere"}]}]}, 'objects.item.variants[0].geoms[0]: missing key "size"'),
         ({"variants": [{"type": "sphere", "size": [0.01], "quat": [0, 0, 0, 0]}]}, "is no orientation"),
-        ({"variants": ODD, "surface": "skin"}, 'surface "skin" names a geom; with variants it is `collision` or `visual`'),
+        (
+            {"variants": ODD, "surface": "skin"},
+            'surface "skin" names a geom; with geoms of its own it is `collision` or `visual`',
+        ),
         ({"variants": ODD, "size": "per_env"}, "has one geom, a primitive; found sphere, box; primitives: sphere"),
-        ({"variants": ODD, "body": "pad"}, 'body "pad" carries taxels, so its geoms cannot vary'),
-        ({"size": "per_env", "body": "floor"}, 'the geoms of body "floor" vary, but object "floor" has it too'),
+        ({"variants": ODD, "body": "pad"}, 'body "pad" carries taxels, so its geoms cannot be others'),
+        ({"size": "per_env", "body": "floor"}, 'the geoms of body "floor" are this object'),
     ],
 )
 def test_mistakes(tmp_path, target, message):

@@ -1,4 +1,4 @@
-"""The command line: `tgdsl compile`, `explain`, `schema` and `run`."""
+"""The command line: `tgdsl compile`, `explain`, `run`, `schema`, `import` and `export-usd`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.errors import SpecError, TgdslError
+from tgdsl.errors import SpecError, TgdslError, did_you_mean
 
 if TYPE_CHECKING:
     from tgdsl.module import TactileModule
@@ -136,6 +136,60 @@ class Run:
         print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
 
 
+Robot = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROBOT")]
+
+
+@dataclass(frozen=True)
+class Import:
+    """Turn a USD stage into MJCF, with its meshes as .obj files in a folder beside it."""
+
+    stage: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STAGE")]
+    """The stage: .usd, .usda, .usdc or .usdz."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """The MJCF file; default: the stage's name with the ending .xml, in the working folder."""
+
+    def run(self) -> None:
+        """Write it."""
+        from tgdsl.compiler.usd import usd_to_mjcf, write_mjcf
+
+        out = self.out or Path(self.stage.with_suffix(".xml").name)
+        write_mjcf(usd_to_mjcf(self.stage), out)
+        print(out)
+
+
+@dataclass(frozen=True)
+class ExportUsd:
+    """Turn an MJCF or URDF file into a USD stage."""
+
+    robot: Robot
+    """The robot's file, or the name of a robot that comes with tgdsl."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """The stage: .usda (text), .usdc or .usd; default: the robot's name with the ending .usda, in the working folder."""
+
+    def run(self) -> None:
+        """Write it."""
+        from tgdsl.compiler.usd_export import export_usd
+
+        file = robot_path(self.robot)
+        out = self.out or Path(file.with_suffix(".usda").name)
+        export_usd(file, out)
+        print(out)
+
+
+def robot_path(robot: Path) -> Path:
+    """Return the file of a robot given by a path or by name.
+
+    Raises:
+        TgdslError: If there is none.
+    """
+    from tgdsl.schema.files import robot_file, robot_names
+
+    found = robot_file(str(robot), Path())
+    if found is None:
+        raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(str(robot), robot_names(), "robots")}')
+    return found
+
+
 def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
     """Return `KEY=VALUE` arguments as a mapping.
 
@@ -163,6 +217,8 @@ Command = (
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
+    | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
 )
 
 

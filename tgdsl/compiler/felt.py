@@ -74,31 +74,32 @@ class FeltBody:
     is_sized: bool
 
 
-def felt_body(target: ObjectSpec, scenes: Sequence[tuple[Model, tuple[str, ...]]], report: Report) -> FeltBody:
-    """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its variants' own.
+def felt_body(body: str, target: ObjectSpec, scenes: Sequence[tuple[Model, tuple[str, ...]]], report: Report) -> FeltBody:
+    """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its own.
 
     Args:
+        body: Its body.
         target: What the document says of it.
-        scenes: The scene; or, if it has variants, the scene with each of them and the names of the variant's geoms.
+        scenes: The scene; or, if it has geoms of its own, the scene with each variant of them, and their names.
         report: Called with mistakes.
     """
     variants = []
     for scene, names in scenes:
         own = tuple(geom for geom in scene.geoms if geom.name in names)
-        geoms = _chosen(target, scene, report) if target.variants is None else own
-        variants.append(_felt(geoms, target, scene, report))
+        geoms = own if target.compounds else _chosen(body, target, scene, report)
+        variants.append(_felt(geoms, body, target, scene, report))
     if target.size == "per_env":
-        own = [geom for geom in scenes[0][0].geoms if geom.body == target.body]
-        for felt in [own] if target.variants is None else variants:
+        own = [geom for geom in scenes[0][0].geoms if geom.body == body]
+        for felt in variants if target.compounds else [own]:
             if len(felt) != 1 or felt[0].shape not in NUM_SIZES:
                 found = ", ".join(geom.shape for geom in felt)
                 hint = f"primitives: {', '.join(NUM_SIZES)}"
-                report(f'with `size: per_env` the body "{target.body}" has one geom, a primitive; found {found}', hint)
+                report(f'with `size: per_env` the body "{body}" has one geom, a primitive; found {found}', hint)
                 break
-    return FeltBody(target.body, tuple(variants), target.size == "per_env")
+    return FeltBody(body, tuple(variants), target.size == "per_env")
 
 
-def _felt(geoms: Sequence[Geom], target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
+def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
     felt = []
     for geom in geoms:
         if geom.shape == "mesh":
@@ -107,23 +108,23 @@ def _felt(geoms: Sequence[Geom], target: ObjectSpec, scene: Model, report: Repor
         elif geom.shape in SHAPES:
             felt.append(FeltGeom(geom, None))
         else:
-            what = f'{geom.shown} of body "{target.body}" is of type {geom.shape}, which cannot be felt'
+            what = f'{geom.shown} of body "{body}" is of type {geom.shape}, which cannot be felt'
             report(what, f"types that can: {', '.join(SHAPES)}, mesh")
     return tuple(felt)
 
 
-def _chosen(target: ObjectSpec, scene: Model, report: Report) -> tuple[Geom, ...]:
-    own = tuple(geom for geom in scene.geoms if geom.body == target.body)
+def _chosen(body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[Geom, ...]:
+    own = tuple(geom for geom in scene.geoms if geom.body == body)
     if not own:
-        report(f'body "{target.body}" has no geoms to feel', "")
+        report(f'body "{body}" has no geoms to feel', "")
     if target.surface == "collision":
-        return scene.touchable(target.body)
+        return scene.touchable(body)
     if target.surface == "visual":
         return tuple(geom for geom in own if not geom.is_colliding) or own
     named = tuple(geom for geom in own if any(matching(target.surface, [name]) for name in geom.names))
     if own and not named:
         names = sorted({name for geom in own for name in geom.names})
-        report(f'no geom or mesh of body "{target.body}" matches "{target.surface}"', f"it has {', '.join(names)}")
+        report(f'no geom or mesh of body "{body}" matches "{target.surface}"', f"it has {', '.join(names)}")
     return named
 
 

@@ -42,7 +42,7 @@ def compile_plan(document: Document, overrides: Mapping[str, str] | None = None,
     loaded = load(document, overrides, known)
     resolved = resolve(loaded)
     plan = lower.plan(loaded, resolved, known, _origin(loaded))
-    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.varied, resolved.meshes))
+    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
 
 
 def compile(

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltBody, felt_body
+from tgdsl.compiler.felt import FeltBody
+from tgdsl.compiler.objects import felt_objects, own_objects
 from tgdsl.compiler.robot import Geom, Model, load_model
 from tgdsl.compiler.sample import Samples, sample
-from tgdsl.compiler.variants import Meshes, scene_object, variant_scenes
+from tgdsl.compiler.variants import OwnObjects
 from tgdsl.errors import Problem, SampleError, did_you_mean, listed
 from tgdsl.layout import Layout, Link
-from tgdsl.plan import SceneObject
 from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
@@ -38,8 +38,7 @@ class Resolved:
         layout: Taxels of the links that some sensor has.
         links: Names of each sensor's links.
         objects: What can be felt of each object that is felt.
-        varied: The objects among them that differ between environments.
-        meshes: The mesh files that these name.
+        own: The objects with geoms or sizes of their own.
         scene: The model that holds robot and objects.
         robot: The robot's own model.
         unused: What has taxels or can be felt but is not needed, and why.
@@ -48,8 +47,7 @@ class Resolved:
     layout: Layout
     links: dict[str, tuple[str, ...]]
     objects: dict[str, FeltBody]
-    varied: tuple[SceneObject, ...]
-    meshes: Meshes
+    own: OwnObjects
     scene: Model
     robot: Model
     unused: tuple[tuple[str, str], ...]
@@ -66,8 +64,7 @@ def resolve(loaded: Loaded) -> Resolved:
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, FeltBody] = {}
-    varied: dict[str, SceneObject] = {}
-    meshes = Meshes()
+    own = OwnObjects()
     if robot is not None and loaded.layout is not None:
         _check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
@@ -76,8 +73,8 @@ def resolve(loaded: Loaded) -> Resolved:
             links = _sensor_links(loaded, loaded.layout, robot, patches)
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
-        varied = _varied(loaded, scene, patches, meshes)
-        objects = _objects(loaded, scene, varied, meshes)
+        scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
+        objects = felt_objects(loaded, scene, own)
     loaded.raise_problems()
     assert robot is not None and scene is not None and loaded.layout is not None
     needed = {name for names in links.values() for name in names}
@@ -85,11 +82,10 @@ def resolve(loaded: Loaded) -> Resolved:
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
-    listed_bodies = {target.body for target in loaded.spec.objects.values()}
+    listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
     others = [body for body in scene.bodies if body not in robot.bodies[1:] and body not in listed_bodies]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
-    kept = tuple(target for name, target in varied.items() if name in objects)
-    return Resolved(layout, links, objects, kept, meshes, scene, robot, tuple(unused))
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused))
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
@@ -207,54 +203,6 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         what = f'the scene has no body "{missing[0]}", which the robot has'
         hint = did_you_mean(missing[0], scene.bodies, "bodies")
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
-
-
-def _varied(loaded: Loaded, scene: Model, patches: list[Patch], meshes: Meshes) -> dict[str, SceneObject]:
-    """Return the objects that differ between environments."""
-    varied: dict[str, SceneObject] = {}
-    for name, target in loaded.spec.objects.items():
-        if (target.variants is None and target.size == "fixed") or target.body not in scene.bodies:
-            continue
-
-        def report(place: Path, what: str, hint: str, name: str = name) -> None:
-            loaded.problems.append(loaded.problem(("objects", name, *place), what, hint))
-
-        others = [other for other, part in loaded.spec.objects.items() if part.body == target.body and other != name]
-        if target.body in [patch.link.body for patch in patches]:
-            report(("body",), f'body "{target.body}" carries taxels, so its geoms cannot vary', "")
-        elif others:
-            report(("body",), f'the geoms of body "{target.body}" vary, but object "{others[0]}" has it too', "")
-        elif not any(geom.body == target.body for geom in scene.geoms):
-            report(("body",), f'body "{target.body}" has no geom', "its first geom says what variants do not, such as friction")
-        else:
-            varied[name] = scene_object(name, target, loaded.folder, meshes, report)
-    return varied
-
-
-def _objects(loaded: Loaded, scene: Model, varied: dict[str, SceneObject], meshes: Meshes) -> dict[str, FeltBody]:
-    """Return the objects that some sensor feels."""
-    felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.feels}
-    is_faulty = bool(loaded.problems)
-    objects: dict[str, FeltBody] = {}
-    for name, target in loaded.spec.objects.items():
-        path: Path = ("objects", name, "body")
-        if target.body not in scene.bodies:
-            hint = did_you_mean(target.body, scene.bodies, "bodies")
-            loaded.problems.append(loaded.problem(path, f'no body is named "{target.body}"', hint))
-            continue
-
-        def report(what: str, hint: str, at: Path = path) -> None:
-            loaded.problems.append(loaded.problem(at, what, hint))
-
-        scenes: list[tuple[Model, tuple[str, ...]]] = [(scene, ())]
-        if target.variants is not None and is_faulty:
-            continue  # what is wrong with them is known already
-        if target.variants is not None:
-            scenes = variant_scenes(scene, varied[name], meshes.contents)
-        body = felt_body(target, scenes, report)
-        if name in felt:
-            objects[name] = body
-    return objects
 
 
 def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> Layout:

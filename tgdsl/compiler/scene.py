@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 
 from tgdsl.compiler.robot import Model
-from tgdsl.compiler.variants import Meshes
+from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError
-from tgdsl.plan import Asset, Inputs, SceneFile, SceneObject, contact_sensor_names
+from tgdsl.plan import Asset, Inputs, SceneFile, contact_sensor_names
 from tgdsl.scene import compiled, portable
 
 SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
@@ -106,8 +106,8 @@ def _contact_sensors(inputs: Inputs) -> Iterator[tuple[str, str, str, tuple[str,
             yield net, inputs.bodies_of[pair.object], pair.link, ("found", "force"), "netforce", 1
 
 
-def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = (), meshes: Meshes | None = None) -> SceneFile:
-    """Return a scene with the contact sensors that a module wants, as text, and the objects that vary with their meshes.
+def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> SceneFile:
+    """Return a scene with the contact sensors that a module wants, as text, and the objects that have geoms of their own.
 
     The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
     the scene does not depend on where they lie. It is compiled again and compared, so that nothing goes missing unnoticed.
@@ -115,17 +115,18 @@ def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = 
     Raises:
         RobotError: If a file cannot be found, or what is kept is not what was loaded.
     """
-    kept = _Kept()
-    if meshes is not None:
-        named = {geom.mesh for target in objects for geoms in target.variants for geom in geoms if geom is not None}
-        kept.assets |= {key: asset for key, asset in meshes.assets.items() if key in named}
-        kept.contents |= meshes.contents
+    own = OwnObjects() if own is None else own
+    kept = _Kept(start_qpos(own.bodies))
+    kept.assets |= own.meshes.assets
+    kept.contents |= own.meshes.contents
     if model.mjcf:
         main = kept.rewritten(ET.fromstring(model.mjcf), model.file, [model.file.parent])
     elif model.is_urdf:
         main = kept.rewritten(ET.fromstring(model.spec.to_xml()), model.file, [model.file.parent])
     else:
         main = kept.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
+    if own.bodies:
+        main.append(as_worldbody(own.bodies))
     sensors = ET.SubElement(main, "sensor")
     for name, body1, body2, data, reduce, num in _contact_sensors(inputs):
         attributes = {"name": name, "body1": body1, "body2": body2, "data": " ".join(data), "reduce": reduce, "num": str(num)}
@@ -134,7 +135,7 @@ def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = 
         mjcf=ET.tostring(main, encoding="unicode"),
         parts=dict(sorted(kept.parts.items())),
         assets=tuple(sorted(kept.assets.values(), key=lambda asset: asset.key)),
-        objects=objects,
+        objects=own.objects,
     )
     try:
         again = compiled(scene, kept.contents)
@@ -147,7 +148,9 @@ def scene_file(model: Model, inputs: Inputs, objects: tuple[SceneObject, ...] = 
 class _Kept:
     """Collects the parts and assets of a scene while its files are rewritten to name them by content."""
 
-    def __init__(self) -> None:
+    def __init__(self, qpos: list[float]) -> None:
+        """Begin; `qpos` is what new bodies add to the keyframes."""
+        self.qpos = "".join(f" {value!r}" for value in qpos)
         self.parts: dict[str, str] = {}
         self.assets: dict[str, Asset] = {}
         self.contents: dict[str, bytes] = {}
@@ -171,6 +174,8 @@ class _Kept:
                 compiler.attrib.pop(attribute, None)
         for element in root.iter():
             name = element.get("file")
+            if element.tag == "key" and element.get("qpos"):
+                element.set("qpos", element.get("qpos", "") + self.qpos)
             if element.tag in ("include", "model") and name:
                 element.set("file", self._part(_found(name, [""], folders, file), folders, element.tag, settings))
             elif element.tag in ASSET_TAGS:

@@ -1,11 +1,14 @@
-"""Objects that differ between environments: their variants as geoms of the scene, and places that the variants share."""
+"""Objects with geoms of their own: new bodies of the scene, variants as geoms of it, and places that the variants share."""
 
 from __future__ import annotations
 
 import hashlib
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import mujoco
 
 from tgdsl.compiler.robot import Model
 from tgdsl.errors import RobotError
@@ -60,15 +63,90 @@ def aligned(rows: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], list[list[i
     return tuple(columns), tables
 
 
+@dataclass(frozen=True)
+class NewBody:
+    """A body that the scene is given.
+
+    Attributes:
+        name: Its name.
+        pos: Where it starts, in the world [m].
+        quat: How it is turned there, w, x, y, z.
+        is_free: Whether it moves freely, or is fixed to the world.
+    """
+
+    name: str
+    pos: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
+    is_free: bool
+
+
+PLACEHOLDER = 0.01
+"""Radius of the ball that a new body has until it is given its own geoms [m]."""
+
+
+def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
+    """Return a scene with new bodies after all of its own; in its keyframes they are where they start.
+
+    Raises:
+        RobotError: If MuJoCo cannot compile it.
+    """
+    if not bodies:
+        return scene
+    spec = scene.spec.copy()
+    for new in bodies:
+        body = spec.worldbody.add_body(name=new.name, pos=new.pos, quat=new.quat)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[PLACEHOLDER, 0, 0])
+        if new.is_free:
+            body.add_freejoint()
+    for key in spec.keys:
+        if len(key.qpos):
+            key.qpos = [*key.qpos, *start_qpos(bodies)]
+    try:
+        with muted_mujoco():
+            return replace(scene, spec=spec, compiled=spec.compile())
+    except ValueError as error:
+        raise RobotError(f"{scene.file}: {' '.join(str(error).split())}") from error
+
+
+def start_qpos(bodies: Sequence[NewBody]) -> list[float]:
+    """Return what new bodies add to `qpos` where they start."""
+    return [value for new in bodies if new.is_free for value in (*new.pos, *new.quat)]
+
+
+def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
+    """Return new bodies as MJCF."""
+    world = ET.Element("worldbody")
+    for new in bodies:
+        place = {"pos": " ".join(map(repr, new.pos)), "quat": " ".join(map(repr, new.quat))}
+        body = ET.SubElement(world, "body", {"name": new.name, **place})
+        if new.is_free:
+            ET.SubElement(body, "freejoint")
+        ET.SubElement(body, "geom", {"type": "sphere", "size": repr(PLACEHOLDER)})
+    return world
+
+
+@dataclass
+class OwnObjects:
+    """Objects with geoms or sizes of their own: the new bodies among them, what they are like, and their mesh files."""
+
+    bodies: tuple[NewBody, ...] = ()
+    objects: tuple[SceneObject, ...] = ()
+    meshes: Meshes = field(default_factory=Meshes)
+
+
 def scene_object(name: str, target: ObjectSpec, folder: Path, meshes: Meshes, report: Report) -> SceneObject:
     """Return an object's variants as geoms of the scene; mesh files are looked up from the document's folder."""
     compounds = target.compounds
     types, tables = aligned([[geom.type if isinstance(geom, PrimitiveGeom) else "mesh" for geom in c] for c in compounds])
+
+    def place(v: int) -> tuple[str | int, ...]:
+        return ("geom",) if target.geom is not None else ("variants", v)
+
     variants = []
     for v, (compound, table) in enumerate(zip(compounds, tables, strict=True)):
-        geoms = [_scene_geom(geom, folder, meshes, lambda what, v=v: report(("variants", v), what, "")) for geom in compound]
+        geoms = [_scene_geom(geom, folder, meshes, lambda what, at=place(v): report(at, what, "")) for geom in compound]
         variants.append(tuple(None if i is None else geoms[i] for i in table))
-    return SceneObject(name, target.body, types, tuple(variants), target.size == "per_env")
+    return SceneObject(name, target.body_of(name), types, tuple(variants), target.size == "per_env")
 
 
 def _scene_geom(

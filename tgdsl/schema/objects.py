@@ -86,15 +86,23 @@ CompoundGeoms.model_rebuild()
 
 
 class ObjectSpec(SpecModel):
-    """Something that taxels can feel."""
+    """Something that taxels can feel: a body of the scene as it is, with other geoms, or a body of its own."""
 
-    body: str
-    """Name of its body in the scene (or in the robot's file, if there is no scene)."""
+    body: str | None = None
+    """Name of its body in the scene (or in the robot's file, if there is no scene); default: a body of its own, of the object's
+    name, is added to the scene."""
+    geom: Variant | None = None
+    """Geom that the body has instead of its own. What else the scene says of the body's first geom, such as friction, stays."""
     variants: Annotated[tuple[Variant, ...], Field(min_length=1)] | None = None
-    """Geoms that the body has instead of its own, of which each environment takes one: see `SceneState.variant`. What else
-    the scene says of the body's first geom, such as friction, holds for all of them."""
+    """The same, of which each environment takes one: see `SceneState.variant`."""
     size: Literal["fixed", "per_env"] = "fixed"
     """`per_env` if its size is part of the state: see `SceneState.object_size`. It (and each variant) is then one primitive."""
+    pos: Position | None = None
+    """Where a body of its own starts, in the world [m]; default: the origin."""
+    quat: tuple[Number, Number, Number, Number] | None = None
+    """How it is turned there, w, x, y, z; default: not at all."""
+    joint: Literal["free", "fixed"] | None = None
+    """Whether a body of its own moves freely (the default) or is fixed to the world."""
     surface: str = "collision"
     """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
     the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is."""
@@ -107,12 +115,26 @@ class ObjectSpec(SpecModel):
     """Largest size of a grid [bytes]."""
 
     @model_validator(mode="after")
-    def _check_surface(self) -> ObjectSpec:
-        if self.variants is not None and self.surface not in ("collision", "visual"):
-            raise ValueError(f'surface "{self.surface}" names a geom; with variants it is `collision` or `visual`')
+    def _check(self) -> ObjectSpec:
+        if self.geom is not None and self.variants is not None:
+            raise ValueError("found `geom` and `variants`, expected one of them")
+        if self.body is None and not self.compounds:
+            raise ValueError("expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own")
+        placed = [key for key in ("pos", "quat", "joint") if getattr(self, key) is not None]
+        if self.body is not None and placed:
+            raise ValueError(f'`{placed[0]}` is for a body of its own; where body "{self.body}" is, the scene says')
+        if self.compounds and self.surface not in ("collision", "visual"):
+            raise ValueError(f'surface "{self.surface}" names a geom; with geoms of its own it is `collision` or `visual`')
+        if self.quat is not None:
+            _oriented(self.quat)
         return self
 
     @property
     def compounds(self) -> tuple[tuple[PrimitiveGeom | MeshGeom, ...], ...]:
-        """The geoms of each variant."""
-        return tuple(part.geoms if isinstance(part, CompoundGeoms) else (part,) for part in self.variants or ())
+        """The geoms of each variant; none if it is the scene's own."""
+        variants = self.variants or (() if self.geom is None else (self.geom,))
+        return tuple(part.geoms if isinstance(part, CompoundGeoms) else (part,) for part in variants)
+
+    def body_of(self, name: str) -> str:
+        """Return its body, its own name being this."""
+        return name if self.body is None else self.body
