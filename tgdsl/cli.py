@@ -153,6 +153,7 @@ class Import:
         from tgdsl.compiler.usd import usd_to_mjcf, write_mjcf
 
         out = self.out or Path(self.stage.with_suffix(".xml").name)
+        out.parent.mkdir(parents=True, exist_ok=True)
         write_mjcf(usd_to_mjcf(self.stage), out)
         print(out)
 
@@ -172,6 +173,7 @@ class ExportUsd:
 
         file = robot_path(self.robot)
         out = self.out or Path(file.with_suffix(".usda").name)
+        out.parent.mkdir(parents=True, exist_ok=True)
         export_usd(file, out)
         print(out)
 

@@ -100,6 +100,7 @@ BEYOND_A_SCHEMA = {
     "missing layout",
     "duplicate key",
     "huge number",
+    "an object that is nowhere",
     "not a name",
     "layout file that does not exist",
     "layout file with a name too long",

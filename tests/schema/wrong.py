@@ -67,7 +67,14 @@ WRONG = {
     ),
     "not a string": (instead("[ball]", "[3]"), "hand.yaml:11:13: sensors.touch.feels[0]: found 3, expected a string"),
     "not a mapping": (instead("{body: ball}", "ball"), 'hand.yaml:4:9: objects.ball: found "ball", expected a mapping'),
-    "nothing": (instead("{body: ball}", "{body: }"), "hand.yaml:4:15: objects.ball.body: found nothing, expected a string"),
+    "nothing": (
+        instead("{body: ball}", "{body: ball, surface: }"),
+        "hand.yaml:4:30: objects.ball.surface: found nothing, expected a string",
+    ),
+    "an object that is nowhere": (
+        instead("{body: ball}", "{}"),
+        "hand.yaml:4:9: objects.ball: expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own",
+    ),
     "not a selection": (
         instead("links: tips", "links: 3"),
         "hand.yaml:10:12: sensors.touch.links: not a selection, "

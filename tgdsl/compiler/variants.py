@@ -144,7 +144,7 @@ def scene_object(name: str, target: ObjectSpec, folder: Path, meshes: Meshes, re
 
     variants = []
     for v, (compound, table) in enumerate(zip(compounds, tables, strict=True)):
-        geoms = [_scene_geom(geom, folder, meshes, lambda what, at=place(v): report(at, what, "")) for geom in compound]
+        geoms = [_scene_geom(geom, folder, meshes, lambda what, v=v: report(place(v), what, "")) for geom in compound]
         variants.append(tuple(None if i is None else geoms[i] for i in table))
     return SceneObject(name, target.body_of(name), types, tuple(variants), target.size == "per_env")
 

@@ -35,18 +35,22 @@ def read_as(
         if not _is_follow_up(fault):
             problems.append(_translated(source, prefix, value, path, fault, known))
         entries.add(path if fault["type"] == "extra_forbidden" else _entry(path))
-    if not isinstance(value, dict):
-        return None
+    return _rest(value, model, entries, required) if isinstance(value, dict) else None
+
+
+def _rest(value: dict, model: type[BaseModel], entries: set[Path], required: tuple[str, ...]) -> BaseModel | None:
+    """Read what is left without some entries, nor those that are faulty without them."""
     rest = copy.deepcopy(value)
     for entry in sorted(entries, key=lambda path: [f"{part:>9}" for part in path], reverse=True):
         _remove(rest, entry)
-    for key in required:
-        if key not in rest:
-            return None
-    try:
-        return model.model_validate(rest)
-    except ValidationError:
+    if any(key not in rest for key in required):
         return None
+    known: dict[int, type[BaseModel]] = {}
+    try:
+        return model.model_validate(rest, context=known)
+    except ValidationError as error:
+        more = {_entry(_raw_path(rest, fault, known)) for fault in error.errors()}
+        return _rest(rest, model, more, required) if more and () not in more and rest != value else None
 
 
 def _is_follow_up(fault: Any) -> bool:
