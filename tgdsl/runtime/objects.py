@@ -25,12 +25,20 @@ class EnvObjects:
     To begin with, environment i has variant i modulo their number, in the size that the document or the scene gives.
 
     Shapes: `env` environments, `object` objects of `inputs.objects`.
+
+    Attributes:
+        variant: The field `variant` of a state.
+        object_size: The field `object_size` of a state [m]; 0 for objects whose size is not part of it.
     """
+
+    variant: Int[np.ndarray, "env object"]
+    object_size: Float[np.ndarray, "env object 3"]
 
     def __init__(self, scenes: SceneModels, inputs: Inputs, num_envs: int):
         self._scenes = scenes
         self._num_variants = dict(zip(inputs.objects, inputs.num_variants, strict=True))
         self._choices = [{name: Choice(env % num) for name, num in self._num_variants.items()} for env in range(num_envs)]
+        self._tabulate()
 
     def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
         """Say what objects are like in some environments: see `BatchSimulation.set_objects`."""
@@ -47,16 +55,11 @@ class EnvObjects:
                 choices[name] = replace(choices[name], size=(x, y, z))
         for env, choices in zip(ids, chosen, strict=True):
             self._choices[env] = choices
+        self._tabulate()
 
-    @property
-    def variant(self) -> Int[np.ndarray, "env object"]:
-        """The field `variant` of a state."""
-        return np.array([[choice.variant for choice in choices.values()] for choices in self._choices], dtype=np.int64)
-
-    @property
-    def object_size(self) -> Float[np.ndarray, "env object 3"]:
-        """The field `object_size` of a state [m]; 0 for objects whose size is not part of it."""
-        return np.array([[self._size(*item) for item in choices.items()] for choices in self._choices])
+    def _tabulate(self) -> None:
+        self.variant = np.array([[choice.variant for choice in own.values()] for own in self._choices], dtype=np.int64)
+        self.object_size = np.array([[self._size(*item) for item in own.items()] for own in self._choices])
 
     def models(self) -> list[mujoco.MjModel]:
         """Return each environment's model; those that are alike share one."""
