@@ -256,3 +256,13 @@ def test_bad_runs(base, tmp_path, fails):
     for arguments, message in cases.items():
         assert fails(base, "run", "pad.safetensors", *arguments, "--out", str(tmp_path / "out")).startswith(message)
     assert not (tmp_path / "out" / "readings.npz").exists()
+
+
+def test_run_holds_a_scene_without_keyframes(here, tmp_path):
+    start, end = SCENE.index("<keyframe>"), SCENE.index("</mujoco>")
+    (tmp_path / "scene.xml").write_text(SCENE[:start] + SCENE[end:])
+    (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    code, out, _ = here(tmp_path, "run", "pad.yaml", "--seconds", "0.1", "--out", "held")
+    assert code == 0 and "its initial state is held for 0.1 s" in out
+    with np.load(tmp_path / "held" / "readings.npz") as kept:
+        assert kept["touch"].shape[0] == 10

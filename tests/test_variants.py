@@ -264,7 +264,7 @@ def test_sizes_and_variants_can_be_set_anew(tmp_path):
         ({"variants": {"item": [0, 1]}}, r"expected 4 integers from 0 to 1, found \[0, 1\]"),
         ({"sizes": {"item": [0.01]}}, r"size of object item is \[0.01\], expected 3 positive lengths"),
         ({"variants": {"itme": 0}}, 'no object "itme" differs between environments; did you mean "item"'),
-        ({"variants": {"item": 0}, "env_ids": [7]}, "env_ids: index 7 is out of bounds"),
+        ({"variants": {"item": 0}, "env_ids": [7]}, "env_ids: found 7, expected indices from 0 to 3, or a mask of 4"),
     ):
         with pytest.raises(SimulationError, match=message):
             sim.set_objects(**bad)

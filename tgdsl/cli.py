@@ -85,8 +85,9 @@ class Run:
 
     document: Document
     """The YAML document, or an artefact (.safetensors)."""
-    keyframes: tuple[str, ...] = ("rest", "squeeze")
-    """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start."""
+    keyframes: tuple[str, ...] | None = None
+    """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start. Default: rest and
+    squeeze if the scene has them, else its initial state is held."""
     seconds: float = 1.0
     """Duration of each hold and of each move between keyframes [s]."""
     controls: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -107,19 +108,30 @@ class Run:
         from tqdm import tqdm
 
         from tgdsl.runtime.batch import simulate
-        from tgdsl.runtime.rollout import Recorder, recorded_controls, rollout, scripted_controls
+        from tgdsl.runtime.rollout import (
+            Recorder,
+            default_keyframes,
+            held_controls,
+            recorded_controls,
+            rollout,
+            scripted_controls,
+        )
         from tgdsl.runtime.table import LiveTable, table
         from tgdsl.runtime.view import picture
 
         touch = _module(self.document, self.set)
         if self.compiled:
             touch.compile()
-        start = self.keyframes[0] if self.keyframes and self.controls is None else None
-        sim = simulate(touch, self.num_envs, substeps=self.substeps, keyframe=start)
+        sim = simulate(touch, self.num_envs, substeps=self.substeps)
+        keyframes = default_keyframes(sim.model) if self.keyframes is None else self.keyframes
         if self.controls is not None:
             controls = recorded_controls(self.controls)
+        elif self.keyframes is None and not keyframes:
+            controls = held_controls(sim.model, self.seconds, sim.control_step)
+            print(f"the scene has no keyframes rest and squeeze: its initial state is held for {self.seconds:g} s")
         else:
-            controls = scripted_controls(sim.model, self.keyframes, self.seconds, sim.control_step)
+            controls = scripted_controls(sim.model, keyframes, self.seconds, sim.control_step)
+            sim = simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0])
         self.out.mkdir(parents=True, exist_ok=True)
         recorder, live = Recorder(touch, len(controls), self.num_envs), LiveTable()
         readings = {}

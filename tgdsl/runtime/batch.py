@@ -12,7 +12,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
@@ -147,12 +147,10 @@ class BatchSimulation:
         Raises:
             SimulationError: If there are no such environments, or MuJoCo reports one as failed.
         """
-        ids = None if env_ids is None else np.asarray(torch.as_tensor(env_ids).cpu())
-        if ids is not None and ids.dtype == bool and ids.shape == (self.num_envs,):
-            ids = np.flatnonzero(ids)
-        if ids is None or len(ids):
+        ids = self._indices(env_ids)
+        if len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
-            self._touch.reset(None if ids is None else torch.from_numpy(ids.astype(np.int64)))
+            self._touch.reset(torch.from_numpy(ids))
 
     def set_objects(
         self,
@@ -175,16 +173,28 @@ class BatchSimulation:
         """
         if self._objects is None:
             raise SimulationError("no object of this module differs between environments")
-        ids = np.arange(self.num_envs)
-        if env_ids is not None:
-            try:
-                ids = ids[np.asarray(torch.as_tensor(env_ids).cpu())]
-            except IndexError as error:
-                raise SimulationError(f"env_ids: {error}") from error
+        ids = self._indices(env_ids)
         self._objects.choose(ids, variants or {}, sizes or {})
         models = self._objects.models()
         self._run(lambda: self.batch.set_models(models))
         self.reset(ids)
+
+    def _indices(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
+        """Return environments as indices, from indices or a mask.
+
+        Raises:
+            SimulationError: If there are no such environments.
+        """
+        if env_ids is None:
+            return np.arange(self.num_envs)
+        found = np.asarray(torch.as_tensor(env_ids).cpu())
+        if found.dtype == bool and found.shape == (self.num_envs,):
+            return np.flatnonzero(found)
+        is_index = found.dtype.kind in "iu" and found.ndim == 1 and ((found >= 0) & (found < self.num_envs)).all()
+        if found.size and not is_index:
+            what = f"indices from 0 to {self.num_envs - 1}, or a mask of {self.num_envs}"
+            raise SimulationError(f"env_ids: found {listed([str(value) for value in found.ravel()])}, expected {what}")
+        return found.reshape(-1).astype(np.int64)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

@@ -61,6 +61,28 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     return np.concatenate(parts)
 
 
+def default_keyframes(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return `rest` and `squeeze`, if the scene has both; else nothing."""
+    known = {model.key(i).name for i in range(model.nkey)}
+    return ("rest", "squeeze") if {"rest", "squeeze"} <= known else ()
+
+
+def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) -> Controls:
+    """Return controls that stay those of the initial state, zero.
+
+    Args:
+        model: The scene.
+        seconds: For how long [s].
+        control_step: Duration of a control step [s].
+
+    Raises:
+        SimulationError: If the duration is not positive.
+    """
+    if not 0 < seconds < np.inf:
+        raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
+    return np.zeros((max(round(seconds / control_step), 1), model.nu))
+
+
 def recorded_controls(path: Path) -> Controls:
     """Return the array `ctrl` of an `.npz` file, (step, actuator) or (step, env, actuator).
 
