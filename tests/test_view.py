@@ -12,7 +12,7 @@ import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch import BatchSimulation
-from tgdsl.runtime.dots import Dots, dots_of
+from tgdsl.runtime.dots import Dots, Pose, dots_of
 from tgdsl.runtime.shot import Camera, camera_for, is_seen, rasterise, solid_of
 from tgdsl.runtime.view import picture, short_names
 
@@ -180,7 +180,8 @@ def test_shapes_are_where_mujoco_has_them(touch, shape: str, size: str, half: li
     scene = SCENE.replace("</worldbody>", f'<body name="it" pos="0 0 1" quat="1 0 0 1">{geom}</body></worldbody>')
     spec = tgdsl.instrument(mujoco.MjSpec.from_string(scene), touch.inputs)
     sim = BatchSimulation(touch, 1, model=spec.compile())
-    solid = solid_of(sim, 0, {sim.model.body("it").id})
+    pose = Pose(sim.batch.xpos[0], sim.batch.xquat[0])
+    solid = solid_of(sim.batch.get_model(0), pose, {sim.model.body("it").id})
     points = solid.corners.reshape(-1, 3)
     expected = np.array([half[1], half[2], half[0]])  # x of the body is y of the world
     centre = np.array([0, 0.1, 1])

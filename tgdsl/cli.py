@@ -1,4 +1,4 @@
-"""The command line: `tgdsl compile`, `explain`, `run`, `schema`, `import` and `export-usd`."""
+"""The command line: `tgdsl compile`, `explain`, `run`, `render`, `schema`, `import` and `export-usd`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ import tyro
 from tgdsl.errors import SpecError, TgdslError, did_you_mean
 
 if TYPE_CHECKING:
+    import mujoco
+
+    from tgdsl.layout import Layout
     from tgdsl.module import TactileModule
 
 Overrides = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
@@ -204,6 +207,74 @@ def robot_path(robot: Path) -> Path:
     return found
 
 
+@dataclass(frozen=True)
+class Render:
+    """Draw a hand and its taxels: a panel per resolution, coloured by link group. Nothing is simulated."""
+
+    hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")]
+    """A YAML document, an artefact (.safetensors), the name of a robot, such as `xhand1`, or a robot's file."""
+    layout: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Layout of a robot; default: its own, which lies beside it."""
+    resolutions: tuple[str, ...] = ()
+    """Resolutions to draw; default: the document's own, or all of the layout."""
+    keyframe: str | None = None
+    """Keyframe that gives the pose; default: the model's own initial state."""
+    view: str = "front"
+    """From where: front (what the taxels face), back, left, right or iso."""
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
+    """Pixels of the picture; default: 750 rows, and as many columns as the hand needs."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    """The picture; default: the hand's name with the ending .png, in the working folder."""
+    set: Overrides = ()
+    """Override a value of the document, as in `--set resolution=high`; may be repeated."""
+
+    def run(self) -> None:
+        """Draw, write and say how many taxels there are."""
+        from tgdsl.runtime.render import render
+
+        model, layouts = self._layouts()
+        out = self.out or Path(Path(self.hand).with_suffix(".png").name)
+        path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size)
+        print(", ".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
+        print(f"picture: {path}")
+
+    def _layouts(self) -> tuple[mujoco.MjModel, dict[str, Layout]]:
+        """Return the model and the layouts to draw by resolution: an artefact's own, or those that its document would have."""
+        if not self.hand.endswith(".safetensors"):
+            from tgdsl.compiler.pipeline import layouts
+
+            return layouts(_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions)
+        from tgdsl.artifact import load_plan
+        from tgdsl.scene import scene_model
+
+        plan = load_plan(self.hand)
+        resolution = plan.origin.resolution
+        if self.set or self.layout or set(self.resolutions) - {resolution}:
+            raise TgdslError(f'an artefact has the layout and resolution it was compiled with, "{resolution}", and no other')
+        return scene_model(plan.scene), {resolution: plan.layout()}
+
+
+def _document(hand: str, layout: Path | None) -> Path | dict[str, object]:
+    """Return the document that an argument names, or one of just a robot and its layout.
+
+    Raises:
+        TgdslError: If it names nothing, or a robot that comes without a layout.
+    """
+    from tgdsl.schema.files import is_file, layout_file, robot_names
+
+    path, names = Path(hand), robot_names()
+    if path.suffix in (".yaml", ".yml"):
+        if layout is not None:
+            raise TgdslError(f"--layout {layout}: a document names its layout itself; try --set robot.layout={layout}")
+        return path
+    if hand not in names and not is_file(path):
+        raise TgdslError(f'there is no document, artefact or robot "{hand}"; {did_you_mean(hand, names, "robots")}')
+    own = layout or layout_file(names.get(hand, path))
+    if own is None:
+        raise TgdslError(f"{hand}: there is no layout.yaml beside this robot; name its layout with --layout")
+    return {"tgdsl": 1, "robot": {"model": hand, "layout": str(own)}}
+
+
 def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
     """Return `KEY=VALUE` arguments as a mapping.
 
@@ -231,6 +302,7 @@ Command = (
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
 )

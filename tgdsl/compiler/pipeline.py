@@ -17,6 +17,8 @@ from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.robot import xml_files
 from tgdsl.compiler.scene import scene_file
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.layout import Layout
 from tgdsl.module import TactileModule
 from tgdsl.plan import Origin, Plan
 from tgdsl.scene import portable
@@ -43,6 +45,42 @@ def compile_plan(document: Document, overrides: Mapping[str, str] | None = None,
     resolved = resolve(loaded)
     plan = lower.plan(loaded, resolved, known, _origin(loaded))
     return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
+
+
+def layouts(
+    document: Document,
+    overrides: Mapping[str, str] | None = None,
+    resolutions: Sequence[str] = (),
+    kinds: Sequence[Kind] = (),
+) -> tuple[mujoco.MjModel, dict[str, Layout]]:
+    """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
+
+    Args:
+        document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
+        overrides: YAML text by dotted path.
+        resolutions: Default: the document's own, or all of the layout's if it names none.
+        kinds: Sensor kinds of your own, beside those of tgdsl.
+
+    Returns:
+        The model of the scene, or of the robot if there is no scene, and the layouts by resolution.
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        TgdslError: If the layout has no such resolution.
+    """
+    chosen, known = overrides or {}, (*KINDS, *kinds)
+    loaded = load(document, chosen, known, needs_sensors=False)
+    if loaded.layout is None:
+        return resolve(loaded).scene.compiled, {}  # which says all that is wrong
+    names, own = list(loaded.layout.spec.resolutions), loaded.resolution
+    wanted = list(resolutions) or ([own] if own is not None else names)
+    for name in resolutions:
+        if name not in names:
+            raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
+    texts = {name: chosen if name == own else {**chosen, "resolution": name} for name in wanted}
+    each = {name: resolve(load(document, text, known, needs_sensors=False)) for name, text in texts.items()}
+    return each[wanted[0]].scene.compiled, {name: resolved.layout for name, resolved in each.items()}
 
 
 def compile(

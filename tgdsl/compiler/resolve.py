@@ -35,7 +35,7 @@ class Resolved:
     """A spec's meaning on one robot.
 
     Attributes:
-        layout: Taxels of the links that some sensor has.
+        layout: Taxels of the links that some sensor has; of all links if the document has no sensors.
         links: Names of each sensor's links.
         objects: What can be felt of each object that is felt.
         own: The objects with geoms or sizes of their own.
@@ -77,7 +77,7 @@ def resolve(loaded: Loaded) -> Resolved:
         objects = felt_objects(loaded, scene, own)
     loaded.raise_problems()
     assert robot is not None and scene is not None and loaded.layout is not None
-    needed = {name for names in links.values() for name in names}
+    needed = {name for names in links.values() for name in names} if links else {patch.link.name for patch in patches}
     layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed])
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]

@@ -1,12 +1,15 @@
-"""Taxels as dots: where they are in one environment, and how much they read.
+"""Taxels as dots: where they are in the world, and how much they read.
 
-Shapes: `taxel` taxels of one sensor.
+Shapes: `taxel` taxels of one sensor or layout, `body` bodies of the model.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
@@ -18,22 +21,38 @@ from tgdsl.runtime.batch import BatchSimulation
 Array = np.ndarray
 
 
+class Pose(NamedTuple):
+    """Bodies in the world at one instant: origins [m], and orientations as quaternions w, x, y, z."""
+
+    pos: Float[Array, "body 3"]
+    quat: Float[Array, "body 4"]
+
+
 @dataclass(frozen=True, eq=False)
-class Dots:
-    """The taxels of one sensor in one environment, and what they read.
+class Taxels:
+    """Taxels in the world.
 
     Attributes:
         pos: Position in the world [m].
         normal: Outward unit normal in the world.
         size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
-        value: Magnitude of the reading, in `unit`.
-        quantity: What is read, such as `|force|`.
-        unit: Its unit, with the prefix that suits the values; empty for plain numbers.
     """
 
     pos: Float[Array, "taxel 3"]
     normal: Float[Array, "taxel 3"]
     size: Float[Array, " taxel"]
+
+
+@dataclass(frozen=True, eq=False)
+class Dots(Taxels):
+    """The taxels of one sensor in one environment, and what they read.
+
+    Attributes:
+        value: Magnitude of the reading, in `unit`.
+        quantity: What is read, such as `|force|`.
+        unit: Its unit, with the prefix that suits the values; empty for plain numbers.
+    """
+
     value: Float[Array, " taxel"]
     quantity: str
     unit: str
@@ -69,8 +88,8 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         env: Which environment.
     """
     table = touch.taxels[sensor_of(touch, output.name)]
-    body = np.array([sim.model.body(name).id for name in table["body"]])
-    rotation = Rotation.from_quat(sim.batch.xquat[env][body], scalar_first=True)
+    pose = Pose(sim.batch.xpos[env], sim.batch.xquat[env])
+    pos, normal = in_world(sim.model, pose, table["body"], table["pos"], table["normal"])
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
     value = np.linalg.norm(values[env].detach().cpu().double().numpy()[:, same], axis=1)
     stem = output.channels[0].removesuffix("_x")
@@ -78,13 +97,22 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
     if unit and 0 < value.max() < 0.1:
         value, unit = (1e3 * value, f"m{unit}") if value.max() >= 1e-4 else (1e6 * value, f"µ{unit}")
     return Dots(
-        pos=sim.batch.xpos[env][body] + rotation.apply(table["pos"]),
-        normal=rotation.apply(table["normal"]),
+        pos=pos,
+        normal=normal,
         size=np.sqrt(table["area"]) * (table["radius"] > 0),
         value=value,
         quantity=f"|{stem}|" if len(same) > 1 else stem,
         unit=unit,
     )
+
+
+def in_world(
+    model: mujoco.MjModel, pose: Pose, bodies: Iterable[str], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"]
+) -> tuple[Float[Array, "taxel 3"], Float[Array, "taxel 3"]]:
+    """Return positions and normals in the world of taxels given in the frames of their bodies, which go by name."""
+    body = np.array([model.body(name).id for name in bodies], dtype=np.int64)
+    rotation = Rotation.from_quat(pose.quat[body], scalar_first=True)
+    return pose.pos[body] + rotation.apply(np.array(pos)), rotation.apply(np.array(normal))  # SciPy wants writable arrays
 
 
 def sensor_of(touch: TactileModule, reading: str) -> str:

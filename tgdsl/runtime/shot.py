@@ -1,6 +1,6 @@
 """Triangles to pixels: an orthographic camera, a z-buffer and simple shading, in NumPy; no GL, no display.
 
-Shapes: `taxel` taxels of one sensor, `face` triangles, `h` and `w` rows and columns of pixels, row 0 at the bottom.
+Shapes: `taxel` taxels of one sensor or layout, `face` triangles, `h` and `w` rows and columns of pixels, row 0 at the bottom.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from tgdsl.runtime.batch import BatchSimulation
-from tgdsl.runtime.dots import Dots
+from tgdsl.runtime.dots import Dots, Pose, Taxels
 from tgdsl.scene import is_absent
 
 Array = np.ndarray
@@ -39,6 +38,30 @@ class Camera(NamedTuple):
     def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return image x, image y and nearness to the camera [m], from the centre."""
         return (points - self.centre) @ np.stack([self.right, self.up, self.toward]).T
+
+
+class Screen(NamedTuple):
+    """The pixels that a camera fills.
+
+    Attributes:
+        camera: The camera.
+        corner: The lower left pixel on the camera's image [m].
+        scale: Pixels per metre.
+        width: Number of columns.
+        height: Number of rows.
+    """
+
+    camera: Camera
+    corner: Float[Array, " 2"]
+    scale: float
+    width: int
+    height: int
+
+    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """Return column [pixel], row [pixel] and nearness to the camera [m]."""
+        placed = self.camera.project(points)
+        placed[..., :2] = (placed[..., :2] - self.corner) * self.scale
+        return placed
 
 
 class Solid(NamedTuple):
@@ -77,7 +100,13 @@ def camera_for(dots: Dots, root: Float[Array, " 3"]) -> Camera:
     return Camera(right, np.cross(toward, right), toward, dots.pos.mean(axis=0))
 
 
-def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " taxel"]:
+def screen_for(camera: Camera, box: Float[Array, "2 2"], width: int, height: int) -> Screen:
+    """Return the screen that shows a part of the camera's image, lower and upper corner [m], as large as it can."""
+    scale = min(width / (box[1, 0] - box[0, 0]), height / (box[1, 1] - box[0, 1]))
+    return Screen(camera, box.mean(axis=0) - np.array([width, height]) / 2 / scale, scale, width, height)
+
+
+def is_seen(dots: Taxels, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " taxel"]:
     """Return which taxels face the camera with nothing of the robot between."""
     height, width = shot.near.shape
     column = np.clip(np.rint(at[:, 0]), 0, width - 1).astype(int)
@@ -86,17 +115,27 @@ def is_seen(dots: Dots, at: Array, shot: Shot, camera: Camera) -> Bool[Array, " 
     return (dots.normal @ camera.toward > 0) & (at[:, 2] + slack >= shot.near[row, column])
 
 
-def solid_of(sim: BatchSimulation, env: int, bodies: set[int]) -> Solid:
-    """Return the triangles of some bodies in one environment: of their geoms that collide, or else of all; planes not."""
-    model = sim.batch.get_model(env)
+def robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], set[int]]:
+    """Return the bodies to fit in the view (the smallest subtree that holds all carriers of taxels), and all of the robot's."""
+    above = [[0]]
+    for body in range(1, model.nbody):
+        above.append([*above[model.body_parentid[body]], body])
+    roots = {int(model.body_rootid[body]) for body in carriers}
+    robot = {body for body in range(model.nbody) if model.body_rootid[body] in roots}
+    top = max(set.intersection(*(set(above[body]) for body in carriers)))
+    return {body for body in robot if top in above[body]}, robot
+
+
+def solid_of(model: mujoco.MjModel, pose: Pose, bodies: set[int]) -> Solid:
+    """Return the triangles of some bodies: of their geoms that collide, or else of all; planes not."""
     parts = [Solid(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
     for body in sorted(bodies):
         own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
         for geom in [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]] or own:
             corners, normals = _triangles(model, geom)
             in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)
-            in_world = Rotation.from_quat(sim.batch.xquat[env][body], scalar_first=True)
-            centre = sim.batch.xpos[env][body] + in_world.apply(model.geom_pos[geom])
+            in_world = Rotation.from_quat(pose.quat[body], scalar_first=True)
+            centre = pose.pos[body] + in_world.apply(model.geom_pos[geom])
             matrix = (in_world * in_body).as_matrix().T
             parts.append(Solid(corners @ matrix + centre, normals @ matrix, np.full(len(corners), body)))
     return Solid(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
@@ -173,13 +212,23 @@ def shaded(image: Array, shot: Shot, solid: Solid, colour: Array, camera: Camera
     face, weights = shot.face[drawn], shot.weights[drawn]
     normal = np.einsum("pi,pij->pj", weights, solid.normals[face])
     normal *= np.where(normal @ camera.toward < 0, -1, 1)[:, None]
-    light = unit(0.85 * camera.toward + 0.4 * camera.up + 0.35 * camera.right, camera.toward)
-    lit = 0.55 + 0.5 * np.clip(normal @ light, 0, 1)
+    lit = 0.55 + 0.5 * np.clip(normal @ lamp(camera), 0, 1)
     image[drawn] += opacity * (np.minimum(colour[face] * lit[:, None], 1) - image[drawn])
     near = np.where(drawn, shot.near, -1.0)
     jump = np.maximum(*(np.abs(np.diff(near, axis=axis, append=near.take([-1], axis))) for axis in (0, 1)))
     image[jump > np.maximum(6 / scale, 0.002)] *= 0.62
     return image
+
+
+def lamp(camera: Camera) -> Float[Array, " 3"]:
+    """Return the direction to the light: behind the camera, to the upper right."""
+    return unit(0.85 * camera.toward + 0.4 * camera.up + 0.35 * camera.right, camera.toward)
+
+
+def smaller(image: Float[Array, "h w 3"], factor: int) -> Array:
+    """Return an image with `factor` times fewer rows and columns, each pixel the mean of those that it replaces."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    return image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
 
 
 def unit(vector: Array, otherwise: Array) -> Array:

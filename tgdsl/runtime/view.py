@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
-import mujoco
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,8 +17,8 @@ from torch import Tensor
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module import Output, TactileModule
 from tgdsl.runtime.batch import BatchSimulation
-from tgdsl.runtime.dots import Dots, dots_of, sensor_of
-from tgdsl.runtime.shot import camera_for, is_seen, rasterise, shaded, solid_of, unit
+from tgdsl.runtime.dots import Dots, Pose, dots_of, sensor_of
+from tgdsl.runtime.shot import camera_for, is_seen, rasterise, robot_bodies, screen_for, shaded, smaller, solid_of, unit
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
@@ -102,35 +101,29 @@ def _draw_scene(
     axes: Axes, touch: TactileModule, sim: BatchSimulation, dots: Dots, table: Array, env: int, norm: Normalize
 ) -> None:
     """Draw robot, felt objects and taxels; those behind a surface of the robot as rings if they read, else not at all."""
-    model = sim.model
+    model, pose = sim.model, Pose(sim.batch.xpos[env], sim.batch.xquat[env])
     carriers = {model.body(name).id for name in table["body"]}
-    framed, robot = _robot_bodies(model, carriers)
+    framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects}
-    hand, objects = (solid_of(sim, env, bodies) for bodies in (robot - felt, felt))
+    hand, objects = (solid_of(sim.batch.get_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
-    camera = camera_for(dots, sim.batch.xpos[env][min(framed)])
+    camera = camera_for(dots, pose.pos[min(framed)])
     box = _window(camera.project(hand.corners[frame] if frame.any() else dots.pos[:, None]), camera.project(objects.corners))
     width, height = (FINE * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
-    scale = min(width / (box[1, 0] - box[0, 0]), height / (box[1, 1] - box[0, 1]))
-    corner = box.mean(axis=0) - np.array([width, height]) / 2 / scale
-
-    def pixels(points: Array) -> Array:
-        placed = camera.project(points)
-        placed[..., :2] = (placed[..., :2] - corner) * scale
-        return placed
-
-    shot = rasterise(pixels(hand.corners), width, height)
+    screen = screen_for(camera, box, width, height)
+    shot = rasterise(screen.project(hand.corners), width, height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], _LIT, _OTHER)
-    image = shaded(np.ones((height, width, 3)), shot, hand, colour, camera, 1.0, scale)
-    veil = rasterise(pixels(objects.corners), width, height)
+    image = shaded(np.ones((height, width, 3)), shot, hand, colour, camera, 1.0, screen.scale)
+    veil = rasterise(screen.project(objects.corners), width, height)
     veil.face[veil.near < shot.near] = -1
-    image = shaded(image, veil, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, scale)
-    image = image.reshape(height // FINE, FINE, width // FINE, FINE, 3).mean(axis=(1, 3))
+    image = shaded(image, veil, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, screen.scale)
+    image = smaller(image, FINE)
     axes.imshow(image, origin="lower", extent=(-0.5, width - 0.5, -0.5, height - 0.5), interpolation="nearest", aspect="auto")
     axes.set_axis_off()
     axes.autoscale(False)
-    _draw_dots(axes, pixels(dots.pos), is_seen(dots, pixels(dots.pos), shot, camera), dots, norm, scale)
-    _draw_ruler(axes, scale, width)
+    at = screen.project(dots.pos)
+    _draw_dots(axes, at, is_seen(dots, at, shot, camera), dots, norm, screen.scale)
+    draw_ruler(axes, screen.scale, width, -44.0)
 
 
 def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, scale: float) -> None:
@@ -145,12 +138,13 @@ def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, 
     axes.scatter(*place.T, s=size, c=value, cmap=_HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
 
 
-def _draw_ruler(axes: Axes, scale: float, width: int) -> None:
+def draw_ruler(axes: Axes, scale: float, width: int, row: float) -> None:
+    """Draw a round number of millimetres at the left of a row [pixel], for a view of `scale` pixels per metre."""
     steps = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
     length = steps[np.abs(steps * scale / 1000 / width - 0.12).argmin()]
     end = 8 + length * scale / 1000
-    axes.plot([8, end], [-44, -44], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
-    axes.text(end + 16, -45, f"{length} mm", fontsize=9.5, color=INK, va="center")
+    axes.plot([8, end], [row, row], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
+    axes.text(end + 16, row - 1, f"{length} mm", fontsize=9.5, color=INK, va="center")
 
 
 def _window(hand: Array, objects: Array) -> Array:
@@ -163,17 +157,6 @@ def _window(hand: Array, objects: Array) -> Array:
         low, high = np.vstack([near, [low]]).min(axis=0), np.vstack([near, [high]]).max(axis=0)
     margin = 0.03 * (high - low).max()
     return np.stack([low - margin, high + margin])
-
-
-def _robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], set[int]]:
-    """Return the bodies to fit in the view (the smallest subtree that holds all taxels), and all of the robot's."""
-    above = [[0]]
-    for body in range(1, model.nbody):
-        above.append([*above[model.body_parentid[body]], body])
-    roots = {int(model.body_rootid[body]) for body in carriers}
-    robot = {body for body in range(model.nbody) if model.body_rootid[body] in roots}
-    top = max(set.intersection(*(set(above[body]) for body in carriers)))
-    return {body for body in robot if top in above[body]}, robot
 
 
 # The maps -------------------------------------------------------------------------------------------------------------

@@ -56,11 +56,12 @@ class Spec(SpecModel):
 
 
 @cache
-def document_model(kinds: tuple[Kind, ...] = KINDS) -> type[Spec]:
+def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) -> type[Spec]:
     """Return the document model whose sensors are of the given kinds."""
     specs = tuple(kind.spec for kind in kinds)
     union: Any = Annotated[Union[specs], Field(discriminator="kind")] if len(specs) > 1 else specs[0]  # type: ignore  # noqa: UP007
-    sensors = (dict[Name, union], Field(min_length=1, description="Sensors by name."))
+    need: dict[str, Any] = {"min_length": 1} if needs_sensors else {"default": {}}
+    sensors = (dict[Name, union], Field(description="Sensors by name.", **need))
     return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors)
 
 

@@ -85,6 +85,7 @@ def load(
     document: str | PathLike[str] | Mapping[str, Any],
     overrides: Mapping[str, str] | None = None,
     kinds: tuple[Kind, ...] = KINDS,
+    needs_sensors: bool = True,
 ) -> Loaded:
     """Read a document and its layout.
 
@@ -92,6 +93,7 @@ def load(
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
         overrides: Values to set first, YAML text by dotted path, such as `{"resolution": "high"}`.
         kinds: The sensor kinds that the document may use.
+        needs_sensors: Whether it is a mistake to have none.
 
     Returns:
         The document with the problems found so far: call `raise_problems` when all stages have added theirs.
@@ -105,9 +107,10 @@ def load(
         source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
     for dotted, text in (overrides or {}).items():
         source.set(dotted, text)
-    model = document_model(kinds)
+    model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
-    spec = read_as(source, (), model, problems, required=("tgdsl", "robot", "sensors"))
+    required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
+    spec = read_as(source, (), model, problems, required)
     if spec is None:
         raise SpecError(problems)
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
