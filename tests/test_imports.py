@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tgdsl"
 FLOORS = {
-    5: {"cli", "rl", "report"},
+    5: {"cli", "robot_commands", "rl", "report"},
     4: {"compiler", "runtime"},
     3: {"schema", "module", "state", "scene", "artifact", "explain"},
     2: {"sensors", "observations", "layout", "plan"},

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -16,6 +14,7 @@ from safetensors.numpy import save as serialized
 from tgdsl.errors import ArtifactError
 from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
+from tgdsl.schema.files import write_whole
 from tgdsl.sensors import KINDS, Kind
 
 METADATA_KEY = "tgdsl"
@@ -57,18 +56,7 @@ def load(
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
     """Write a plan, as `save` does; return the bytes written."""
     content = serialized({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
-    target = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_whole(Path(path), content)
     return len(content)
 
 

@@ -1,4 +1,4 @@
-"""The command line: `tgdsl compile`, `explain`, `run`, `render`, `schema`, `import` and `export-usd`."""
+"""The command line: what to do with documents and artefacts, and `main`. Commands on robots are in `robot_commands`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tgdsl.errors import SpecError, TgdslError, did_you_mean
+from tgdsl.robot_commands import ExportUsd, Import, LayoutNew, Links
 
 if TYPE_CHECKING:
     import mujoco
@@ -151,62 +152,6 @@ class Run:
         print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
 
 
-Robot = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROBOT")]
-
-
-@dataclass(frozen=True)
-class Import:
-    """Turn a USD stage into MJCF, with its meshes as .obj files in a folder beside it."""
-
-    stage: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STAGE")]
-    """The stage: .usd, .usda, .usdc or .usdz."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """The MJCF file; default: the stage's name with the ending .xml, in the working folder."""
-
-    def run(self) -> None:
-        """Write it."""
-        from tgdsl.compiler.usd import usd_to_mjcf, write_mjcf
-
-        out = self.out or Path(self.stage.with_suffix(".xml").name)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_mjcf(usd_to_mjcf(self.stage), out)
-        print(out)
-
-
-@dataclass(frozen=True)
-class ExportUsd:
-    """Turn an MJCF or URDF file into a USD stage."""
-
-    robot: Robot
-    """The robot's file, or the name of a robot that comes with tgdsl."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """The stage: .usda (text), .usdc or .usd; default: the robot's name with the ending .usda, in the working folder."""
-
-    def run(self) -> None:
-        """Write it."""
-        from tgdsl.compiler.usd_export import export_usd
-
-        file = robot_path(self.robot)
-        out = self.out or Path(file.with_suffix(".usda").name)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        export_usd(file, out)
-        print(out)
-
-
-def robot_path(robot: Path) -> Path:
-    """Return the file of a robot given by a path or by name.
-
-    Raises:
-        TgdslError: If there is none.
-    """
-    from tgdsl.schema.files import robot_file, robot_names
-
-    found = robot_file(str(robot), Path())
-    if found is None:
-        raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(str(robot), robot_names(), "robots")}')
-    return found
-
-
 @dataclass(frozen=True)
 class Render:
     """Draw a hand and its taxels: a panel per resolution, coloured by link group. Nothing is simulated."""
@@ -303,6 +248,8 @@ Command = (
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Links, tyro.conf.subcommand("links")]
+    | Annotated[LayoutNew, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
 )

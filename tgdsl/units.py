@@ -8,6 +8,7 @@ import re
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "area": {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6},
+    "density": {"/m2": 1.0, "/cm2": 1e4, "/mm2": 1e6},
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
     "force": {"N": 1.0, "mN": 1e-3},
     "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
@@ -16,7 +17,7 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([A-Za-zµ][\w*/µ]*)?\s*\Z")
+_QUANTITY = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([A-Za-zµ/][\w*/µ]*)?\s*\Z")
 
 
 def parse(value: object, dimension: str) -> float:

@@ -1,8 +1,9 @@
-"""Where files are: those a document names, and the robots that come with tgdsl."""
+"""Where files are, those a document names and the robots that come with tgdsl; and writing one whole."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import tgdsl
@@ -45,3 +46,18 @@ def layout_file(model: Path) -> Path | None:
     side = model.stem.removeprefix(f"{model.parent.name}_")
     names = (f"layout_{side}.yaml", "layout.yaml")
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
+
+
+def write_whole(target: Path, content: bytes) -> None:
+    """Write a file so that it appears whole or not at all; one that is there is replaced."""
+    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)
+        os.replace(temporary, target)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

@@ -119,6 +119,20 @@ def load(
     return loaded
 
 
+def load_layout(path: FilePath) -> LoadedLayout:
+    """Read a layout file by itself.
+
+    Raises:
+        SpecError: All its mistakes.
+    """
+    source = _read_file(path, str(path))
+    problems = list(source.problems)
+    spec = read_as(source, (), LayoutSpec, problems, required=("resolutions",))
+    if problems or not isinstance(spec, LayoutSpec):
+        raise SpecError(problems)
+    return LoadedLayout(spec, source, (), path.parent)
+
+
 def _read_file(path: FilePath, name: str) -> Source:
     try:
         text = path.read_text(encoding="utf-8")
