@@ -6,14 +6,11 @@ Used by the hands' own `measure.py`.
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 import igl
 import numpy as np
-import trimesh
 
 from tgdsl.compiler.robot import Model, load_model
 from tgdsl.compiler.sample import Samples, sample
@@ -31,29 +28,6 @@ def layout(folder: Path) -> dict[str, dict[str, Placement]]:
     """Return how each link is sampled, by resolution and link name."""
     file = folder / "layout.yaml"
     return LayoutSpec.model_validate(yaml.parse(file.read_text(encoding="utf-8"), file.name).value).resolutions
-
-
-def readable(file: Path, folder: Path) -> Path:
-    """Copy a URDF and what lies beside it, with STL files that are text made binary: MuJoCo reads no others.
-
-    Args:
-        file: The vendor's URDF.
-        folder: An empty folder for the copy.
-
-    Returns:
-        The copied URDF.
-    """
-    shutil.copytree(file.parent, folder, dirs_exist_ok=True)
-    for path in folder.rglob("*"):
-        if path.suffix.lower() == ".stl" and _is_text(path):
-            trimesh.load_mesh(path).export(path, file_type="stl")
-    return folder / file.name
-
-
-def _is_text(path: Path) -> bool:
-    """Return whether an STL file is text; both kinds may start with `solid`, but a binary one's size follows from its faces."""
-    content = path.read_bytes()
-    return content.startswith(b"solid") and len(content) != 84 + 50 * int.from_bytes(content[80:84], "little")
 
 
 def surface(robot: Model, link: str) -> Surface:
@@ -106,8 +80,7 @@ def compare(folder: Path, model: str) -> None:
     parser = argparse.ArgumentParser(description="Compare our surfaces with the vendor's.")
     parser.add_argument("reference_dir", type=Path, help="folder that holds the vendor's URDF and meshes")
     [urdf] = parser.parse_args().reference_dir.glob("*.urdf")
-    with tempfile.TemporaryDirectory() as copy:
-        ours, reference = load_model(folder / model), load_model(readable(urdf, Path(copy)))
+    ours, reference = load_model(folder / model), load_model(urdf)
     is_good = same_counts(folder, ours, reference)
     placed = taxels(ours, layout(folder)["high"], folder)
     found = {link: errors(samples, surface(reference, link)) for link, samples in placed.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ INHERITED = (
     *("group", "rgba", "material"),
 )
 """What a variant's geoms have of the body's first geom."""
+_STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 OFF_CENTER = 2e-6
 """Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
 
@@ -50,7 +52,24 @@ def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
 
 def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
     parts = {name: text.encode() for name, text in scene.parts.items()}
-    return mujoco.MjSpec.from_string(scene.mjcf, include=parts, assets=dict(assets))
+    return mujoco.MjSpec.from_string(
+        scene.mjcf, include=parts, assets={key: readable(key, content) for key, content in assets.items()}
+    )
+
+
+def readable(name: str, content: bytes) -> bytes:
+    """Return a file as MuJoCo reads it: an STL file that is text in binary, any other as it is."""
+    if Path(name).suffix.lower() != ".stl" or content.lstrip()[:5].lower() != b"solid":
+        return content
+    if len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        return content  # binary, whatever its header says
+    try:
+        corners = np.array(_STL_VERTEX.findall(content)).astype(np.float32).reshape(-1, 3, 3)
+    except ValueError:
+        return content  # MuJoCo will name it
+    triangles = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
+    triangles["corners"] = corners
+    return bytes(80) + len(corners).to_bytes(4, "little") + triangles.tobytes() if len(corners) else content
 
 
 def scene_model(scene: SceneFile) -> mujoco.MjModel:

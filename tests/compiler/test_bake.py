@@ -10,7 +10,7 @@ from surfaces import ball, box, plate, surface_of
 
 import tgdsl.compiler.bake as baking
 from tgdsl.compiler.bake import METHODS, Baked, BakeError, bake
-from tgdsl.geometry.grid import Grid
+from tgdsl.geometry.grid import one_grid
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.geometry.surface import Surface
 
@@ -39,7 +39,7 @@ def rounded_cube(half: float = 0.02, radius: float = 0.004) -> trimesh.Trimesh:
 
 
 def ask(baked: Baked, pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    grid = Grid(torch.tensor(baked.values), torch.tensor(baked.origin), torch.tensor(baked.cell, dtype=torch.float64))
+    grid = one_grid(torch.tensor(baked.values), torch.tensor(baked.origin), torch.tensor(baked.cell, dtype=torch.float64))
     distance, gradient = METHODS[baked.method](tuple(torch.tensor(pos).unbind(-1)), grid)
     return distance.numpy(), torch.stack(gradient, dim=-1).numpy()
 

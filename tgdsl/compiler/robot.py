@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from tgdsl.compiler.urdf import as_mujoco_text
 from tgdsl.compiler.usd import USD_SUFFIXES, usd_to_mjcf
 from tgdsl.errors import RobotError
 from tgdsl.geometry.surface import Surface
-from tgdsl.scene import muted_mujoco
+from tgdsl.scene import muted_mujoco, readable
 
 SHAPE_NAMES: dict[int, str] = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -85,6 +86,7 @@ class Model:
         compiled: MuJoCo's compiled model.
         is_urdf: Whether it is URDF.
         mjcf: The MJCF that it was turned into, if it is USD; else empty.
+        rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
     """
 
     file: Path
@@ -92,6 +94,7 @@ class Model:
     compiled: mujoco.MjModel
     is_urdf: bool
     mjcf: str = ""
+    rewritten: Mapping[str, Path] = field(default_factory=dict)
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -232,9 +235,22 @@ def load_model(path: Path) -> Model:
             spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(path))
             for mesh in spec.meshes if is_urdf else ():
                 mesh.file = str(files[Path(mesh.file).stem])
-            return Model(path, spec, spec.compile(), is_urdf)
+            rewritten = _rewrite_meshes(spec)
+            return Model(path, spec, spec.compile(), is_urdf, rewritten=rewritten)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
+
+
+def _rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
+    """Rewrite in memory those of a model's own mesh files that MuJoCo cannot read; return the files by their new names."""
+    files = {}
+    for mesh in spec.meshes:
+        file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
+        if file.is_file() and (content := readable(mesh.file, original := file.read_bytes())) is not original:
+            key = f"{hashlib.sha256(content).hexdigest()}.stl"  # MuJoCo knows files in memory by their names, without folders
+            spec.assets[key], files[key] = content, file
+            mesh.name, mesh.file = mesh.name or file.stem, key
+    return files
 
 
 def _is_urdf(path: Path) -> bool:

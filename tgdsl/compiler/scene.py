@@ -122,7 +122,11 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
     if model.mjcf:
         main = kept.rewritten(ET.fromstring(model.mjcf), model.file, [model.file.parent])
     elif model.is_urdf:
-        main = kept.rewritten(ET.fromstring(model.spec.to_xml()), model.file, [model.file.parent])
+        root = ET.fromstring(model.spec.to_xml())
+        for mesh in root.iter("mesh"):
+            if (name := mesh.get("file", "")) in model.rewritten:
+                mesh.set("file", str(model.rewritten[name]))
+        main = kept.rewritten(root, model.file, [model.file.parent])
     else:
         main = kept.rewritten(ET.parse(model.file).getroot(), model.file, [model.file.parent])
     if own.bodies:

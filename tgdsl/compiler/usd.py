@@ -6,13 +6,14 @@ The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
 - Position zero is where the frames of a joint meet. If the authored poses or the drives' targets differ from it, the keyframe
   `authored` has them.
 - A drive becomes a `position` actuator, or a `velocity` actuator if it has no stiffness, named after its joint. A drive
-  without gains exerts no force and gives none.
+  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's.
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
   of two, and its own default where no material is bound.
 - `physxJoint:armature` and `physxJoint:jointFriction` (a torque or force) are read where they are authored.
 - A joint that closes a loop becomes an equality constraint between sites.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2. Materials' looks, subdivision,
   holes of meshes and what is not drawn by default are left out; whatever else is dropped is warned of.
+- What `usd_export` notes in attributes `tgdsl:` is read back, in SI units and radians whatever those of the stage.
 """
 
 from __future__ import annotations
@@ -29,12 +30,13 @@ from pathlib import Path
 import numpy as np
 
 from tgdsl.compiler.usd_filters import exclusions
-from tgdsl.compiler.usd_geoms import Geom, read_geoms
+from tgdsl.compiler.usd_geoms import Geom, Site, read_geoms, read_sites
 from tgdsl.compiler.usd_joints import MEETING, Joint, read_joints
 from tgdsl.compiler.usd_mass import Inertial, inertial_of
+from tgdsl.compiler.usd_notes import OPTION, read_flags, read_note, read_notes
 from tgdsl.compiler.usd_stage import Matrix, Prim, Stage, opened, unique_names
 from tgdsl.compiler.usd_tree import Link, Tree, spanning_tree
-from tgdsl.compiler.usd_xml import MeshAssets, add_geom, add_key, add_loop, add_motion, numbers, posed
+from tgdsl.compiler.usd_xml import MeshAssets, add_geom, add_key, add_loop, add_motion, add_site, numbers, posed
 from tgdsl.errors import RobotError
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -52,20 +54,24 @@ class _Robot:
         frames: Their world poses [m].
         joints: All joints.
         geoms: All geoms.
+        sites: All sites.
         inertials: Mass and inertia of each body that has one.
         tree: Which body hangs on which.
         kinematic: Whether each body is kinematic.
-        names: Name of each body, then of each geom and of each joint, by path.
+        names: Name of each body, then of each geom, of each joint and of each site, by path.
+        free: Name of each floating body's joint, or empty, by the body's path.
     """
 
     bodies: dict[str, Prim]
     frames: dict[str, Matrix]
     joints: list[Joint]
     geoms: list[Geom]
+    sites: list[Site]
     inertials: dict[str, Inertial | None]
     tree: Tree
     kinematic: dict[str, bool]
-    names: tuple[dict[str, str], dict[str, str], dict[str, str]]
+    names: tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]
+    free: dict[str, str]
 
 
 def usd_to_mjcf(path: Path) -> str:
@@ -96,6 +102,7 @@ def _read(stage: Stage) -> _Robot:
         owners[path] = path if path in bodies else owners[path.rpartition("/")[0] or "/"]
     frames = {path: stage.frame(prim)[0] for path, prim in bodies.items()}
     joints, geoms = read_joints(stage, owners, frames), read_geoms(stage, owners, frames)
+    sites = read_sites(stage, owners, frames)
     inertials = {
         path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path], frames[path])
         for path, prim in bodies.items()
@@ -106,9 +113,11 @@ def _read(stage: Stage) -> _Robot:
         unique_names(stage, bodies.values(), ["world"]),
         unique_names(stage, {geom.path: geom.prim for geom in geoms}.values()),
         unique_names(stage, [joint.prim for joint in joints]),
+        unique_names(stage, [site.prim for site in sites]),
     )
     tree = spanning_tree(kinematic, joints, roots)
-    return _Robot(bodies, frames, joints, geoms, inertials, tree, kinematic, names)
+    free = {path: str(read_note(stage, prim, "freejoint") or "") for path, prim in bodies.items()}
+    return _Robot(bodies, frames, joints, geoms, sites, inertials, tree, kinematic, names, free)
 
 
 def _check(stage: Stage, robot: _Robot) -> None:
@@ -143,8 +152,7 @@ def _written(stage: Stage, robot: _Robot) -> ET.Element:
     root = ET.Element("mujoco", model=stage.file.stem)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     option = ET.SubElement(root, "option")
-    if gravity := _gravity(stage):
-        option.set("gravity", gravity)
+    flags = _option(stage, option)
     meshes = MeshAssets(ET.SubElement(root, "asset"))
     world = ET.SubElement(root, "worldbody")
     elements: dict[str | None, ET.Element] = {None: world}
@@ -157,7 +165,9 @@ def _written(stage: Stage, robot: _Robot) -> ET.Element:
         ET.SubElement(contact, "exclude", body1=first, body2=second)
     if any(link.joint and link.parent and not link.joint.is_filtering for link in robot.tree.links.values()):
         # MuJoCo never collides a parent with its child; here it should, and who should not is listed above.
-        ET.SubElement(option, "flag", filterparent="disable")
+        flags["filterparent"] = "disable"
+    if flags:
+        ET.SubElement(option, "flag", flags)
     equality, actuator = ET.SubElement(root, "equality"), ET.SubElement(root, "actuator")
     for joint in robot.tree.loops:
         _add_loop(stage, robot, joint, elements, equality)
@@ -173,18 +183,24 @@ def _depth_first(tree: Tree, parent: str | None = None) -> list[Link]:
     return [link for child in tree.children(parent) for link in (child, *_depth_first(tree, child.body))]
 
 
-def _gravity(stage: Stage) -> str:
-    """Return gravity [m/s²] as the first scene has it, or nothing."""
+def _option(stage: Stage, option: ET.Element) -> dict[str, str]:
+    """Set gravity and the solver's settings as the first scene has them; return its flags."""
     scenes = [prim for prim in stage.prims if prim.IsA(stage.pxr.UsdPhysics.Scene)]
     for scene in scenes[1:]:
         stage.drop("physics scenes after the first one were dropped", scene)
     if not scenes:
-        return ""
-    direction = np.array(stage.value(scenes[0], "physics:gravityDirection"), dtype=np.float64)
-    size = stage.number(scenes[0], "physics:gravityMagnitude", -math.inf)
+        return {}
+    option.attrib |= {"gravity": _gravity(stage, scenes[0]), **read_notes(stage, scenes[0], OPTION)}
+    return read_flags(stage, scenes[0])
+
+
+def _gravity(stage: Stage, scene: Prim) -> str:
+    """Return gravity [m/s²]."""
+    direction = np.array(stage.value(scene, "physics:gravityDirection"), dtype=np.float64)
+    size = stage.number(scene, "physics:gravityMagnitude", -math.inf)
     size = GRAVITY if size < 0 else size * stage.metres
     if not np.isfinite(direction).all() or not math.isfinite(size):
-        raise stage.error(scenes[0], "gravity is not finite")
+        raise stage.error(scene, "gravity is not finite")
     if not direction.any():
         return numbers([0.0, 0.0, -size])
     return numbers(stage.world[:3, :3] @ direction / stage.metres / np.linalg.norm(direction) * size)
@@ -199,7 +215,7 @@ def _add_body(
     if robot.kinematic[link.body]:
         element.set("mocap", "true")
     else:
-        add_motion(element, link, robot.names[2])
+        add_motion(element, link, robot.names[2], robot.free[link.body])
     if (inertial := robot.inertials[link.body]) is not None:
         moments, axes = inertial.principal()
         ET.SubElement(
@@ -226,6 +242,9 @@ def _add_geoms(robot: _Robot, body: str | None, element: ET.Element, meshes: Mes
                 taken.add(name)
             written.add(geom.path)
             add_geom(element, name, geom, meshes)
+    for site in robot.sites:
+        if site.body == body:
+            add_site(element, robot.names[3][str(site.prim.GetPath())], site)
 
 
 def _add_loop(

@@ -1,10 +1,14 @@
 """Robots out: a compiled MJCF or URDF model as a UsdPhysics stage, in SI units but where USD wants degrees.
 
 Bodies are siblings below the default prim, at their world poses. What USD has no word for and tgdsl reads back is kept in
-attributes named `tgdsl:`: the names of MuJoCo (`name`, `actuator`; a floating body's joint in `freejoint`), collision masks
-(`contype`, `conaffinity`), `site`, and a joint's `ctrlrange` [rad, m, or these per second] and its own `damping`
-[N·m·s/rad or N·s/m], which its drive's damping includes.
-Contact parameters other than sliding friction, and textures, stay behind.
+attributes named `tgdsl:`, in SI units and radians:
+
+- the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
+- a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
+  the actuator's place in the `order`, if actuators do not come in the joints' order;
+- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `usd_notes`.
+
+Textures stay behind.
 """
 
 from __future__ import annotations
@@ -20,9 +24,10 @@ import mujoco
 import numpy as np
 
 from tgdsl.compiler.robot import load_model
-from tgdsl.compiler.usd_export_draft import Draft, note, place, usd
+from tgdsl.compiler.usd_export_draft import Draft, note, place, put, usd
 from tgdsl.compiler.usd_export_geoms import add_geoms, add_sites
 from tgdsl.compiler.usd_export_joints import BALL, FREE, add_drives, add_joint, joint_of
+from tgdsl.compiler.usd_notes import OPTION, flags, notable, plain
 from tgdsl.errors import RobotError, listed
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -44,7 +49,8 @@ def export_usd(model_file: Path, out: Path) -> None:
     if out.suffix not in ENDINGS:
         raise RobotError(f"{out}: USD files end in {listed(ENDINGS)}")
     u = usd()
-    draft = Draft(model_file, load_model(model_file).compiled, u.Usd.Stage.CreateInMemory())
+    model = load_model(model_file)
+    draft = Draft(model_file, model.spec, model.compiled, u.Usd.Stage.CreateInMemory())
     _add_scene(draft)
     joints, materials = (draft.path(draft.root, name) for name in ("joints", "materials"))
     _add_bodies(draft, materials)
@@ -72,8 +78,11 @@ def _add_scene(draft: Draft) -> None:
     gravity = np.zeros(3) if is_weightless else model.opt.gravity
     strength = float(np.linalg.norm(gravity))
     scene = u.UsdPhysics.Scene.Define(stage, draft.path("", "physicsScene"))
-    scene.CreateGravityMagnitudeAttr(strength)
-    scene.CreateGravityDirectionAttr(u.Gf.Vec3f(*(gravity / (strength or 1.0)).tolist()))
+    put(scene.CreateGravityMagnitudeAttr(), strength)
+    put(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
+    settings = notable(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(plain().opt, name))
+    for key, value in (settings | flags(model)).items():
+        note(scene.GetPrim(), key, value)
 
 
 def _add_bodies(draft: Draft, materials: str) -> None:
@@ -103,12 +112,12 @@ def _add_mass(draft: Draft, body: int, prim: Any) -> None:
     if model.body_mocapid[body] >= 0:
         rigid.CreateKinematicEnabledAttr(True)
     mass = u.UsdPhysics.MassAPI.Apply(prim)
-    mass.CreateMassAttr(float(model.body_mass[body]))
-    mass.CreateCenterOfMassAttr(u.Gf.Vec3f(*model.body_ipos[body].tolist()))
+    put(mass.CreateMassAttr(), model.body_mass[body])
+    put(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
         return  # of a body that has none, USD wants neither the moments nor their axes
-    mass.CreateDiagonalInertiaAttr(u.Gf.Vec3f(*model.body_inertia[body].tolist()))
-    mass.CreatePrincipalAxesAttr(u.Gf.Quatf(*model.body_iquat[body].tolist()))
+    put(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
+    put(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
 
 def _add_joints(draft: Draft, scope: str) -> None:

@@ -11,7 +11,16 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.compiler.usd_stage import NAMESPACE
 from tgdsl.errors import RobotError
+
+DECIMALS = 14
+"""Decimals of positions and rotations: those beyond are rounding, which differs from machine to machine."""
+
+
+def tidy(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"]:
+    """Return a position [m] or rotation without the noise of its last digits."""
+    return np.round(values, DECIMALS) + 0.0
 
 
 def usd() -> Any:
@@ -35,6 +44,7 @@ class Draft:
 
     Attributes:
         file: The robot file, for messages.
+        spec: MuJoCo's editable model.
         model: MuJoCo's compiled model.
         stage: The `Usd.Stage`.
         root: Path of the default prim.
@@ -44,6 +54,7 @@ class Draft:
     """
 
     file: Path
+    spec: mujoco.MjSpec
     model: mujoco.MjModel
     stage: Any
     root: str = ""
@@ -83,16 +94,40 @@ def place(
     """
     u = usd()
     xform, double = u.UsdGeom.Xformable(prim), u.UsdGeom.XformOp.PrecisionDouble
-    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*pos.tolist()))
-    xform.AddOrientOp(double).Set(u.Gf.Quatd(*quat.tolist()))
+    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*tidy(pos).tolist()))
+    xform.AddOrientOp(double).Set(u.Gf.Quatd(*tidy(quat).tolist()))
     if scale is not None:
         xform.AddScaleOp(double).Set(u.Gf.Vec3d(*scale.tolist()))
 
 
-def note(prim: Any, key: str, value: str | bool | int | float | tuple[float, float]) -> None:
+def note(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
     """Keep on a prim what USD has no word for, as the attribute `tgdsl:<key>`; an empty name is not kept."""
     if value == "":
         return
     types = usd().Sdf.ValueTypeNames
-    kind = {str: types.String, bool: types.Bool, int: types.Int, float: types.Double, tuple: types.Double2}[type(value)]
-    prim.CreateAttribute(f"tgdsl:{key}", kind, custom=True).Set(value)
+    kinds = {str: types.String, bool: types.Bool, int: types.Int, float: types.Double, tuple: types.Double2}
+    kinds[list] = types.StringArray if isinstance(value, list) and isinstance(value[0], str) else types.DoubleArray
+    kind = kinds[type(value)]
+    prim.CreateAttribute(f"{NAMESPACE}{key}", kind, custom=True).Set(value)
+
+
+def put(attribute: Any, value: float | Float[np.ndarray, " number"]) -> None:
+    """Set an attribute to 15 digits, and keep them in its double twin `tgdsl:<its name>` where it has float32 only.
+
+    Args:
+        attribute: A number, a vector of three or a quaternion (w x y z).
+        value: Its value.
+    """
+    u, digits = usd(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
+    types, kind = u.Sdf.ValueTypeNames, attribute.GetTypeName().type.typeName
+    if kind == "GfQuatf":
+        exact, wide = u.Gf.Quatd(*digits), types.Quatd
+        attribute.Set(u.Gf.Quatf(exact))
+    elif kind == "GfVec3f":
+        exact, wide = u.Gf.Vec3d(*digits), types.Double3
+        attribute.Set(u.Gf.Vec3f(exact))
+    else:
+        exact, wide = digits[0], types.Double
+        attribute.Set(exact)
+    if type(exact)(attribute.Get()) != exact:
+        attribute.GetPrim().CreateAttribute(f"{NAMESPACE}{attribute.GetName()}", wide, custom=True).Set(exact)

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
+import mujoco
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.robot import SHAPE_NAMES
-from tgdsl.compiler.usd_export_draft import Draft, note, place, usd
+from tgdsl.compiler.usd_export_draft import Draft, note, place, put, usd
+from tgdsl.compiler.usd_notes import GEOM, MESH, SITE, Notes, notable, plain
 from tgdsl.errors import RobotError
 
+MESH_GEOM = int(mujoco.mjtGeom.mjGEOM_MESH)
+MASKS = ("contype", "conaffinity")
+"""What is noted of visuals too."""
+AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+"""How the importer takes meshes, unless it is noted otherwise."""
 PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
 """MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
 
@@ -30,15 +39,30 @@ def add_geoms(draft: Draft, body: int, materials: str) -> None:
     for geom in range(first, first + int(model.body_geomnum[body])):
         shape, scale = _define(draft, geom)
         prim = shape.GetPrim()
-        place(prim, model.geom_pos[geom], model.geom_quat[geom], scale)
+        place(prim, *_pose(draft, geom), scale)
         note(prim, "name", model.geom(geom).name)
         _colour(draft, geom, shape)
-        contype, conaffinity = int(model.geom_contype[geom]), int(model.geom_conaffinity[geom])
-        if (contype, conaffinity) != (1, 1):
-            note(prim, "contype", contype)
-            note(prim, "conaffinity", conaffinity)
-        if contype or conaffinity:
+        is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+        for key, value in _notes(draft, GEOM, geom).items():
+            if is_colliding or key in MASKS:
+                note(prim, key, value)
+        if is_colliding:
             _collide(draft, geom, prim, materials)
+
+
+def _notes(draft: Draft, table: Notes, index: int) -> dict[str, Any]:
+    return notable(table, lambda name: getattr(draft.model, name)[index], lambda name: getattr(plain(), name)[0])
+
+
+def _pose(draft: Draft, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a geom's pose in its body's frame; of a mesh, that of the frame which its file is in."""
+    model, mesh = draft.model, int(draft.model.geom_dataid[geom])
+    pos, quat = model.geom_pos[geom], model.geom_quat[geom]
+    if model.geom_type[geom] != MESH_GEOM:
+        return pos, quat
+    turn = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).inv()
+    quat = turn.as_quat(canonical=True, scalar_first=True)
+    return pos - turn.apply(model.mesh_pos[mesh]), quat
 
 
 def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
@@ -76,14 +100,34 @@ def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
 
 
 def _fill(draft: Draft, geom: int, shape: Any) -> None:
-    """Write a mesh's triangles, in the geom's frame: MuJoCo's own vertices, bit by bit."""
+    """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
     model, mesh, u = draft.model, int(draft.model.geom_dataid[geom]), usd()
-    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.mesh_vert[first : first + count])))
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(_file_vertices(model, mesh)))
     first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
     shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
     shape.CreateSubdivisionSchemeAttr("none")
+    note(shape.GetPrim(), "mesh", model.mesh(mesh).name)
+    own, usual = draft.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
+    for key, value in notable(MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name)).items():
+        note(shape.GetPrim(), key, value)
+
+
+def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
+    """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order.
+
+    MuJoCo moves them to the mesh's principal axes, which costs a last bit here and there; its hull of a symmetric mesh depends
+    on that bit. So where all coordinates are, to that bit, of few decimals, these are what the file had.
+    """
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    moved = model.mesh_vert[first : first + count].astype(np.float64)
+    found = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]
+    bit = np.finfo(np.float32).eps * max(np.abs(found).max(), np.abs(moved).max())
+    for decimals in range(8):
+        if np.abs(np.round(found, decimals) - found).max() <= bit:
+            found = np.round(found, decimals)
+            break
+    return np.ascontiguousarray(found + 0.0, dtype=np.float32)
 
 
 def _colour(draft: Draft, geom: int, shape: Any) -> None:
@@ -112,8 +156,8 @@ def _material(draft: Draft, friction: float, scope: str) -> Any:
     if friction not in draft.frictions:
         material = u.UsdShade.Material.Define(draft.stage, draft.path(scope, f"friction_{friction!r}"))
         surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-        surface.CreateStaticFrictionAttr(friction)
-        surface.CreateDynamicFrictionAttr(friction)
+        put(surface.CreateStaticFrictionAttr(), friction)
+        put(surface.CreateDynamicFrictionAttr(), friction)
         draft.frictions[friction] = material
     return draft.frictions[friction]
 
@@ -127,3 +171,5 @@ def add_sites(draft: Draft, body: int) -> None:
         place(prim, model.site_pos[site], model.site_quat[site])
         note(prim, "site", True)
         note(prim, "name", name)
+        for key, value in _notes(draft, SITE, site).items():
+            note(prim, key, value)

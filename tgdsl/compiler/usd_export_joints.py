@@ -18,7 +18,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tgdsl.compiler.usd_export_draft import Draft, note, usd
+from tgdsl.compiler.usd_export_draft import Draft, note, put, tidy, usd
+from tgdsl.compiler.usd_notes import JOINT, notable, plain
 from tgdsl.errors import RobotError
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
@@ -81,7 +82,7 @@ def add_joint(draft: Draft, body: int, scope: str, collides: bool) -> Any | None
 
 
 def _frames(draft: Draft, body: int, joint: int, made: Any) -> None:
-    model, gf = draft.model, usd().Gf
+    model = draft.model
     pos, turn = np.zeros(3), Rotation.identity()
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if joint >= 0:
@@ -97,8 +98,8 @@ def _frames(draft: Draft, body: int, joint: int, made: Any) -> None:
         parent_turn = parent_turn * Rotation.from_rotvec([-rest, 0.0, 0.0])
     for number, (place, rotation) in enumerate(((parent_pos, parent_turn), (pos, turn))):
         quat = rotation.as_quat(canonical=True, scalar_first=True)
-        getattr(made, f"CreateLocalPos{number}Attr")(gf.Vec3f(*place.tolist()))
-        getattr(made, f"CreateLocalRot{number}Attr")(gf.Quatf(*quat.tolist()))
+        put(getattr(made, f"CreateLocalPos{number}Attr")(), tidy(place))
+        put(getattr(made, f"CreateLocalRot{number}Attr")(), tidy(quat))
 
 
 def _x_to(axis: np.ndarray) -> Rotation:
@@ -113,19 +114,23 @@ def _limit(model: mujoco.MjModel, joint: int, made: Any) -> None:
     low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
     if model.jnt_type[joint] == HINGE:
         low, high = math.degrees(low), math.degrees(high)
-    made.CreateLowerLimitAttr(low)
-    made.CreateUpperLimitAttr(high)
+    put(made.CreateLowerLimitAttr(), low)
+    put(made.CreateUpperLimitAttr(), high)
 
 
 def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
     first = int(model.jnt_dofadr[joint])
+    index = {"jnt": joint, "dof": first}
+    notes = notable(JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(plain(), name)[0])
+    for key, value in notes.items():
+        note(prim, key, value)
     known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
     if any(known.values()):
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
     for key, value in known.items():
         if value:
-            prim.CreateAttribute(f"physxJoint:{key}", usd().Sdf.ValueTypeNames.Float, custom=True).Set(float(value))
+            put(prim.CreateAttribute(f"physxJoint:{key}", usd().Sdf.ValueTypeNames.Float, custom=True), value)
     damping = float(model.dof_damping[first])
     if damping:
         note(prim, "damping", damping)
@@ -142,12 +147,14 @@ class Servo:
         damping: Effort per error of velocity.
         limit: Largest effort, either way.
         control: Range of the target, or None if it is free.
+        gear: What the actuator's own control and effort are multiplied or divided by.
     """
 
     stiffness: float
     damping: float
     limit: float
     control: tuple[float, float] | None
+    gear: float = 1.0
 
 
 def add_drives(draft: Draft, joints: dict[int, Any]) -> None:
@@ -157,7 +164,7 @@ def add_drives(draft: Draft, joints: dict[int, Any]) -> None:
         draft: The stage.
         joints: The schema of each joint that can move, by MuJoCo's index.
     """
-    model, driven = draft.model, set()
+    model, driven = draft.model, list[int]()
     for actuator in range(model.nu):
         name = model.actuator(actuator).name
         shown = f'{draft.file}: actuator "{name}"' if name else f"{draft.file}: unnamed actuator {actuator}"
@@ -170,12 +177,14 @@ def add_drives(draft: Draft, joints: dict[int, Any]) -> None:
         if joint in driven:
             draft.left_out.append(f"{shown} is not the first of its joint, and USD has one drive for each: left out")
             continue
-        driven.add(joint)
+        driven.append(joint)
         low, high = model.actuator_forcerange[actuator].tolist()
         if model.actuator_forcelimited[actuator] and low != -high:
             draft.left_out.append(f"{shown} has the force range {low:g} {high:g}, and USD's are symmetric: the larger is used")
         _drive(model, joint, servo, joints[joint].GetPrim())
         note(joints[joint].GetPrim(), "actuator", name)
+    for order, joint in enumerate(driven if driven != sorted(driven) else ()):
+        note(joints[joint].GetPrim(), "order", order)
 
 
 def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
@@ -199,6 +208,7 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
         damping=damping * gear**2,
         limit=float(min(limits, default=math.inf)),
         control=(low, high) if model.actuator_ctrllimited[actuator] else None,
+        gear=gear,
     )
 
 
@@ -208,8 +218,10 @@ def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:
     unit = math.radians(1.0) if is_hinge else 1.0  # an angular drive counts in degrees
     drive = usd().UsdPhysics.DriveAPI.Apply(prim, "angular" if is_hinge else "linear")
     drive.CreateTypeAttr("force")
-    drive.CreateStiffnessAttr(servo.stiffness * unit)
-    drive.CreateDampingAttr((servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
-    drive.CreateMaxForceAttr(servo.limit)
+    put(drive.CreateStiffnessAttr(), servo.stiffness * unit)
+    put(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
+    put(drive.CreateMaxForceAttr(), servo.limit)
     if servo.control:
         note(prim, "ctrlrange", servo.control)
+    if servo.gear != 1.0:
+        note(prim, "gear", servo.gear)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.compiler.usd_notes import GEOM, MESH, SITE, read_note, read_notes
 from tgdsl.compiler.usd_shapes import SCHEMAS, Shape, approximated, shape_of
 from tgdsl.compiler.usd_stage import Matrix, Prim, Stage
 
@@ -30,6 +31,8 @@ class Geom:
         friction: Coefficient of sliding friction, or None if its material has none.
         density: Density of its material [kg/m³], or 0.
         color: Red, green, blue, alpha, or None.
+        notes: More attributes of the MJCF geom, if it collides.
+        mesh: Attributes of its MJCF mesh, its name among them.
     """
 
     path: str
@@ -42,6 +45,43 @@ class Geom:
     friction: float | None
     density: float
     color: Float[np.ndarray, 4] | None
+    notes: dict[str, str] = field(default_factory=dict)
+    mesh: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A frame on a body that MJCF calls a site.
+
+    Attributes:
+        prim: Its prim.
+        body: Path of its body; None is the world.
+        pose: Its frame in the body's frame [m].
+        notes: More attributes of the MJCF site.
+    """
+
+    prim: Prim
+    body: str | None
+    pose: Matrix
+    notes: dict[str, str]
+
+
+def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Site]:
+    """Read all prims that are noted to be sites.
+
+    Args:
+        stage: The stage.
+        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
+        frames: World pose of each rigid body [m].
+    """
+    sites = []
+    for prim in stage.prims:
+        if read_note(stage, prim, "site"):
+            body = owners[str(prim.GetPath())]
+            pose = stage.frame(prim)[0]
+            place = pose if body is None else np.linalg.inv(frames[body]) @ pose
+            sites.append(Site(prim, body, place, read_notes(stage, prim, SITE)))
+    return sites
 
 
 def read_geoms(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Geom]:
@@ -87,19 +127,21 @@ def _geoms(
     shape = shape_of(stage, prim, place)
     friction, density = _material(stage, prim) if is_collider else (None, 0.0)
     color = _color(stage, prim)
+    notes, mesh = read_notes(stage, prim, GEOM) if is_collider else {}, read_notes(stage, prim, MESH)
+    mesh |= {"name": name} if (name := read_note(stage, prim, "mesh")) else {}
     path = str(prim.GetPath())
     if not is_collider:
         if shape.vertices is not None and len(shape.vertices) < 4:
             stage.drop("visual meshes with less than four points were dropped", prim)
             return []
-        return [Geom(path, prim, body, shape, False, True, False, None, 0.0, color)]
+        return [Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh)]
     collided, is_hull = (
         approximated(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
     )
     is_same = collided is shape
-    found = [Geom(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color)]
+    found = [Geom(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color, notes, mesh)]
     if is_visible and not is_same:
-        found.append(Geom(path, prim, body, shape, False, True, False, None, 0.0, color))
+        found.append(Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh))
     return found
 
 

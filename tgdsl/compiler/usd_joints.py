@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tgdsl.compiler.usd_drives import ENDLESS, Drive, Range, read_drive
+from tgdsl.compiler.usd_notes import JOINT, read_note, read_notes
 from tgdsl.compiler.usd_stage import Matrix, Prim, Stage
 
-ENDLESS = 1e30
-"""From this magnitude on a limit is none: the largest float32 is often written for infinity."""
 OPEN_SIDE = 1e10
 """Written for a missing limit beside one that exists, which MuJoCo has no word for [rad or m]."""
 MEETING = 1e-4
@@ -23,26 +23,6 @@ DOFS = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 AXES = {"X": np.array([1.0, 0.0, 0.0]), "Y": np.array([0.0, 1.0, 0.0]), "Z": np.array([0.0, 0.0, 1.0])}
 KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "PhysicsSphericalJoint": "ball"}
 """MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are seen to one by one."""
-Range = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A spring and damper that pulls a joint towards a target.
-
-    Attributes:
-        stiffness: [N·m/rad or N/m].
-        damping: [N·m·s/rad or N·s/m].
-        max_force: [N·m or N], or infinity.
-        target: Target position [rad or m].
-        target_velocity: [rad/s or m/s].
-    """
-
-    stiffness: float
-    damping: float
-    max_force: float
-    target: float
-    target_velocity: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +39,12 @@ class Joint:
         frames: The joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero.
         range: Least and greatest position [rad or m], or None if it has no limits.
         drive: What drives it.
+        damping: Its own [N·m·s/rad or N·s/m], beside the drive's.
         armature: [kg·m² or kg].
         friction: Friction torque or force [N·m or N].
         is_excluded: Whether it is kept out of the articulation.
         is_filtering: Whether the bodies must not collide.
+        notes: More attributes of the MJCF joint.
     """
 
     path: str
@@ -74,10 +56,12 @@ class Joint:
     frames: tuple[Matrix, Matrix]
     range: Range | None
     drive: Drive | None
+    damping: float
     armature: float
     friction: float
     is_excluded: bool
     is_filtering: bool
+    notes: dict[str, str]
 
     def pose(self, is_swapped: bool) -> Matrix:
         """Return the pose of the child in its parent at position zero; body 0 is the child if swapped."""
@@ -151,6 +135,9 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
     if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
         kind, frame0, limits = "fixed", frame0 @ _moved(kind, axis, limits[0]), None
     _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
+    drive, damping = None, float(read_note(stage, prim, "damping") or 0.0)
+    if kind in ("hinge", "slide"):
+        drive, damping = read_drive(stage, prim, instance, kind, damping)
     mass = stage.kilograms * (1.0 if kind == "slide" else stage.metres**2)
     return Joint(
         path=str(prim.GetPath()),
@@ -161,11 +148,13 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
         targets=(target0, target1),
         frames=(frame0, frame1),
         range=limits,
-        drive=_drive(stage, prim, instance, kind) if kind in ("hinge", "slide") else None,
+        drive=drive,
+        damping=damping,
         armature=stage.number(prim, "physxJoint:armature") * mass,
         friction=stage.number(prim, "physxJoint:jointFriction") * mass * (stage.metres if kind == "slide" else 1.0),
         is_excluded=bool(stage.value(prim, "physics:excludeFromArticulation")),
         is_filtering=not stage.value(prim, "physics:collisionEnabled"),
+        notes=read_notes(stage, prim, JOINT),
     )
 
 
@@ -263,26 +252,6 @@ def rotation_of(stage: Stage, prim: Prim, name: str) -> Rotation:
     if not np.isfinite(length) or length == 0:
         raise stage.error(prim, f"{name} is no rotation: {value}")
     return Rotation.from_quat(quat / length, scalar_first=True)
-
-
-def _drive(stage: Stage, prim: Prim, instance: str, kind: str) -> Drive | None:
-    if not prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, instance):
-        return None
-    stiffness, damping, most, target, velocity = (
-        stage.number(prim, f"drive:{instance}:physics:{name}")
-        for name in ("stiffness", "damping", "maxForce", "targetPosition", "targetVelocity")
-    )
-    if not stiffness and not damping:
-        return None  # it never exerts a force
-    if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
-        stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
-        return None
-    is_angular = kind == "hinge"
-    gain = stage.kilograms * (stage.metres**2 * math.degrees(1) if is_angular else 1.0)
-    force = stage.kilograms * (stage.metres**2 if is_angular else stage.metres)
-    unit = math.radians(1) if is_angular else stage.metres
-    most = math.inf if most >= ENDLESS else most * force
-    return Drive(stiffness * gain, damping * gain, most, target * unit, velocity * unit)
 
 
 def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:

@@ -23,7 +23,9 @@ Matrix = Float[np.ndarray, "4 4"]
 """A homogeneous transform of column vectors."""
 SHEAR = 1e-5
 """Cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32."""
-NAME_ATTRIBUTE = "tgdsl:name"
+NAMESPACE = "tgdsl:"
+"""What the names of our own custom attributes begin with."""
+NAME_ATTRIBUTE = f"{NAMESPACE}name"
 """A custom string attribute of a prim: the name that it has in MJCF."""
 
 
@@ -93,14 +95,19 @@ class Stage:
         return self.pxr.UsdGeom.XformCache(self._time)
 
     def value(self, prim: Prim, name: str) -> Any:
-        """Return an attribute's value, the schema's own where none is authored, or None where there is no such attribute."""
-        attribute = prim.GetAttribute(name)
-        return attribute.Get(self._time) if attribute else None
+        """Return an attribute's value, the schema's own where none is authored, or None where there is no such attribute.
+
+        Where it is what its double twin `tgdsl:<name>` rounds to, that is returned.
+        """
+        attribute, twin = prim.GetAttribute(name), prim.GetAttribute(f"{NAMESPACE}{name}")
+        value = attribute.Get(self._time) if attribute else None
+        exact = twin.Get(self._time) if twin and value is not None else None
+        return value if exact is None or not _is_rounded(exact, value) else exact
 
     def authored(self, prim: Prim, name: str) -> Any:
         """Return an attribute's value if it is authored, or else None."""
         attribute = prim.GetAttribute(name)
-        return attribute.Get(self._time) if attribute and attribute.HasAuthoredValue() else None
+        return self.value(prim, name) if attribute and attribute.HasAuthoredValue() else None
 
     def number(self, prim: Prim, name: str, default: float = 0.0) -> float:
         """Return the value of a scalar attribute."""
@@ -143,6 +150,16 @@ class Stage:
         paths = self.dropped.setdefault(what, [])
         if (path := str(prim.GetPath())) not in paths:
             paths.append(path)
+
+
+def _is_rounded(exact: Any, value: Any) -> bool:
+    """Return whether a value in float32 is what one in double rounds to."""
+    if isinstance(value, float):
+        return isinstance(exact, float) and bool(np.float32(exact) == np.float32(value))
+    try:
+        return bool(type(value)(exact) == value)
+    except TypeError:  # another program wrote something else under this name
+        return False
 
 
 def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, 3]] | None:

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from tgdsl.compiler.usd_geoms import Geom
-from tgdsl.compiler.usd_joints import Drive, Joint
+from tgdsl.compiler.usd_drives import Drive
+from tgdsl.compiler.usd_geoms import Geom, Site
+from tgdsl.compiler.usd_joints import Joint
 from tgdsl.compiler.usd_shapes import Shape, quaternion
 from tgdsl.compiler.usd_stage import Matrix
 from tgdsl.compiler.usd_tree import Link
@@ -36,23 +37,24 @@ def posed(element: ET.Element, pose: Matrix) -> ET.Element:
 
 
 class MeshAssets:
-    """The meshes of a model: those that are equal to the last digit are kept once."""
+    """The meshes of a model: those that are equal in float32, which is what MuJoCo keeps, are kept once."""
 
     def __init__(self, asset: ET.Element):
         self.asset = asset
         self.names: dict[str, str] = {}
 
-    def name(self, shape: Shape, name: str) -> str:
-        """Return the name of a shape's mesh, which is added under the given name if it is new."""
+    def name(self, shape: Shape, name: str, notes: Mapping[str, str]) -> str:
+        """Return the name of a shape's mesh, which is added if it is new: under its noted name, or else the given one."""
         assert shape.vertices is not None and shape.faces is not None
-        vertices = np.ascontiguousarray(shape.vertices + 0.0)
+        vertices = np.ascontiguousarray(shape.vertices + 0.0, dtype=np.float32)
         faces = np.ascontiguousarray(shape.faces, dtype=np.int64)
-        key = hashlib.sha256(vertices.tobytes() + b"|" + faces.tobytes()).hexdigest()
+        key = hashlib.sha256(vertices.tobytes() + b"|" + faces.tobytes() + repr(sorted(notes.items())).encode()).hexdigest()
         if key not in self.names:
-            self.names[key] = name
+            wanted = (notes.get("name", name), name, *(f"{name}_{i + 2}" for i in range(len(self.names))))
+            self.names[key] = next(own for own in wanted if own not in self.names.values())
             # Masses are given with the bodies; a shell is what MuJoCo never finds wrong with a mesh that is open or flat.
-            mesh = ET.SubElement(self.asset, "mesh", name=name, inertia="shell")
-            mesh.set("vertex", numbers(vertices.reshape(-1)))
+            mesh = ET.SubElement(self.asset, "mesh", {"inertia": "shell", **notes, "name": self.names[key]})
+            mesh.set("vertex", " ".join(map(str, vertices.reshape(-1))))
             mesh.set("face", " ".join(map(str, faces.reshape(-1).tolist())))
         return self.names[key]
 
@@ -62,13 +64,15 @@ def add_geom(body: ET.Element, name: str, geom: Geom, meshes: MeshAssets) -> Non
     element = ET.SubElement(body, "geom", name=name, type=geom.shape.kind)
     posed(element, geom.shape.pose)
     if geom.shape.kind == "mesh":
-        element.set("mesh", meshes.name(geom.shape, name))
+        element.set("mesh", meshes.name(geom.shape, name, geom.mesh))
     else:
         element.set("size", numbers(geom.shape.size))
     if geom.is_collider:
         element.set("group", VISIBLE if geom.is_visible else HIDDEN)
+        element.attrib |= geom.notes
         if geom.friction is not None:
-            element.set("friction", numbers([geom.friction]))
+            more = geom.notes.get("friction", "").split()[1:]
+            element.set("friction", " ".join([*numbers([geom.friction]).split(), *more]))
     else:
         for attribute, value in {"group": SEEN_ONLY, "contype": "0", "conaffinity": "0", "mass": "0"}.items():
             element.set(attribute, value)
@@ -76,11 +80,16 @@ def add_geom(body: ET.Element, name: str, geom: Geom, meshes: MeshAssets) -> Non
         element.set("rgba", numbers(geom.color))
 
 
-def add_motion(body: ET.Element, link: Link, names: Mapping[str, str]) -> None:
-    """Add to a body what lets it move against its parent."""
+def add_site(body: ET.Element, name: str, site: Site) -> None:
+    """Add a site to its body."""
+    posed(ET.SubElement(body, "site", {"name": name} | site.notes), site.pose)
+
+
+def add_motion(body: ET.Element, link: Link, names: Mapping[str, str], free: str) -> None:
+    """Add to a body what lets it move against its parent: a joint, or one that is called `free` if it floats."""
     joint = link.joint
     if joint is None:
-        ET.SubElement(body, "freejoint")
+        ET.SubElement(body, "freejoint", {"name": free} if free else {})
         return
     if joint.kind == "fixed":
         return
@@ -91,9 +100,10 @@ def add_motion(body: ET.Element, link: Link, names: Mapping[str, str]) -> None:
         element.set("axis", numbers(frame[:3, :3] @ joint.axis * (-1 if link.is_swapped else 1)))
         if joint.range is not None:
             element.set("range", numbers(joint.range))
-    for attribute, value in {"armature": joint.armature, "frictionloss": joint.friction}.items():
+    for attribute, value in {"damping": joint.damping, "armature": joint.armature, "frictionloss": joint.friction}.items():
         if value:
             element.set(attribute, numbers([value]))
+    element.attrib |= joint.notes
 
 
 def add_loop(
@@ -144,6 +154,7 @@ def add_key(
     qpos: list[float] = []
     ctrl: list[float] = []
     is_needed = False
+    driven: list[tuple[Drive, str]] = []
     for link, authored in motions:
         joint = link.joint
         if joint is None or authored is None:
@@ -158,9 +169,10 @@ def add_key(
             qpos += [*turn]
             is_needed |= bool(np.abs(turn[1:]).max() > MOVED)
         if joint.drive is not None:
-            ctrl.append(_add_actuator(actuator, joint.drive, names[joint.path]))
-            is_needed |= ctrl[-1] != 0.0
-    if is_needed:
+            driven.append((joint.drive, names[joint.path]))
+    for drive, name in sorted(driven, key=lambda pair: pair[0].order):
+        ctrl.append(_add_actuator(actuator, drive, name))
+    if is_needed or any(ctrl):
         key = ET.SubElement(keyframe, "key", name="authored", qpos=numbers(qpos))
         if ctrl:
             key.set("ctrl", numbers(ctrl))
@@ -174,19 +186,25 @@ def _child_turn(link: Link, joint: Joint, apart: Matrix) -> Matrix:
     return turn
 
 
-def _add_actuator(actuator: ET.Element, drive: Drive, name: str) -> float:
-    """Add the actuator that is a drive, and return its control at the drive's target."""
-    attributes = {"name": name, "joint": name}
+def _add_actuator(actuator: ET.Element, drive: Drive, joint: str) -> float:
+    """Add the actuator that is a drive of a joint, and return its control at the drive's target."""
+    attributes, gear = {"name": drive.actuator or joint, "joint": joint}, drive.gear
+    if gear != 1.0:
+        attributes["gear"] = numbers([gear])
+    if drive.control is not None:
+        attributes["ctrlrange"] = numbers(sorted(end * gear for end in drive.control))
     if not math.isinf(drive.max_force):
-        attributes["forcerange"] = numbers([-drive.max_force, drive.max_force])
-    kp, kv = numbers([drive.stiffness]), numbers([drive.damping])
-    if not drive.stiffness:
+        most = drive.max_force / abs(gear)
+        attributes["forcerange"] = numbers([-most, most])
+    stiffness, damping = drive.stiffness / gear**2, drive.damping / gear**2
+    kp, kv = numbers([stiffness]), numbers([damping])
+    if not stiffness:
         ET.SubElement(actuator, "velocity", attributes, kv=kv)
-        return drive.target_velocity
+        return drive.target_velocity * gear
     if not drive.target_velocity:
         ET.SubElement(actuator, "position", attributes, kp=kp, kv=kv)
-        return drive.target
+        return drive.target * gear
     # A spring whose damper pulls towards a speed: a position actuator with a constant force.
-    bias = numbers([drive.damping * drive.target_velocity, -drive.stiffness, -drive.damping])
+    bias = numbers([damping * drive.target_velocity * gear, -stiffness, -damping])
     ET.SubElement(actuator, "general", attributes, gainprm=kp, biastype="affine", biasprm=bias)
-    return drive.target
+    return drive.target * gear

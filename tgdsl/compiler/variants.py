@@ -13,7 +13,7 @@ import mujoco
 from tgdsl.compiler.robot import Model
 from tgdsl.errors import RobotError
 from tgdsl.plan import Asset, SceneGeom, SceneObject
-from tgdsl.scene import Choice, geom_name, muted_mujoco, portable, with_choices
+from tgdsl.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices
 from tgdsl.schema.files import is_file
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
@@ -170,7 +170,7 @@ def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, byt
     found = []
     for variant, geoms in enumerate(target.variants):
         spec = scene.spec.copy()
-        spec.assets = {**spec.assets, **contents}
+        spec.assets = {**spec.assets, **{key: readable(key, content) for key, content in contents.items()}}
         try:
             with muted_mujoco():
                 spec = with_choices(spec, [target], {target.name: Choice(variant)})
