@@ -9,6 +9,7 @@ import torch
 import trimesh
 
 import tgdsl
+from tgdsl.compiler.usd_export import export_usd
 from tgdsl.errors import SpecError
 from tgdsl.runtime.rollout import scripted_controls
 from tgdsl.scene import scene_model
@@ -129,3 +130,23 @@ def test_examples_are_touched_when_the_hand_closes(name, links, num_envs):
     for link in links:
         assert (force[:, touch.taxels["touch"]["link"] == f"right_hand_{link}"].sum(dim=1) > 0).float().mean() > 0.7, link
     assert set(touch.observe(readings)) == {"policy"}
+
+
+@pytest.mark.parametrize("format", ["urdf", "usda"])
+def test_objects_for_a_robot_that_is_no_mjcf(tmp_path, format):
+    """The scene that is kept holds the new body once, at its exact place."""
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="pad"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+        '</inertial><collision><geometry><box size=".1 .1 .02"/></geometry></collision></link></robot>'
+    )
+    if format == "usda":
+        (tmp_path / "arm.xml").write_text(
+            '<mujoco><worldbody><body name="pad"><joint axis="0 0 1"/><geom type="box" size=".05 .05 .01"/></body></worldbody></mujoco>'
+        )
+        export_usd(tmp_path / "arm.xml", tmp_path / "arm.usda")
+    doc = document(tmp_path, {"ball": {"geom": BALL, "pos": [0, 0, 0.123456789]}})
+    doc["robot"]["model"] = str(tmp_path / f"arm.{format}")
+    touch = tgdsl.compile(doc, dtype=torch.float64)
+    sim = tgdsl.simulate(touch, 1)
+    assert sim.batch.qpos[0, -5] == 0.123456789
+    assert touch(sim.state())["s"][0, 0, 0].item() == pytest.approx(0.123456789 - 0.01 - 0.02, abs=1e-9)

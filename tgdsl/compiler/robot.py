@@ -85,7 +85,7 @@ class Model:
         spec: MuJoCo's editable model.
         compiled: MuJoCo's compiled model.
         is_urdf: Whether it is URDF.
-        mjcf: The MJCF that it was turned into, if it is USD; else empty.
+        mjcf: The MJCF that it was turned into, if it is URDF or USD; else empty.
         rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
     """
 
@@ -236,7 +236,8 @@ def load_model(path: Path) -> Model:
             for mesh in spec.meshes if is_urdf else ():
                 mesh.file = str(files[Path(mesh.file).stem])
             rewritten = _rewrite_meshes(spec)
-            return Model(path, spec, spec.compile(), is_urdf, rewritten=rewritten)
+            compiled = spec.compile()
+            return Model(path, spec, compiled, is_urdf, spec.to_xml() if is_urdf else "", rewritten)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
 

@@ -120,9 +120,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
     kept.assets |= own.meshes.assets
     kept.contents |= own.meshes.contents
     if model.mjcf:
-        main = kept.rewritten(ET.fromstring(model.mjcf), model.file, [model.file.parent])
-    elif model.is_urdf:
-        root = ET.fromstring(model.spec.to_xml())
+        root = ET.fromstring(model.mjcf)
         for mesh in root.iter("mesh"):
             if (name := mesh.get("file", "")) in model.rewritten:
                 mesh.set("file", str(model.rewritten[name]))

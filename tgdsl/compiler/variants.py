@@ -174,7 +174,7 @@ def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, byt
         try:
             with muted_mujoco():
                 spec = with_choices(spec, [target], {target.name: Choice(variant)})
-                model = Model(scene.file, spec, spec.compile(), scene.is_urdf)
+                model = replace(scene, spec=spec, compiled=spec.compile())
         except ValueError as error:
             message = " ".join(str(error).split())
             raise RobotError(f"{scene.file}: object {target.name}, variant {variant}: {message}") from error
