@@ -5,10 +5,12 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.usd import usd_to_mjcf
+from tgdsl.errors import RobotError
 
 ONE = (1.0, 0.0, 0.0, 0.0)
 JOINTS = {
@@ -160,3 +162,79 @@ def inertia(model: mujoco.MjModel, body: str) -> np.ndarray:
     """Return a body's inertia about its centre of mass, in its frame."""
     turned = Rotation.from_quat(model.body(body).iquat, scalar_first=True).as_matrix()
     return turned @ np.diag(model.body(body).inertia) @ turned.T
+
+
+TOLERANCE = 1e-6
+"""USD keeps joint frames and sizes in float32, MuJoCo mesh vertices too; all here is about 1 m or 1 kg."""
+ODD = (0.8, 0.3, -0.4, 0.2)
+OTHER = (0.5, -0.6, 0.1, 0.7)
+ONE_TURN = (1.0, 0.0, 0.0, 0.0)
+WEDGE = [(0, 0, 0), (3, 0, 0), (0, 2, 0), (0, 0, 1)]
+WEDGE_FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+QUAD = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+FRAMES = ((0.4, -0.3, 0.2), ODD, (-0.1, 0.25, 0.35), OTHER)
+"""Where the joint of `arm` is in body 0 and in body 1: position and quaternion."""
+FRAME0, FRAME1 = matrix(*FRAMES[:2]), matrix(*FRAMES[2:])
+
+
+def close(found, expected, tolerance: float = TOLERANCE) -> None:
+    np.testing.assert_allclose(found, expected, rtol=tolerance, atol=tolerance)
+
+
+def error_of(stage: Usd.Stage) -> str:
+    path = path_of(stage)
+    with pytest.raises(RobotError) as caught:
+        usd_to_mjcf(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def warned(stage: Usd.Stage) -> tuple[mujoco.MjModel, list[str]]:
+    """Return the model, and its warnings without the file's name."""
+    with pytest.warns(UserWarning, match=r"\.usda: ") as caught:
+        model = compiled(stage)
+    return model, [str(w.message).removeprefix(f"{path_of(stage)}: ") for w in caught]
+
+
+def arm(stage: Usd.Stage, kind: str, axis: str, is_swapped: bool = False, **values) -> None:
+    """Add a base that is fixed to the world and a link on it; frame 0 is the base's, or the link's if swapped."""
+    add_body(stage, "/robot/base", (0.1, 0.2, 0.3), OTHER)
+    add_body(stage, "/robot/link")
+    UsdPhysics.ArticulationRootAPI.Apply(
+        add_joint(stage, "/robot/root", "fixed", (None, "/robot/base"), (0.1, 0.2, 0.3), OTHER)
+    )
+    bodies = ("/robot/link", "/robot/base") if is_swapped else ("/robot/base", "/robot/link")
+    add_joint(stage, "/robot/j", kind, bodies, *FRAMES, **({"axis": axis} if axis else {}), **values)
+    place_at_zero(stage, is_swapped)
+
+
+def place_at_zero(stage: Usd.Stage, is_swapped: bool) -> None:
+    """Move the link to where the joint is at zero, so that nothing is off."""
+    base = matrix((0.1, 0.2, 0.3), OTHER)
+    pose = base @ (FRAME1 @ np.linalg.inv(FRAME0) if is_swapped else FRAME0 @ np.linalg.inv(FRAME1))
+    move(stage.GetPrimAtPath("/robot/link"), pose)
+
+
+GENERIC = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+
+
+def generic(stage: Usd.Stage, limits: dict[str, tuple[float, float]]) -> None:
+    arm(stage, "generic", "")
+    for dof, (low, high) in limits.items():
+        limit = UsdPhysics.LimitAPI.Apply(stage.GetPrimAtPath("/robot/j"), dof)
+        limit.CreateLowAttr(low)
+        limit.CreateHighAttr(high)
+
+
+def parents(model: mujoco.MjModel) -> dict[str, str]:
+    return {model.body(i).name: model.body(model.body_parentid[i]).name for i in range(1, model.nbody)}
+
+
+def chain(stage: Usd.Stage, count: int, kind: str = "hinge", **values) -> None:
+    """Add bodies a row along x, 1 m apart, each joined to the one before by its own origin."""
+    for i in range(count):
+        add_body(stage, f"/b{i}", (i, 0, 0))
+        if i:
+            add_joint(stage, f"/j{i}", kind, (f"/b{i - 1}", f"/b{i}"), (1, 0, 0), **values)

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.usd_export import export_usd
 
-pytest.importorskip("pxr")
 usd_to_mjcf = pytest.importorskip("tgdsl.compiler.usd").usd_to_mjcf
 
 XHAND1 = Path(__file__).parents[2] / "robots" / "xhand1" / "xhand1_right.xml"
