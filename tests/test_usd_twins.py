@@ -17,7 +17,6 @@ from tgdsl.compiler.usd_export import export_usd
 from tgdsl.schema.load import load
 from tgdsl.sensors import KINDS
 
-pytest.importorskip("pxr")
 ROOT = Path(__file__).resolve().parent.parent
 HANDS = {"xhand1": "right_hand_link", "sharpa": "right_hand_C_MC"}
 SHARPA_SCENE = f"""

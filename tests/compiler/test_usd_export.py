@@ -7,14 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
 from scipy.spatial.transform import Rotation
 
 from tgdsl.compiler.robot import load_model
 from tgdsl.compiler.usd_export import export_usd
 from tgdsl.errors import RobotError
-
-pxr = pytest.importorskip("pxr")
-from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation  # noqa: E402
 
 XHAND1 = Path(__file__).parents[2] / "robots" / "xhand1" / "xhand1_right.xml"
 TOLERANCE = 1e-6

@@ -5,12 +5,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from pxr import Usd
 
 from tgdsl.compiler.robot import load_model
 from tgdsl.compiler.usd_export import export_usd
 from tgdsl.compiler.usd_notes import FLAGS, KNOWN_FLAGS, OPTION
-
-Usd = pytest.importorskip("pxr.Usd")
 
 MODEL = """
 <mujoco model="notes">

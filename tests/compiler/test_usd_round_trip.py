@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tgdsl.compiler.usd import usd_to_mjcf
 from tgdsl.compiler.usd_export import export_usd
-
-usd_to_mjcf = pytest.importorskip("tgdsl.compiler.usd").usd_to_mjcf
 
 XHAND1 = Path(__file__).parents[2] / "robots" / "xhand1" / "xhand1_right.xml"
 TOLERANCE = 1e-6
