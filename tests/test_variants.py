@@ -324,3 +324,15 @@ def test_places_are_shared_in_order():
 def test_the_same_document_is_the_same_plan(tmp_path):
     first, second = (compile_plan(document(tmp_path, "<geom size='.01'/>", variants=ODD)) for _ in range(2))
     assert first.to_json() == second.to_json() and json.loads(first.to_json())["scene"]["objects"][0]["name"] == "item"
+
+
+def test_models_that_no_environment_has_any_more_are_forgotten(tmp_path):
+    touch = falling(tmp_path, '<geom type="box" size=".01 .01 .01"/>', size="per_env")
+    sim = tgdsl.simulate(touch, 4)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        sim.set_objects(sizes={"item": rng.uniform(0.01, 0.02, (4, 3))})
+    scenes = sim._objects._scenes
+    assert len(scenes._models) == 4
+    sim.step()
+    assert np.isfinite(sim.batch.qpos).all()

@@ -105,14 +105,13 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
         objects: The objects.
         choices: What each is like, by its name; default: its first variant.
     """
-    free = _free_bit(spec) if objects else 0
     for target in objects:
         choice = choices.get(target.name, Choice())
         body = spec.body(target.body)
         if target.types:
             template = body.geoms[0]
             for i in range(len(target.types)):
-                _add_geom(spec, target, i, choice.variant, template, free)
+                _add_geom(spec, target, i, choice.variant, template)
             for geom in body.geoms[: -len(target.types)]:
                 spec.delete(geom)
         if choice.size is not None:
@@ -144,7 +143,7 @@ def _free_bit(spec: mujoco.MjSpec) -> int:
     return free
 
 
-def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom, free: int) -> None:
+def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom) -> None:
     """Add geom i of an object to its body as one variant has it, and the meshes that it has in any."""
     meshes = {}
     for v, geoms in enumerate(target.variants):
@@ -168,14 +167,14 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
     for name in INHERITED:
         setattr(geom, name, getattr(template, name))
     if chosen is None:
-        geom.contype, geom.conaffinity = free, 0
+        geom.contype, geom.conaffinity = _free_bit(spec), 0
         geom.mass, geom.density = 0.0, 0.0
         geom.rgba = [0.0, 0.0, 0.0, 0.0]
         geom.material = ""
 
 
 class SceneModels:
-    """The models of a scene whose objects differ between environments, all of one layout, each compiled once."""
+    """The models of a scene whose objects differ between environments, all of one layout, each compiled once while in use."""
 
     def __init__(self, scene: SceneFile):
         """Read the assets.
@@ -211,16 +210,25 @@ class SceneModels:
                 raise RobotError(f"MuJoCo cannot compile the scene with {dict(choices)}: {error}") from error
         return self._models[key]
 
+    def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
+        """Return the model of each environment, and forget those that none has: sizes drawn anew would pile up."""
+        found = [self.model(own) for own in choices]
+        used = {id(model) for model in found}
+        self._models = {key: model for key, model in self._models.items() if id(model) in used}
+        return found
+
     def size(self, name: str, choice: Choice) -> tuple[float, float, float]:
         """Return the size of an object whose size may be chosen, as MuJoCo defines it [m]."""
+        if choice.size is not None:
+            return choice.size
         target, model = self.objects[name], self.model({name: choice})
         x, y, z = model.geom_size[model.body(target.body).geomadr[0] + _sized_geom(target, choice.variant)]
         return float(x), float(y), float(z)
 
-    def type(self, name: str, choice: Choice) -> str:
-        """Return MuJoCo's name of its type."""
-        target, model = self.objects[name], self.model({name: choice})
-        kind = model.geom_type[model.body(target.body).geomadr[0] + _sized_geom(target, choice.variant)]
+    def type(self, name: str, variant: int) -> str:
+        """Return MuJoCo's name of the type of a variant of an object whose size may be chosen."""
+        target, model = self.objects[name], self.model({name: Choice(variant)})
+        kind = model.geom_type[model.body(target.body).geomadr[0] + _sized_geom(target, variant)]
         return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
 
     def _compiled(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:

@@ -48,7 +48,7 @@ class EnvObjects:
                 choices[name] = Choice(int(variant))
         for name, value in sizes.items():
             for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
-                num = NUM_SIZES[self._scenes.type(name, choices[name])]
+                num = NUM_SIZES[self._scenes.type(name, choices[name].variant)]
                 if len(size) < num or not (size[:num] > 0).all():
                     raise SimulationError(f"size of object {name} is {size.tolist()}, expected {num} positive lengths")
                 x, y, z = [*size[:num].tolist(), 0.0, 0.0][:3]
@@ -63,7 +63,7 @@ class EnvObjects:
 
     def models(self) -> list[mujoco.MjModel]:
         """Return each environment's model; those that are alike share one."""
-        return [self._scenes.model(choices) for choices in self._choices]
+        return self._scenes.models(self._choices)
 
     def _size(self, name: str, choice: Choice) -> tuple[float, float, float]:
         return self._scenes.size(name, choice) if self._scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
