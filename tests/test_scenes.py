@@ -105,6 +105,23 @@ def test_mistakes(tmp_path, target, message):
     assert message in str(error.value), str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("notes.md", b"# no mesh", "no decoder found for mesh file 'notes.md'"),
+        ("short.stl", b"x" * 100, "in STL file 'short.stl'"),
+    ],
+)
+def test_a_mesh_file_that_is_none(tmp_path, name, content, message):
+    """The mistake is where the document names the file, in the document's own words for it."""
+    (tmp_path / name).write_bytes(content)
+    path = str(tmp_path / name)
+    with pytest.raises(SpecError) as error:
+        tgdsl.compile(document(tmp_path, {"item": {"variants": [BALL, {"mesh": path}]}}))
+    assert f'objects.item.variants[1]: MuJoCo cannot read mesh file "{path}"' in str(error.value)
+    assert message in str(error.value) and len(error.value.problems) == 1
+
+
 def test_a_name_that_the_scene_has(tmp_path):
     with pytest.raises(SpecError, match='the scene has a body "pad" already; `body: pad` gives that one these geoms'):
         tgdsl.compile(document(tmp_path, {"pad": {"geom": BALL}}))

@@ -313,6 +313,7 @@ def test_mistakes(tmp_path, target, message):
     with pytest.raises(SpecError) as error:
         tgdsl.compile(document(tmp_path, "<geom size='.01'/>", **target))
     assert message in str(error.value), str(error.value)
+    assert len(error.value.problems) == 1, str(error.value)
 
 
 def test_places_are_shared_in_order():

@@ -69,7 +69,7 @@ def felt_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, Fel
             hint = did_you_mean(body, scene.bodies, "bodies")
             loaded.problems.append(loaded.problem(path, f'no body is named "{body}"', hint))
             continue
-        if target.compounds and is_faulty:
+        if (target.compounds or target.size == "per_env") and is_faulty:
             continue  # what is wrong with its geoms is known already
 
         def report(what: str, hint: str, at: Path = path) -> None:

@@ -158,7 +158,16 @@ def _scene_geom(
     if not is_file(path):
         report(f'there is no file "{geom.mesh}"')
         return None
-    return SceneGeom((), geom.pos, geom.quat, geom.density, meshes.add(path), geom.scale)
+    key = meshes.add(path)
+    trial = mujoco.MjSpec()
+    trial.assets = {key: readable(key, meshes.contents[key])}
+    trial.add_mesh(name=path.stem, file=key)
+    try:
+        trial.compile()
+    except ValueError as error:
+        report(f'MuJoCo cannot read mesh file "{geom.mesh}": {" ".join(str(error).split()).replace(key, path.name)}')
+        return None
+    return SceneGeom((), geom.pos, geom.quat, geom.density, key, geom.scale)
 
 
 def variant_scenes(scene: Model, target: SceneObject, contents: Mapping[str, bytes]) -> list[tuple[Model, tuple[str, ...]]]:
