@@ -1,5 +1,31 @@
-"""Types and shapes are checked at run time in tests, and only there."""
+"""Types and shapes are checked at run time in tests, and only there; and the command line is run as users run it."""
 
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
 from jaxtyping import install_import_hook
 
 install_import_hook("tgdsl", "beartype.beartype")
+
+
+@pytest.fixture
+def here(monkeypatch, capsys):
+    """Run a command in this process, which spares the seconds that importing torch takes; return exit code and both texts."""
+
+    def run(folder: Path, *arguments: str) -> tuple[int, str, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["tgdsl", *arguments])
+        monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
+        capsys.readouterr()
+        try:
+            from tgdsl.cli import main
+
+            main()
+            code = 0
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        return code, *capsys.readouterr()
+
+    return run

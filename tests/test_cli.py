@@ -4,14 +4,12 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import tgdsl
-from tgdsl.cli import main
 from tgdsl.schema.document import json_schema
 
 REPOSITORY = Path(__file__).parents[1]
@@ -61,25 +59,6 @@ def tgdsl_in(folder: Path, *arguments: str, filters: str = "error") -> subproces
     environment = {**os.environ, "PYTHONWARNINGS": filters, "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
     command = [sys.executable, "-m", "tgdsl", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-
-
-@pytest.fixture
-def here(monkeypatch, capsys):
-    """Run a command in this process, which spares the seconds that importing torch takes; return exit code and both texts."""
-
-    def run(folder: Path, *arguments: str) -> tuple[int, str, str]:
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["tgdsl", *arguments])
-        monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
-        capsys.readouterr()
-        try:
-            main()
-            code = 0
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        return code, *capsys.readouterr()
-
-    return run
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """Pictures of hands: where the discs land, which are in view, what the legend counts, and what is said of a mistake."""
 
-import sys
 from pathlib import Path
 
 import matplotlib.image
@@ -10,7 +9,6 @@ import pytest
 from matplotlib.axes import Axes
 
 import tgdsl
-from tgdsl.cli import main
 from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout import Layout, Link
@@ -328,22 +326,9 @@ def test_mistakes_of_documents(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def command(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
+def command(here, folder: Path):
     """Run `tgdsl render` in the folder of the hand; return exit code, output and errors."""
-
-    def run(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["tgdsl", "render", *arguments])
-        monkeypatch.setattr("warnings.showwarning", lambda *_: None)  # the command sets its own
-        capsys.readouterr()
-        try:
-            main()
-            code = 0
-        except SystemExit as ended:
-            code = int(ended.code or 0)
-        return code, *capsys.readouterr()
-
-    return run
+    return lambda *arguments: here(folder, "render", *arguments)
 
 
 def test_command_draws_a_robot_a_document_and_an_artefact(command, folder: Path, tmp_path: Path) -> None:
