@@ -223,7 +223,7 @@ class InverseSpec(ContactProbeSpec):
 
 INVERSE = Kind(
     InverseSpec,
-    lower=lambda spec, layout: Lowered((Channel("inverse", "1"),)),
+    lower=lambda spec, layout, surface_of: Lowered((Channel("inverse", "1"),)),
     forward=lambda felt, probes, constants, state: ({"inverse": 1 / (1 + felt.depth)}, {}),
     reference=lambda spec, layout, touch, state: (1 / (1 + touch.depth[:, None]), {}),
 )

@@ -83,6 +83,22 @@ class SampleError(TgdslError):
         super().__init__(f"{what}; {hint}" if hint else what)
 
 
+class LowerError(TgdslError):
+    """What a kind of sensor cannot do on the links that it was put on.
+
+    Attributes:
+        what: What was found and what was expected.
+        field: The field of the sensor's spec that is at fault, or empty.
+        hint: What would be right, or empty.
+    """
+
+    def __init__(self, what: str, field: str = "", hint: str = ""):
+        self.what = what
+        self.field = field
+        self.hint = hint
+        super().__init__(f"{what}; {hint}" if hint else what)
+
+
 def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
     """Return a hint that names the nearest known name, or else lists what exists."""
     known = sorted(set(names))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -50,11 +51,9 @@ def operations_per_env(touch: TactileModule) -> int:
     for num_envs in (2, 4):
         state = touch.example_state(num_envs)
         memory = {
-            f"{s.name}:{plane}": torch.zeros(
-                num_envs, touch.plan.queries[s.query].num_taxels, dtype=touch.dtype, device=touch.device
-            )
+            f"{s.name}:{name}": torch.full((num_envs, *memory.shape), memory.rest, dtype=touch.dtype, device=touch.device)
             for s in touch.plan.sensors
-            for plane in s.state
+            for name, memory in s.state.items()
         }
         tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
         with torch.no_grad(), _OperationCounter() as counter:
@@ -73,12 +72,14 @@ def explain(touch: TactileModule) -> str:
     lines += _grids(touch)
     lines += ["", "queries (each measures its probes once, whatever number of sensors they serve)"]
     for i, query in enumerate(plan.queries):
-        lines.append(f"  {i}: {query.num_taxels} probes against {', '.join(_felt(plan.objects[o]) for o in query.objects)}")
+        against = ", ".join(_felt(plan.objects[o]) for o in query.objects) or "nothing"
+        lines.append(f"  {i}: {query.num_taxels} probes against {against}")
         for a, answer in enumerate(query.answers):
             users = ", ".join(sensor.name for sensor in plan.sensors if (sensor.query, sensor.answer) == (i, a))
             gate = "where MuJoCo has the pair in contact" if answer.is_gated else "wherever a probe reaches"
             extra = " with " + " and ".join(answer.needs) if answer.needs else ""
-            lines.append(f"    {users}: depth{extra}, {gate}")
+            what = f"depth{extra}, {gate}" if answer.objects else " and ".join(answer.needs)
+            lines.append(f"    {users}: {what}")
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
@@ -102,9 +103,12 @@ def _links(touch: TactileModule) -> list[str]:
 
 def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
     taxels = touch.plan.queries[sensor.query].num_taxels
-    channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(sensor.channels, sensor.units, strict=True))
     memory = f"remembers {', '.join(sensor.state)}" if sensor.state else "no state"
-    return [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}", f"  reads {channels}"]
+    lines = [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}"]
+    for reading in sensor.readings:
+        channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))
+        lines.append(f"  {reading.name}: {channels} of each {reading.rows}")
+    return lines
 
 
 def _grids(touch: TactileModule) -> list[str]:
@@ -129,7 +133,8 @@ def _grids(touch: TactileModule) -> list[str]:
 def _observations(touch: TactileModule) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
-        groups.setdefault(term.group, []).append(f"{term.type} of {term.reading} ({term.num_features})")
+        what = f"{term.type} of {term.reading} ({term.num_features})" if term.reading else term.type
+        groups.setdefault(term.group, []).append(what)
     if not groups:
         return []
     return ["observations"] + [f"  {group}: {', '.join(terms)}" for group, terms in groups.items()] + [""]
@@ -140,13 +145,15 @@ def _inputs(touch: TactileModule) -> list[str]:
     lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
     if inputs.pairs:
         lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
+    if inputs.slots:
+        lines.append(f"  slots   {inputs.slots} contacts of each pair")
     return [*lines, ""]
 
 
 def _costs(touch: TactileModule) -> list[str]:
     size = torch.finfo(touch.dtype).bits // 8
     outputs = sum(taxels * channels for taxels, channels in {output.name: output.shape for output in touch.outputs}.values())
-    memory = sum(touch.plan.queries[s.query].num_taxels * len(s.state) for s in touch.plan.sensors)
+    memory = sum(math.prod(m.shape) for s in touch.plan.sensors for m in s.state.values())
     state = touch.example_state(1)
     read = sum(getattr(state, n).numel() * 8 for n in touch.inputs.fields if n != "dt")
     constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())

@@ -52,6 +52,16 @@ class Layout:
     cell: Int[np.ndarray, "taxel 2"]
 
     @property
+    def bodies(self) -> tuple[str, ...]:
+        """The links' bodies, each once, in order."""
+        return tuple(dict.fromkeys(link.body for link in self.links))
+
+    @property
+    def body_id(self) -> Int[np.ndarray, " taxel"]:
+        """Index into `bodies` of each taxel; ascending."""
+        return np.array([self.bodies.index(link.body) for link in self.links], dtype=np.int64)[self.link_id]
+
+    @property
     def num_taxels(self) -> int:
         """Number of taxels on all links."""
         return len(self.link_id)

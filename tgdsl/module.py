@@ -13,58 +13,39 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from tgdsl import observations
+from tgdsl.buffers import Constants
 from tgdsl.errors import StateError, TgdslError, did_you_mean
+from tgdsl.example import example_state
 from tgdsl.geometry.bvh import TriangleMesh
+from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, measure, relate
-from tgdsl.plan import Inputs, Plan, PlannedObject, PlannedQuery, PlannedSensor
+from tgdsl.plan import Inputs, Plan, PlannedObject
 from tgdsl.sensors import KINDS, Kind
-from tgdsl.state import SHAPES, SceneState, shape_of
+from tgdsl.state import SceneState
+from tgdsl.taxels import image_indices, taxel_table
 
 
 @dataclass(frozen=True)
 class Output:
-    """One entry of a reading: its name, its shape after `env`, and the name and unit of each channel."""
+    """One reading: its name, its sensor's kind, its shape after `env`, what it has rows of, and name and unit of each channel.
+
+    Rows are the sensor's taxels (`rows` is "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    """
 
     name: str
     kind: str
     shape: tuple[int, int]
+    rows: str
+    bodies: tuple[str, ...]
     channels: tuple[str, ...]
     units: tuple[str, ...]
-
-
-class _Constants(nn.Module):
-    """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
-
-    def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
-        super().__init__()
-        self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
-        for name, exact in self._exact.items():
-            self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
-
-    def __getitem__(self, name: str) -> Tensor:
-        return self._buffers[name]  # type: ignore[return-value]
-
-    def under(self, prefix: str, names: Sequence[str]) -> dict[str, Tensor]:
-        return {name: self[f"{prefix}/{name}"] for name in names}
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> _Constants:
-        before = dict(self._buffers)
-        super()._apply(fn, recurse)
-        for name, exact in self._exact.items():
-            old, new = before[name], self._buffers[name]
-            assert old is not None and new is not None
-            is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
-            if is_untouched:
-                self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
-        return self
 
 
 class TactileModule(nn.Module):
@@ -101,7 +82,7 @@ class TactileModule(nn.Module):
             if shape == "raycast"
         }
         unused = ("layout/", *(f"objects/{part}/" for part in self._raycast))
-        self.constants = _Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
+        self.constants = Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
         self.memory = nn.Module()
         self._compiled_core: Callable[..., Any] | None = None
 
@@ -114,19 +95,23 @@ class TactileModule(nn.Module):
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading."""
         return tuple(
-            Output(reading, s.kind, (self.plan.queries[s.query].num_taxels, len(s.channels)), s.channels, s.units)
-            for s in self.plan.sensors
-            for reading in s.readings
+            Output(
+                reading.name,
+                sensor.kind,
+                (reading.num_rows, len(reading.channels)),
+                reading.rows,
+                self.plan.layout_of(sensor).bodies,
+                reading.channels,
+                reading.units,
+            )
+            for sensor in self.plan.sensors
+            for reading in sensor.readings
         )
 
     @property
-    def taxels(self) -> dict[str, np.ndarray]:
-        """The taxels of each sensor, in the order of its readings, as tables (NumPy structured arrays).
-
-        Columns: `link`, `body`, `pos` and `normal` and `tangent` (body frame), `radius` [m], `area` [m²], `row`, `column`
-        (−1 where there is no grid), `groups` (names joined by commas).
-        """
-        return {sensor.name: _table(self.plan, sensor) for sensor in self.plan.sensors}
+    def taxels(self) -> dict[str, Any]:
+        """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
+        return {sensor.name: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors}
 
     @property
     def dtype(self) -> torch.dtype:
@@ -148,7 +133,7 @@ class TactileModule(nn.Module):
         """Number of environments whose state is held; None before the first call, or if there is no state."""
         return next((buffer.shape[0] for buffer in self.memory.buffers()), None)
 
-    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env taxel channel"]]:
+    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env row channel"]]:
         """Read all sensors.
 
         Args:
@@ -174,14 +159,15 @@ class TactileModule(nn.Module):
 
         Args:
             tensors: The fields of `SceneState` that `inputs` names.
-            memory: State by `sensor:plane`, each (env, taxel).
+            memory: State by `sensor:name`, each (env, …).
 
         Returns:
             Readings by name, and the new state.
         """
         pairs = self._pairs(tensors)
-        objects = [self._object(target, tensors) for target in self.plan.objects]
-        answers = [self._query(i, query, pairs, objects) for i, query in enumerate(self.plan.queries)]
+        measured = sorted({o for query in self.plan.queries for o in query.objects})
+        objects = {o: self._object(self.plan.objects[o], tensors) for o in measured}
+        answers = [self._query(i, pairs, objects, tensors) for i in range(len(self.plan.queries))]
         readings: dict[str, Tensor] = {}
         updated: dict[str, Tensor] = {}
         for sensor in self.plan.sensors:
@@ -189,19 +175,49 @@ class TactileModule(nn.Module):
             own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
             constants = self.constants.under(f"sensors/{sensor.name}", sensor.constants)
             result, new = self._kinds[sensor.name].forward(felt, probes, constants, own)
-            reading = torch.stack([result[channel] for channel in sensor.channels], dim=1).transpose(1, 2)
-            readings |= dict.fromkeys(sensor.readings, reading)
+            stacked = {r.channels: torch.stack([result[name] for name in r.channels], dim=1) for r in sensor.readings}
+            readings |= {r.name: stacked[r.channels].transpose(1, 2) for r in sensor.readings}
             updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major."""
+        num_envs = next(iter(readings.values())).shape[0]
+        nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
         groups: dict[str, list[Tensor]] = {}
         for term in self.plan.observations:
-            constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-            features = observations.observe(term.type, readings[term.reading], term.channels, constants)
+            features = nothing
+            if term.reading is not None:
+                constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
+                features = observations.observe(term.type, readings[term.reading], term.channels, constants)
             groups.setdefault(term.group, []).append(features)
         return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+
+    def images(
+        self, name: str, readings: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:
+        """Return a reading of taxels as one image per link, and where its pixels are taxels, for convolutions.
+
+        Cells of a link's grid that missed its surface, and inactive probes, are 0 in the image and False in the mask. Links
+        without a grid are left out.
+
+        Args:
+            name: The reading.
+            readings: All readings.
+
+        Raises:
+            TgdslError: If there is no such reading, if it is not one of taxels, or none of its links has a grid.
+        """
+        owner = {r.name: sensor for sensor in self.plan.sensors for r in sensor.readings if r.rows == "taxel"}
+        if name not in owner:
+            raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
+        by_channel = readings[name].transpose(1, 2)
+        images, masks = {}, {}
+        for link, index in image_indices(self.plan.layout_of(owner[name])).items():
+            place = torch.from_numpy(index).to(by_channel.device)
+            masks[link] = place >= 0
+            images[link] = torch.where(masks[link], by_channel[:, :, place.clamp(min=0)], 0.0)
+        return images, masks
 
     def reset(self, env_ids: Tensor | Sequence[int] | None = None) -> None:
         """Bring the state of some environments (default: all) back to rest; the others are left untouched.
@@ -210,11 +226,11 @@ class TactileModule(nn.Module):
             env_ids: Indices, or a boolean mask over environments.
         """
         for sensor in self.plan.sensors:
-            for name, rest in sensor.state.items():
+            for name, memory in sensor.state.items():
                 buffer = self.memory._buffers.get(f"{sensor.name}:{name}")
                 if buffer is not None:
                     with torch.no_grad():
-                        buffer[slice(None) if env_ids is None else torch.as_tensor(env_ids, device=buffer.device)] = rest
+                        buffer[slice(None) if env_ids is None else torch.as_tensor(env_ids, device=buffer.device)] = memory.rest
 
     def compile(self, **options: Any) -> TactileModule:
         """Compile the core with `torch.compile` into fused kernels, in place; the first call then takes longer.
@@ -240,27 +256,9 @@ class TactileModule(nn.Module):
             num_envs: Number of environments.
             seed: Seed of the draw.
             dtype: Dtype of the tensors.
-            spread: Standard deviation of the bodies' positions [m].
+            spread: Standard deviation of the bodies' positions, and of contacts from their links [m].
         """
-        generator = torch.Generator().manual_seed(seed)
-        values: dict[str, Any] = {}
-        for name in (name for name in self.inputs.fields if name in SHAPES):
-            shape = (num_envs, *shape_of(name, self.inputs))
-            value = torch.randn(shape, generator=generator, dtype=dtype)
-            if name == "body_pos":
-                value = spread * value
-            elif name == "body_quat":
-                value = value / value.norm(dim=-1, keepdim=True)
-            elif name == "contact_found":
-                value = value > -1.0
-            elif name == "variant":
-                value = torch.arange(num_envs)[:, None] % torch.tensor(self.inputs.num_variants)
-            elif name == "object_size":
-                value = 0.015 + 0.01 * value.clamp(-1, 1)
-            values[name] = value.to(self.device)
-        if "dt" in self.inputs.fields:
-            values["dt"] = 0.01
-        return SceneState(**values)
+        return example_state(self.inputs, num_envs, seed, dtype, spread).to(self.device)
 
     def explain(self) -> str:
         """Return an account of what is computed, what was dropped and why, and what it costs."""
@@ -284,8 +282,11 @@ class TactileModule(nn.Module):
             gate,
         )
 
-    def _query(self, i: int, query: PlannedQuery, pairs: Pairs, objects: Sequence[FeltObject]) -> list[tuple[Felt, Probes]]:
+    def _query(
+        self, i: int, pairs: Pairs, objects: Mapping[int, FeltObject], tensors: dict[str, Tensor]
+    ) -> list[tuple[Felt, Probes]]:
         """Return the answers to a query, and its probes."""
+        query = self.plan.queries[i]
         x, y, z = self.constants[f"queries/{i}/pos"]
         probes = Probes((x, y, z), self.constants[f"queries/{i}/pair"])
         near = measure(pairs, probes, [objects[index] for index in query.objects])
@@ -293,8 +294,12 @@ class TactileModule(nn.Module):
         for a, answer in enumerate(query.answers):
             own = pairs if answer.is_gated else pairs._replace(gate=None)
             reach = self.constants[f"queries/{i}/{a}/reach"]
-            answers.append((feel(own, probes, [near[index] for index in answer.objects], reach, answer.needs), probes))
+            found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
+            answers.append((feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found), probes))
         return answers
+
+    def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:
+        return contacts(tensors, self.constants[f"queries/{i}/bodies"], self.constants[f"queries/{i}/{a}/contacts"], self.dtype)
 
     def _object(self, target: PlannedObject, tensors: dict[str, Tensor]) -> FeltObject:
         """Return an object as each environment has it."""
@@ -341,9 +346,8 @@ class TactileModule(nn.Module):
         if self.has_state and self.num_envs is None:
             with torch.inference_mode(False):
                 for sensor in self.plan.sensors:
-                    for name, rest in sensor.state.items():
-                        shape = (num_envs, self.plan.queries[sensor.query].num_taxels)
-                        buffer = torch.full(shape, rest, dtype=self.dtype, device=self.device)
+                    for name, memory in sensor.state.items():
+                        buffer = torch.full((num_envs, *memory.shape), memory.rest, dtype=self.dtype, device=self.device)
                         self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
         if self.has_state and self.num_envs != num_envs:
             raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
@@ -375,24 +379,3 @@ def _raycast_surface(plan: Plan, target: PlannedObject, i: int) -> RaycastSurfac
 
 def _has_cpp_compiler() -> bool:
     return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
-
-
-def _table(plan: Plan, sensor: PlannedSensor) -> np.ndarray:
-    layout = plan.layout_of(sensor)
-    groups = [",".join(g for g, members in layout.groups.items() if link.name in members) for link in layout.links]
-    columns: list[tuple[str, Any]] = [
-        ("link", np.array([link.name for link in layout.links])[layout.link_id]),
-        ("body", np.array([link.body for link in layout.links])[layout.link_id]),
-        ("pos", layout.pos),
-        ("normal", layout.normal),
-        ("tangent", layout.tangent),
-        ("radius", layout.radius),
-        ("area", layout.area),
-        ("row", layout.cell[:, 0]),
-        ("column", layout.cell[:, 1]),
-        ("groups", np.array(groups)[layout.link_id]),
-    ]
-    table = np.empty(layout.num_taxels, dtype=[(name, column.dtype, column.shape[1:]) for name, column in columns])
-    for name, column in columns:
-        table[name] = column
-    return table

@@ -1,12 +1,12 @@
 """Observations: what a policy reads, made of readings by light post-processing.
 
-Each type takes one sensor's reading (env, taxel, channel) and gives features (env, feature), flattened channel-major: all
-taxels (or links) of the first channel, then of the second. "Per link" means one value for each link that carries the sensor,
-in the order of the robot's bodies.
+Each type takes one reading (env, row, channel) and gives features (env, feature), flattened channel-major: all taxels (or
+links) of the first channel, then of the second. "Per link" means one value for each link that carries the sensor, in the order
+of the robot's bodies; `link_bool` and `link_force` have one for each body, for that is what the solver knows.
 
 Source of the types and their constants: Chung et al., *Tactile Genesis*, appendix, "Tactile Observation Types".
 
-Shapes: `env` environments, `taxel` taxels of the sensor, `link` links that carry it.
+Shapes: `env` environments, `taxel` taxels of the sensor, `link` links that carry it, `row` taxels or bodies.
 """
 
 from __future__ import annotations
@@ -23,9 +23,16 @@ from tgdsl.fields import Positive, SpecModel
 from tgdsl.layout import Layout
 
 
+class NoneObservation(SpecModel):
+    """No touch at all: nothing is added to the group; the policy that others are compared with."""
+
+    type: Literal["none"]
+    """Nothing."""
+
+
 class _Of(SpecModel):
     of: str
-    """The sensor that is observed."""
+    """The reading that is observed: a sensor's name, or `<sensor>/clean`."""
 
 
 class BoolObservation(_Of):
@@ -63,7 +70,7 @@ class AggForceObservation(_Of):
 
 
 class ForceObservation(_Of):
-    """Force per taxel [N], link frame, of a `kinematic_taxel` sensor."""
+    """Force per taxel [N], link frame, of a `kinematic_taxel`, `force_taxel` or `proximity` sensor."""
 
     type: Literal["force"]
     """Force per taxel [N]."""
@@ -76,20 +83,63 @@ class ForceTorqueObservation(_Of):
     """Force [N] and torque [N·m] per taxel."""
 
 
+class ElastomerObservation(_Of):
+    """Displacement of each marker [m], link frame, of an `elastomer` sensor."""
+
+    type: Literal["elastomer"]
+    """Displacement of each marker [m]."""
+
+
+class ProximityObservation(_Of):
+    """Force and torque signal per taxel [N, N·m], link frame, of a `proximity` sensor."""
+
+    type: Literal["proximity"]
+    """Force and torque signal per taxel."""
+
+
+class LinkBoolObservation(_Of):
+    """Contact bit per body, as the solver has it, of a `link_contact` sensor."""
+
+    type: Literal["link_bool"]
+    """Contact bit per body."""
+
+
+class LinkForceObservation(_Of):
+    """The solver's force on each body [N], in the body's frame, of a `link_contact` sensor."""
+
+    type: Literal["link_force"]
+    """The solver's force on each body [N]."""
+
+
 ObservationSpec = Annotated[
-    BoolObservation | AggBoolObservation | DepthObservation | AggForceObservation | ForceObservation | ForceTorqueObservation,
+    NoneObservation
+    | BoolObservation
+    | AggBoolObservation
+    | DepthObservation
+    | AggForceObservation
+    | ForceObservation
+    | ForceTorqueObservation
+    | ElastomerObservation
+    | ProximityObservation
+    | LinkBoolObservation
+    | LinkForceObservation,
     Field(discriminator="type"),
 ]
 
-WANTED_CHANNELS: dict[str, tuple[str, ...]] = {
-    "bool": ("contact",),
-    "agg_bool": ("contact",),
-    "depth": ("depth",),
-    "agg_force": ("depth",),
-    "force": ("force_x", "force_y", "force_z"),
-    "force_torque": ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z"),
+_FORCE, _TORQUE, _MARKER = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque", "displacement"))
+WANTED: dict[str, tuple[tuple[str, ...], str]] = {
+    "bool": (("contact",), "taxel"),
+    "agg_bool": (("contact",), "taxel"),
+    "depth": (("depth",), "taxel"),
+    "agg_force": (("depth",), "taxel"),
+    "force": (_FORCE, "taxel"),
+    "force_torque": (_FORCE + _TORQUE, "taxel"),
+    "elastomer": (_MARKER, "taxel"),
+    "proximity": (_FORCE + _TORQUE, "taxel"),
+    "link_bool": (("contact",), "body"),
+    "link_force": (_FORCE, "body"),
 }
-"""Channels of the sensor's reading that each observation type takes, in order."""
+"""Channels of a reading that each observation type takes, in order, and what the reading has rows of."""
 
 
 def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
@@ -105,18 +155,18 @@ def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
     return {}
 
 
-def num_features(type_: str, num_taxels: int, num_links: int) -> int:
+def num_features(type_: str, num_rows: int, num_links: int) -> int:
     """Return how many features an observation type gives."""
     if type_ == "agg_bool":
         return num_links
     if type_ == "agg_force":
         return 3 * num_links
-    return len(WANTED_CHANNELS[type_]) * num_taxels
+    return len(WANTED[type_][0]) * num_rows
 
 
 def observe(
     type_: str,
-    reading: Float[Tensor, "env taxel channel"],
+    reading: Float[Tensor, "env row channel"],
     channels: tuple[int, ...],
     constants: dict[str, Tensor],
 ) -> Float[Tensor, "env feature"]:

@@ -14,8 +14,10 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `objects/<name>/<geom>/<variant>/{vertices,faces}` | (v, 3), (f, 3) | triangles of a geom that is queried by raycast |
 | `objects/<name>/<geom>/max_distance` | () | how far that query looks |
 | `queries/<i>/{taxels,pos,pair}` | (taxel,), (3, taxel), (object, taxel) | probes, see `geometry.query.Probes` |
+| `queries/<i>/bodies` | (body,) | body indices of the links that carry its probes, if contacts are wanted |
 | `queries/<i>/<answer>/reach` | (object, taxel) | what an answer feels, see `geometry.query.feel` |
-| `sensors/<name>/<constant>` | () or (…, taxel) | what the kind's `lower` folded |
+| `queries/<i>/<answer>/contacts` | (body, object) | whose contacts: indices into `inputs.pairs`, or their number for none |
+| `sensors/<name>/<constant>` | | what the kind's `lower` folded |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
 """
 
@@ -26,7 +28,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -34,8 +36,12 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 2
+FORMAT = 3
 """Version of the Plan; a reader refuses any other."""
+
+
+SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
+"""Fields of the state that are read contact by contact."""
 
 
 @dataclass(frozen=True)
@@ -120,18 +126,35 @@ class PlannedQuery:
 
 
 @dataclass(frozen=True)
+class PlannedReading:
+    """One entry of a module's readings: its name, what it has rows of (taxels or bodies), name and unit of each channel."""
+
+    name: str
+    rows: Literal["taxel", "body"]
+    num_rows: int
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PlannedMemory:
+    """What a sensor carries from one call to the next: its value at rest, and its shape after the leading `env`."""
+
+    rest: float
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class PlannedSensor:
-    """One sensor: its kind, its query and which answer of it, the channels of its reading and the state it carries."""
+    """One sensor: its kind, its query and which answer of it, its readings and the state it carries."""
 
     name: str
     kind: str
     query: int
     answer: int
-    channels: tuple[str, ...]
-    units: tuple[str, ...]
     constants: tuple[str, ...]
-    state: Mapping[str, float]
-    readings: tuple[str, ...]
+    state: Mapping[str, PlannedMemory]
+    readings: tuple[PlannedReading, ...]
 
 
 @dataclass(frozen=True)
@@ -141,7 +164,7 @@ class PlannedObservation:
     group: str
     index: int
     type: str
-    reading: str
+    reading: str | None
     channels: tuple[int, ...]
     constants: tuple[str, ...]
     num_features: int

@@ -25,11 +25,11 @@ from torch import Tensor
 
 from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.geometry.reference import ReferenceBody, ReferenceGeom, Touch, touch
+from tgdsl.geometry.reference import ReferenceBody, ReferenceContacts, ReferenceGeom, Touch, touch
 from tgdsl.module import TactileModule
-from tgdsl.plan import Plan, PlannedObject
+from tgdsl.plan import SLOT_FIELDS, Plan, PlannedObject
 from tgdsl.schema.load import load
-from tgdsl.sensors.base import Kind, SensorSpec
+from tgdsl.sensors.base import Kind, ProbeSpec
 from tgdsl.state import SHAPES, SceneState
 
 FLOAT32_TOLERANCE = 1e-5
@@ -87,12 +87,14 @@ def conformance_document(scene: Path, sensor: Mapping[str, Any], palm: list[Any]
 class ReferenceModule:
     """A plan's first sensor, computed by the kind's float64 reference, environment by environment."""
 
-    def __init__(self, plan: Plan, kind: Kind, spec: SensorSpec):
+    def __init__(self, plan: Plan, kind: Kind, spec: ProbeSpec):
         self.plan = plan
         self.kind = kind
         self.spec = spec
         self.sensor = plan.sensors[0]
         self.layout = plan.layout_of(self.sensor)
+        reach = plan.arrays[f"queries/{self.sensor.query}/{self.sensor.answer}/reach"]
+        self.radius = reach.max(axis=0, initial=-np.inf)
         self.memory: dict[int, dict[str, np.ndarray]] = {}
 
     def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, np.ndarray]]]:
@@ -100,7 +102,7 @@ class ReferenceModule:
         assert state.body_pos is not None
         readings, memories = [], {}
         for env in range(state.body_pos.shape[0]):
-            rest = {name: np.full(self.layout.num_taxels, value) for name, value in self.sensor.state.items()}
+            rest = {name: np.full(memory.shape, memory.rest) for name, memory in self.sensor.state.items()}
             felt = self._touch(state, env, shift)
             reading, memories[env] = self.kind.reference(self.spec, self.layout, felt, self.memory.get(env, rest))
             readings.append(reading)
@@ -121,8 +123,26 @@ class ReferenceModule:
                 geoms = self._geoms(target, state, env)
                 objects.append((self._body(state, env, target.body, shift), geoms) if is_felt else None)
             body = self._body(state, env, link.body, np.zeros(3))
-            parts.append(touch(body, self.layout.pos[own], self.layout.radius[own], objects))
-        return Touch(*(np.concatenate([getattr(part, name) for part in parts]) for name in Touch.__dataclass_fields__))
+            parts.append(touch(body, self.layout.pos[own], self.radius[own], objects))
+        names = [name for name in Touch.__dataclass_fields__ if name != "contacts"]
+        contacts = self._contacts(state, env) if "contacts" in answer.needs else None
+        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return Touch(**joined, contacts=contacts)
+
+    def _contacts(self, state: SceneState, env: int) -> ReferenceContacts:
+        """Return the contacts of the sensor's bodies with the objects that it feels, pair by pair and slot by slot."""
+        inputs, own = self.plan.inputs, self.spec.feels
+        rows: list[tuple[int, list[np.ndarray]]] = []
+        net = np.zeros((len(self.layout.bodies), 3))
+        for b, name in enumerate(self.layout.bodies):
+            body = self._body(state, env, name, np.zeros(3))
+            for p in (p for p, pair in enumerate(inputs.pairs) if pair.link == name and pair.object in own):
+                net[b] += body.rotation.T @ _row(state.contact_netforce, env, p)
+                for slot in range(inputs.slots):
+                    pos, *vectors = (_row(getattr(state, field), env, p, slot) for field in SLOT_FIELDS)
+                    rows.append((b, [body.rotation.T @ vector for vector in (pos - body.pos, *vectors)]))
+        pos, force, torque, normal = np.array([row for _, row in rows]).reshape(len(rows), 4, 3).transpose(1, 0, 2)
+        return ReferenceContacts(np.array([b for b, _ in rows], dtype=np.int64), pos, force, torque, normal, net)
 
     def _body(self, state: SceneState, env: int, name: str, shift: np.ndarray) -> ReferenceBody:
         i = self.plan.inputs.bodies.index(name)
@@ -144,8 +164,13 @@ class ReferenceModule:
         return [ReferenceGeom(target.shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
+def _row(field: Tensor | None, *index: int) -> np.ndarray:
+    assert field is not None
+    return field[index].double().numpy()
+
+
 def full_scale_error(found: Tensor, expected: np.ndarray) -> np.ndarray:
-    """Return |found − expected| over the largest magnitude of each channel in the batch (env, taxel, channel)."""
+    """Return |found − expected| over the largest magnitude of each channel in the batch (env, row, channel)."""
     scale = np.abs(expected).max(axis=(0, 1), keepdims=True)
     error = np.abs(found.detach().double().numpy() - expected)
     return error / np.where(scale > 0, scale, 1.0)
@@ -164,17 +189,20 @@ def assert_agrees(found: Tensor, reference: ReferenceModule, state: SceneState, 
             break
     reference.memory = memory or {}
     env, taxel = np.unravel_index(int(worst.argmax()), worst.shape)
-    assert worst.max() <= tolerance, f"error {worst.max():.2e} of full scale in environment {env}, taxel {taxel}"
+    assert worst.max() <= tolerance, f"error {worst.max():.2e} of full scale in environment {env}, row {taxel}"
 
 
 def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
     """Return the whole scene, rotated about the origin and then shifted [m]; float64."""
     rotation = torch.from_numpy(turn.as_matrix())
     values = {name: getattr(state, name) for name in (*SHAPES, "dt")}
-    for name in ("body_pos", "body_linvel", "body_angvel"):
+    for name in ("body_pos", "body_linvel", "body_angvel", *SLOT_FIELDS, "contact_netforce"):
         if values[name] is not None:
             values[name] = values[name].double() @ rotation.T
     values["body_pos"] = values["body_pos"] + torch.from_numpy(offset)
+    if values["contact_pos"] is not None:
+        is_used = (values["contact_normal"] != 0).any(dim=-1, keepdim=True)
+        values["contact_pos"] = torch.where(is_used, values["contact_pos"] + torch.from_numpy(offset), 0.0)
     quats = Rotation.from_quat(values["body_quat"].reshape(-1, 4).numpy(), scalar_first=True)
     turned = torch.from_numpy((turn * quats).as_quat(scalar_first=True))
     values["body_quat"] = turned.reshape(values["body_quat"].shape)
@@ -299,6 +327,9 @@ class KindConformance:
         for state in self.states(first):
             expected = first(state)["s"]
             found = second(state)["s"]
+            if first.outputs[0].rows == "body":
+                torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+                continue
             torch.testing.assert_close(found[:, :18], expected[:, :18][:, order], rtol=1e-13, atol=1e-13)
             torch.testing.assert_close(found[:, 18:], expected[:, 18:], rtol=1e-13, atol=1e-13)
 
@@ -310,10 +341,12 @@ class KindConformance:
             state = module.example_state(4)
             inactive = torch.from_numpy(module.taxels["s"]["radius"] == 0)
             assert inactive.any()
-            assert (module(state)["s"][:, inactive] == rest).all()
-            if state.contact_found is not None:
-                state.contact_found = torch.zeros_like(state.contact_found)
-            else:
+            if module.outputs[0].rows == "taxel":
+                assert (module(state)["s"][:, inactive] == rest).all()
+            for name in ("contact_found", *SLOT_FIELDS, "contact_netforce"):
+                if (value := getattr(state, name)) is not None:
+                    setattr(state, name, torch.zeros_like(value))
+            if state.contact_found is None:
                 assert state.body_pos is not None and state.body_quat is not None
                 state.body_quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(state.body_quat)
                 state.body_pos = torch.zeros_like(state.body_pos)
@@ -332,10 +365,10 @@ class KindConformance:
         assert readings[1].isnan().any(dim=1).any()
 
     def test_gradients_equal_finite_differences(self, scene: Path) -> None:
-        """Derivatives with respect to poses are those of the readings; where readings jump they are finite."""
+        """Derivatives with respect to poses and contacts are those of the readings; where readings jump they are finite."""
         module, _ = self.build(self.document(scene), torch.float64)
         state = module.example_state(2)
-        names = [name for name in module.inputs.fields if name.startswith("body_")]
+        names = [name for name in module.inputs.fields if name.startswith(("body_", "contact_")) and name != "contact_found"]
         tensors = [getattr(state, name).clone().requires_grad_() for name in names]
 
         def readings(*values: Tensor) -> Tensor:

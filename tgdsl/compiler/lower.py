@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from tgdsl import observations
@@ -9,11 +11,12 @@ from tgdsl.compiler import passes
 from tgdsl.compiler.felt import settle
 from tgdsl.compiler.passes import Draft, DraftSensor
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.errors import BakeError, did_you_mean
-from tgdsl.plan import Origin, Plan, PlannedObservation, PlannedSensor, SceneFile
+from tgdsl.errors import BakeError, LowerError, did_you_mean
+from tgdsl.plan import Origin, Plan, PlannedMemory, PlannedObservation, PlannedReading, PlannedSensor, SceneFile
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
+from tgdsl.sensors.base import Channel
 
 
 def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...]) -> Draft:
@@ -23,9 +26,15 @@ def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...]) -> Draft:
     for name, spec in loaded.spec.sensors.items():
         kind = by_name[spec.kind]  # type: ignore[attr-defined]
         taxels = resolved.layout.taxels_of(resolved.links[name])
-        lowered = kind.lower(spec, resolved.layout.take(taxels))
+        try:
+            lowered = kind.lower(spec, resolved.layout.take(taxels), resolved.surface_of)
+        except LowerError as error:
+            path: Path = ("sensors", name, *([error.field] if error.field else []))
+            loaded.problems.append(loaded.problem(path, error.what, error.hint))
+            continue
         readings = (name, f"{name}/clean") if spec.readout == "both" else (name,)
         sensors.append(DraftSensor(name, kind.name, taxels, spec.feels, spec.is_gated, lowered, readings))
+    loaded.raise_problems()
     return Draft(resolved.layout, sensors, dict(resolved.objects), resolved.scene, list(resolved.unused))
 
 
@@ -33,7 +42,8 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     """Return the Plan of a document, its scene still empty.
 
     Raises:
-        SpecError: If an observation does not fit its sensor, or a sensor can never feel what it should.
+        SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
+            should.
     """
     work = draft(loaded, resolved, kinds)
     for sensor, target in passes.prune(work):
@@ -45,7 +55,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     queries, answer_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
-    sensors = tuple(_sensor(part, answer_of[part.name], arrays) for part in work.sensors)
+    sensors = tuple(_sensor(work, part, answer_of[part.name], arrays) for part in work.sensors)
     terms = _observations(loaded, resolved, work, sensors, arrays)
     loaded.raise_problems()
     return Plan(
@@ -68,62 +78,58 @@ def _settle(loaded: Loaded, work: Draft) -> None:
     for name, felt in work.objects.items():
         target = loaded.spec.objects[name]
         margin = passes.margin(work, name)
+        if margin is None:
+            continue
         try:
             work.settled[name] = tuple(tuple(settle(geom, target, margin, name) for geom in geoms) for geoms in felt.variants)
         except BakeError as error:
             loaded.problems.append(loaded.problem(("objects", name), str(error)))
 
 
-def _sensor(part: DraftSensor, place: tuple[int, int], arrays: dict[str, np.ndarray]) -> PlannedSensor:
-    for name, value in part.lowered.constants.items():
+def _sensor(work: Draft, part: DraftSensor, place: tuple[int, int], arrays: dict[str, np.ndarray]) -> PlannedSensor:
+    lowered, num_taxels = part.lowered, len(part.taxels)
+    for name, value in lowered.constants.items():
         arrays[f"sensors/{part.name}/{name}"] = value
-    return PlannedSensor(
-        name=part.name,
-        kind=part.kind,
-        query=place[0],
-        answer=place[1],
-        channels=tuple(channel.name for channel in part.lowered.channels),
-        units=tuple(channel.unit for channel in part.lowered.channels),
-        constants=tuple(sorted(part.lowered.constants)),
-        state=dict(part.lowered.state),
-        readings=part.readings,
-    )
+    rows = {"taxel": num_taxels, "body": len(work.layout.take(part.taxels).bodies)}
+
+    def reading(name: str, kind: Literal["taxel", "body"], channels: tuple[Channel, ...]) -> PlannedReading:
+        return PlannedReading(name, kind, rows[kind], tuple(c.name for c in channels), tuple(c.unit for c in channels))
+
+    own = [reading(name, lowered.rows, lowered.channels) for name in part.readings]
+    reports = [reading(f"{part.name}/{key}", "body", channels) for key, channels in lowered.reports.items()]
+    memory = {n: PlannedMemory(m.rest, (num_taxels,) if m.shape is None else m.shape) for n, m in lowered.state.items()}
+    return PlannedSensor(part.name, part.kind, *place, tuple(sorted(lowered.constants)), memory, (*own, *reports))
 
 
 def _observations(
     loaded: Loaded, resolved: Resolved, work: Draft, sensors: tuple[PlannedSensor, ...], arrays: dict[str, np.ndarray]
 ) -> tuple[PlannedObservation, ...]:
-    by_reading = {reading: sensor for sensor in sensors for reading in sensor.readings}
+    layouts = {part.name: resolved.layout.take(part.taxels) for part in work.sensors}
+    found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms = []
     for group, specs in loaded.spec.observations.items():
         for i, spec in enumerate(specs):
             path: Path = ("observations", group, i)
-            sensor = by_reading.get(spec.of)
-            if sensor is None:
-                hint = did_you_mean(spec.of, by_reading, "readings")
+            if isinstance(spec, observations.NoneObservation):
+                terms.append(PlannedObservation(group, i, spec.type, None, (), (), 0))
+                continue
+            if spec.of not in found:
+                hint = did_you_mean(spec.of, found, "readings")
                 loaded.problems.append(loaded.problem((*path, "of"), f'there is no reading "{spec.of}"', hint))
                 continue
-            wanted = observations.WANTED_CHANNELS[spec.type]
-            lacking = [channel for channel in wanted if channel not in sensor.channels]
-            if lacking:
-                what = f'"{spec.type}" needs {", ".join(lacking)}, which "{spec.of}" ({sensor.kind}) does not read'
-                loaded.problems.append(loaded.problem(path, what, f"it reads {', '.join(sensor.channels)}"))
+            reading, layout = found[spec.of]
+            wanted, rows = observations.WANTED[spec.type]
+            if reading.rows != rows or not set(wanted) <= set(reading.channels):
+                what = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
+                has = f"it reads {', '.join(reading.channels)} of each {reading.rows}"
+                loaded.problems.append(loaded.problem(path, what, has))
                 continue
-            layout = resolved.layout.take(next(part.taxels for part in work.sensors if part.name == sensor.name))
             constants = observations.lower(spec, layout)
             for name, value in constants.items():
                 arrays[f"observations/{group}/{i}/{name}"] = value
-            terms.append(
-                PlannedObservation(
-                    group=group,
-                    index=i,
-                    type=spec.type,
-                    reading=spec.of,
-                    channels=tuple(sensor.channels.index(channel) for channel in wanted),
-                    constants=tuple(sorted(constants)),
-                    num_features=observations.num_features(spec.type, layout.num_taxels, len(layout.links)),
-                )
-            )
+            channels = tuple(reading.channels.index(channel) for channel in wanted)
+            count = observations.num_features(spec.type, reading.num_rows, len(layout.links))
+            terms.append(PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count))
     return tuple(terms)
 
 

@@ -7,7 +7,7 @@ writes the index tables.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,13 +16,13 @@ from tgdsl.compiler.felt import FeltBody, FeltGeom, Settled
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import aligned
 from tgdsl.layout import Layout
-from tgdsl.plan import Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
+from tgdsl.plan import SLOT_FIELDS, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
 from tgdsl.sensors.base import Lowered
 
 
 @dataclass(frozen=True, eq=False)
 class DraftSensor:
-    """A lowered sensor: its taxels (rows of the layout), what it feels and how that is gated."""
+    """A lowered sensor: its taxels (rows of the layout), what it feels and how that is gated, its readings' names."""
 
     name: str
     kind: str
@@ -43,7 +43,8 @@ class Draft:
         objects: What is felt of each object that some sensor feels.
         scene: The model that says what can collide.
         dropped: What is not needed, and why; the passes add to it.
-        settled: How the distance to each geom of each variant is found; set once the sensors' ranges are known.
+        settled: How the distance to each geom of each variant is found, of the objects that some sensor measures; set once the
+            sensors' ranges are known.
         pairs: The (link body, object) pairs that are needed, sorted by object and link; set by `prune`.
         gated: Those of them whose contacts are needed.
     """
@@ -63,11 +64,21 @@ class Draft:
 
 
 @dataclass(eq=False)
+class DraftAnswer:
+    """What some sensors feel of a query: objects, gate, how far from each taxel [m], −∞ for inactive ones; what they need."""
+
+    objects: tuple[str, ...]
+    is_gated: bool
+    radius: np.ndarray
+    needs: set[str] = field(default_factory=set)
+
+
+@dataclass(eq=False)
 class DraftQuery:
-    """A query and what is needed to pack it: the answers' objects and gates, and what is needed of each."""
+    """A query, its answers, and what is planned of it."""
 
     taxels: np.ndarray
-    answers: dict[tuple[tuple[str, ...], bool], set[str]] = field(default_factory=dict)
+    answers: list[DraftAnswer] = field(default_factory=list)
     planned: PlannedQuery = field(init=False)
 
 
@@ -85,11 +96,11 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
         bodies = set(work.bodies_of(sensor.taxels))
         for target in sensor.feels:
             pairs = {Pair(body, target) for body in bodies}
-            if sensor.is_gated:
-                apart = {p for p in pairs if not work.scene.can_meet(p.link, work.objects[target].body)}
-                gated |= pairs - apart
-            else:
-                apart = {p for p in pairs if p.link == work.objects[target].body}
+            meeting = {p for p in pairs if work.scene.can_meet(p.link, work.objects[target].body)}
+            if sensor.is_gated or "contacts" in sensor.lowered.needs:
+                gated |= meeting
+            itself = {p for p in pairs if p.link == work.objects[target].body}
+            apart = pairs - meeting if sensor.is_gated else itself
             wanted |= pairs - apart
             never |= apart
             if apart == pairs:
@@ -108,19 +119,35 @@ def _order(pair: Pair) -> tuple[str, str]:
 def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
     """Return the distinct queries, and which of them, and which answer of it, each sensor uses."""
     queries: dict[bytes, DraftQuery] = {}
+    answers: dict[tuple[bytes, tuple[str, ...], bool, bytes], DraftAnswer] = {}
     answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
-        probes, view = sensor.taxels.tobytes(), (sensor.feels, sensor.is_gated)
+        probes, radius = sensor.taxels.tobytes(), _reach(work, sensor)
         query = queries.setdefault(probes, DraftQuery(sensor.taxels))
-        query.answers.setdefault(view, set()).update(sensor.lowered.needs)
-        answer_of[sensor.name] = list(queries).index(probes), list(query.answers).index(view)
+        key = probes, sensor.feels, sensor.is_gated, radius.tobytes()
+        if key not in answers:
+            answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius)
+            query.answers.append(answers[key])
+        answers[key].needs.update(sensor.lowered.needs)
+        answer_of[sensor.name] = list(queries).index(probes), query.answers.index(answers[key])
     return list(queries.values()), answer_of
 
 
-def margin(work: Draft, name: str) -> float:
-    """Return the largest distance from an object's surface that any sensor asks for [m]."""
-    reaches = [max(float(work.layout.radius[s.taxels].max()), s.lowered.range) for s in work.sensors if name in s.feels]
-    return max(reaches)
+def _reach(work: Draft, sensor: DraftSensor) -> np.ndarray:
+    """Return how far from each taxel a sensor feels objects [m]; −∞ for inactive probes."""
+    radius = work.layout.radius[sensor.taxels]
+    return np.where(radius > 0, radius if sensor.lowered.radius is None else sensor.lowered.radius, -np.inf)
+
+
+def margin(work: Draft, name: str) -> float | None:
+    """Return the largest distance from an object's surface that any sensor asks for [m]; None if no sensor measures it."""
+    users = [s for s in work.sensors if name in s.feels and _is_measuring(_reach(work, s), s.lowered.needs)]
+    return max((max(float(_reach(work, s).max()), s.lowered.range) for s in users), default=None)
+
+
+def _is_measuring(radius: np.ndarray, needs: Collection[str]) -> bool:
+    """Return whether a sensor wants distances: one that reads contacts alone lets no probe reach anywhere."""
+    return bool((radius > -np.inf).any()) or "distance" in needs
 
 
 def fold(work: Draft) -> dict[str, np.ndarray]:
@@ -129,6 +156,8 @@ def fold(work: Draft) -> dict[str, np.ndarray]:
     fields = ("link_id", "pos", "normal", "tangent", "radius", "area", "cell")
     arrays = {f"layout/{name}": getattr(layout, name) for name in fields}
     for name in work.objects:
+        if name not in work.settled:
+            continue  # nobody measures the distance to it
         _, rows = _geoms(work, name)
         for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):
             felt = [[absent if part is None else getattr(part[0].geom, key) for part in row] for row in rows]
@@ -184,11 +213,18 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
     arrays["pairs/gate"] = np.array([gate.get(pair, 0) for pair in work.pairs], dtype=np.int64)
     for i, query in enumerate(queries):
         _pack_query(work, query, names, i, arrays)
-    needs = {need for query in queries for own in query.answers.values() for need in own}
+        if any("contacts" in answer.needs for answer in query.answers):
+            own = work.layout.take(query.taxels).bodies  # one that touches nothing has no pose in the state, and no contacts
+            arrays[f"queries/{i}/bodies"] = np.array([bodies.index(body) if body in bodies else 0 for body in own])
+    answers = [answer for query in queries for answer in query.answers]
+    needs = {need for answer in answers for need in answer.needs}
+    slots = max(sensor.lowered.slots for sensor in work.sensors)
     varied = [target for target in objects if target.is_sized or target.num_variants > 1]
     fields = ["body_pos", "body_quat"]
     fields += ["body_linvel", "body_angvel"] if "motion" in needs else []
-    fields += ["contact_found"] if work.gated else []
+    fields += ["contact_found"] if any(answer.is_gated for answer in answers) else []
+    fields += SLOT_FIELDS if slots else []
+    fields += ["contact_netforce"] if "contacts" in needs else []
     fields += ["variant"] if any(target.num_variants > 1 for target in varied) else []
     fields += ["object_size"] if any(target.is_sized for target in varied) else []
     inputs = Inputs(
@@ -196,7 +232,7 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
         bodies=tuple(bodies),
         pairs=tuple(work.gated),
         bodies_of={pair.object: body_of[pair.object] for pair in work.gated},
-        slots=0,
+        slots=slots,
         objects=tuple(target.name for target in varied),
         num_variants=tuple(target.num_variants for target in varied),
     )
@@ -204,7 +240,8 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
 
 
 def _object(work: Draft, name: str) -> PlannedObject:
-    shapes, rows = _geoms(work, name)
+    num_variants = len(work.objects[name].variants)
+    shapes, rows = _geoms(work, name) if name in work.settled else ((), [[]] * num_variants)
     own = [i for i, pair in enumerate(work.pairs) if pair.object == name]
     return PlannedObject(
         name=name,
@@ -219,7 +256,8 @@ def _object(work: Draft, name: str) -> PlannedObject:
 
 
 def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays: dict[str, np.ndarray]) -> None:
-    felt = [name for name in dict.fromkeys(name for objects, _ in query.answers for name in objects) if name in names]
+    measuring = [answer for answer in query.answers if _is_measuring(answer.radius, answer.needs)]
+    felt = [name for name in dict.fromkeys(name for answer in measuring for name in answer.objects) if name in names]
     bodies = work.bodies_of(query.taxels)
     own = {name: [pair for pair in work.pairs if pair.object == name] for name in felt}
     pairs = {name: [Pair(body, name) for body in bodies] for name in felt}
@@ -227,13 +265,16 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
     arrays[f"queries/{i}/taxels"] = query.taxels
     arrays[f"queries/{i}/pos"] = work.layout.pos[query.taxels].T
     arrays[f"queries/{i}/pair"] = np.array(index, dtype=np.int64).reshape(len(felt), len(bodies))
-    radius = work.layout.radius[query.taxels]
     answers = []
-    for a, ((objects, is_gated), needs) in enumerate(query.answers.items()):
-        chosen = [name for name in objects if name in names]
-        allowed = set(work.gated if is_gated else work.pairs)
+    for a, answer in enumerate(query.answers):
+        reachable = [name for name in answer.objects if name in names]
+        chosen = reachable if answer in measuring else []
+        allowed = set(work.gated if answer.is_gated else work.pairs)
         can_meet = np.array([[pair in allowed for pair in pairs[name]] for name in chosen], dtype=bool)
-        is_felt = can_meet.reshape(len(chosen), len(bodies)) & (radius > 0)
-        arrays[f"queries/{i}/{a}/reach"] = np.where(is_felt, radius, -np.inf)
-        answers.append(PlannedAnswer(tuple(felt.index(name) for name in chosen), is_gated, tuple(sorted(needs))))
+        arrays[f"queries/{i}/{a}/reach"] = np.where(can_meet.reshape(len(chosen), len(bodies)), answer.radius, -np.inf)
+        if "contacts" in answer.needs:
+            places = [[Pair(body, name) for name in reachable] for body in dict.fromkeys(bodies)]
+            table = [[work.gated.index(p) if p in work.gated else len(work.gated) for p in row] for row in places]
+            arrays[f"queries/{i}/{a}/contacts"] = np.array(table, dtype=np.int64)
+        answers.append(PlannedAnswer(tuple(felt.index(name) for name in chosen), answer.is_gated, tuple(sorted(answer.needs))))
     query.planned = PlannedQuery(tuple(names.index(name) for name in felt), len(bodies), tuple(answers))

@@ -5,10 +5,17 @@ Shapes: `n` faces or points, `m` corners of polygons or points on them, `k` what
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from tgdsl.errors import SampleError, did_you_mean
+from tgdsl.fields import Selection
+from tgdsl.geometry.surface import Surface
+from tgdsl.regions import Facing, InBox, InSphere, OnGeoms, RegionPart
 
 LENGTH_TOLERANCE = 1e-7
 """Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
@@ -31,6 +38,25 @@ class Region:
     facings: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
     boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]
     spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
+
+    @staticmethod
+    def of(surface: Surface, parts: Sequence[RegionPart]) -> Region:
+        """Return what a user wrote, on a link's surface.
+
+        Raises:
+            SampleError: If the link has no such geom.
+        """
+        is_geom = None
+        for part in parts:
+            if isinstance(part, OnGeoms):
+                chosen = _chosen_geoms(surface, part.geoms)
+                is_geom = chosen if is_geom is None else is_geom & chosen
+        return Region(
+            is_geom=is_geom,
+            facings=tuple((unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
+            boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
+            spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
+        )
 
     @property
     def is_everything(self) -> bool:
@@ -145,3 +171,52 @@ def _disc(
     offset = np.einsum("nkpx,nkx->npk", points[:, None] - corners[:, :, None], inward)
     is_on = (offset >= 0).all(axis=-1) | (offset <= 0).all(axis=-1)
     return np.where(is_on[..., None], points, np.nan)
+
+
+def cut(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
+    """Return the part of a surface that is in a region: whole faces, and what boxes leave of others.
+
+    Raises:
+        SampleError: If the region holds nothing of the surface, or is a sphere: a box has straight edges to cut along.
+    """
+    region = Region.of(surface, parts)
+    if region.spheres:
+        raise SampleError("a sphere does not cut faces straight", "use facing, box or geoms")
+    kept = np.flatnonzero(region.has_faces(surface.face_normals, surface.face_geom))
+    polygons, owner = region.clipped(surface.corners[kept])
+    fans = [np.stack([polygons[:, 0], polygons[:, k], polygons[:, k + 1]], axis=1) for k in range(1, polygons.shape[1] - 1)]
+    corners = np.concatenate(fans)
+    geom = np.tile(surface.face_geom[kept][owner], len(fans))
+    size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    corners, geom = corners[size > 0], geom[size > 0]
+    if not len(corners):
+        raise SampleError("the region holds nothing of the link's surface", "widen it")
+    return Surface(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), geom, surface.geoms)
+
+
+def _chosen_geoms(surface: Surface, selection: Selection) -> Bool[np.ndarray, " geom"]:
+    """Return which geoms a selection takes, by any of their names."""
+
+    def matching(patterns: tuple[str, ...]) -> Bool[np.ndarray, " geom"]:
+        return np.array(
+            [any(fnmatchcase(name, pattern) for name in names for pattern in patterns) for names in surface.geoms],
+            dtype=bool,
+        )
+
+    included = matching(selection.include)
+    if not included.any():
+        wanted = ", ".join(f'"{pattern}"' for pattern in selection.include)
+        names = [name for names in surface.geoms for name in names]
+        hint = did_you_mean(selection.include[0], names, "named geoms on this link")
+        raise SampleError(f"no geom or mesh of this link matches {wanted}", hint)
+    chosen = included & ~matching(selection.exclude)
+    if not chosen.any():
+        raise SampleError("`exclude` leaves none of the geoms that `include` takes", "exclude less")
+    return chosen
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Return vectors over their lengths."""
+    # The largest component first: the square of a tiny or huge one is not representable.
+    scaled = vectors / np.abs(vectors).max(axis=-1, keepdims=True)
+    return scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tgdsl.compiler.felt import FeltBody
 from tgdsl.compiler.objects import felt_objects, own_objects
+from tgdsl.compiler.region import cut
 from tgdsl.compiler.robot import Geom, Model, load_model
 from tgdsl.compiler.sample import Samples, sample
 from tgdsl.compiler.variants import OwnObjects
-from tgdsl.errors import Problem, SampleError, did_you_mean, listed
+from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
+from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout, Link
+from tgdsl.regions import RegionPart
 from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
@@ -42,6 +46,7 @@ class Resolved:
         scene: The model that holds robot and objects.
         robot: The robot's own model.
         unused: What has taxels or can be felt but is not needed, and why.
+        patches: The links that carry taxels.
     """
 
     layout: Layout
@@ -51,6 +56,19 @@ class Resolved:
     scene: Model
     robot: Model
     unused: tuple[tuple[str, str], ...]
+    patches: Mapping[str, Patch]
+
+    def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, or of a region of it, in its body's frame.
+
+        Raises:
+            LowerError: If the region holds nothing of the link.
+        """
+        surface = self.robot.surface(self.patches[link].geoms)
+        try:
+            return cut(surface, region) if region else surface
+        except SampleError as error:
+            raise LowerError(f'link "{link}": {error.what}', hint=error.hint) from error
 
 
 def resolve(loaded: Loaded) -> Resolved:
@@ -85,7 +103,7 @@ def resolve(loaded: Loaded) -> Resolved:
     listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
     others = [body for body in scene.bodies if body not in robot.bodies[1:] and body not in listed_bodies]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused))
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {patch.link.name: patch for patch in patches})
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:

@@ -6,20 +6,18 @@ Shapes: `taxel` samples, `f` faces, `cell` cells of a grid. Everything is in the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from tgdsl.compiler import meshlab, spread
 from tgdsl.compiler.points import point_table
 from tgdsl.compiler.rays import View, first_hits, frame, reference_axes, seen_rectangle
-from tgdsl.compiler.region import Region
-from tgdsl.errors import SampleError, did_you_mean
-from tgdsl.fields import Selection
+from tgdsl.compiler.region import Region, unit
+from tgdsl.errors import SampleError
 from tgdsl.geometry.surface import Surface
-from tgdsl.schema.placement import Facing, Grid, InBox, InSphere, OnGeoms, Placement, Points, Poisson
+from tgdsl.schema.placement import Grid, Placement, Points, Poisson
 
 MIN_COSINE = 0.1
 """A grid cell on a steep face counts at most 1/0.1 times its projected area."""
@@ -75,7 +73,7 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
     frame is left-handed, as the mirror image of a grid is.
     """
     view = View.of(surface, _grid_axes(placement))
-    region = _region(surface, placement)
+    region = Region.of(surface, placement.region)
     rectangle = seen_rectangle(view, region)
     if rectangle is None:
         what = "the link's surface" if region.is_everything else "the region"
@@ -106,10 +104,10 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
 
 def _grid_axes(placement: Grid) -> Float[np.ndarray, "3 3"]:
     """Return the unit vectors along columns, rows and rays."""
-    direction = _unit(np.array(placement.direction))
+    direction = unit(np.array(placement.direction))
     if placement.columns_along is None:
         return frame(direction)
-    columns = _unit(np.array(placement.columns_along))
+    columns = unit(np.array(placement.columns_along))
     if np.linalg.norm(np.cross(direction, columns)) < 1e-6:
         what = f"`columns_along` {_shown(placement.columns_along)} is parallel to `direction`"
         raise SampleError(f"{what} {_shown(placement.direction)}", "choose an axis across it")
@@ -142,7 +140,7 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
         raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
-    region = _region(surface, placement)
+    region = Region.of(surface, placement.region)
     pool = spread.pool(shell, region, placement.seed, placement.count, placement.spacing)
     if pool is None:
         raise SampleError("no part of the link's outer surface is in the region", "widen `region`")
@@ -169,7 +167,7 @@ def _points(placement: Points, folder: Path) -> Samples:
     """Take points as they are: nothing is projected."""
     table = point_table(placement, folder)
     pos, radius, area = table[:, :3], table[:, 6], table[:, 7]
-    normal = _unit(table[:, 3:6])
+    normal = unit(table[:, 3:6])
     return Samples(
         pos=pos.copy(),
         normal=normal,
@@ -180,50 +178,8 @@ def _points(placement: Points, folder: Path) -> Samples:
     )
 
 
-def _region(surface: Surface, placement: Grid | Poisson) -> Region:
-    parts = placement.region if isinstance(placement.region, tuple) else (placement.region,)
-    is_geom = None
-    for part in parts:
-        if isinstance(part, OnGeoms):
-            chosen = _chosen_geoms(surface, part.geoms)
-            is_geom = chosen if is_geom is None else is_geom & chosen
-    return Region(
-        is_geom=is_geom,
-        facings=tuple((_unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
-        boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
-        spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
-    )
-
-
-def _chosen_geoms(surface: Surface, selection: Selection) -> Bool[np.ndarray, " geom"]:
-    """Return which geoms a selection takes, by any of their names."""
-
-    def matching(patterns: tuple[str, ...]) -> Bool[np.ndarray, " geom"]:
-        return np.array(
-            [any(fnmatchcase(name, pattern) for name in names for pattern in patterns) for names in surface.geoms],
-            dtype=bool,
-        )
-
-    included = matching(selection.include)
-    if not included.any():
-        wanted = ", ".join(f'"{pattern}"' for pattern in selection.include)
-        names = [name for names in surface.geoms for name in names]
-        hint = did_you_mean(selection.include[0], names, "named geoms on this link")
-        raise SampleError(f"no geom or mesh of this link matches {wanted}", hint)
-    chosen = included & ~matching(selection.exclude)
-    if not chosen.any():
-        raise SampleError("`exclude` leaves none of the geoms that `include` takes", "exclude less")
-    return chosen
-
-
 def _shown(vector: tuple[float, ...]) -> str:
     return "[" + ", ".join(f"{component:g}" for component in vector) + "]"
-
-
-def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    # The largest component first: the square of a tiny or huge one is not representable.
-    scaled = vectors / np.abs(vectors).max(axis=-1, keepdims=True)
-    return scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
 
 
 def _tangent(
@@ -234,4 +190,4 @@ def _tangent(
     if otherwise is not None:
         is_normal = np.linalg.norm(np.cross(normal, along), axis=1) < 1e-3
         along = np.where(is_normal[:, None], otherwise, along)
-    return _unit(along - (along * normal).sum(axis=1, keepdims=True) * normal)
+    return unit(along - (along * normal).sum(axis=1, keepdims=True) * normal)

@@ -13,11 +13,9 @@ import numpy as np
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError
-from tgdsl.plan import Asset, Inputs, SceneFile, contact_sensor_names
+from tgdsl.plan import SLOT_FIELDS, Asset, Inputs, SceneFile, contact_sensor_names
 from tgdsl.scene import compiled, portable
 
-SLOT_FIELDS = ("contact_pos", "contact_force", "contact_torque", "contact_normal")
-"""Fields of the state that are read contact by contact."""
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")

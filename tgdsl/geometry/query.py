@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
+from tgdsl.geometry.contacts import Contacts
 from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.geometry.shapes import SHAPES
@@ -129,6 +130,18 @@ class Distance(NamedTuple):
     gradient: Vec
 
 
+class Frame(NamedTuple):
+    """How an object sees the link: a place on the link, rotated and shifted, is in the object's frame; planes (env, taxel).
+
+    Attributes:
+        rotation: Rotates link vectors into the object's frame.
+        offset: The link's origin in the object's frame [m].
+    """
+
+    rotation: Rot
+    offset: Vec
+
+
 class Felt(NamedTuple):
     """The answer, at the geom that each probe is deepest in; planes of shape (env, taxel), in the link's frame.
 
@@ -138,6 +151,8 @@ class Felt(NamedTuple):
         velocity: Velocity of the object's material at the probe relative to the probe [m/s]; None if not wanted.
         angular: Angular velocity of the object relative to the link [rad/s]; None if not wanted.
         distances: Distance to each object, by its name; empty if not wanted.
+        frames: How each object sees the link, by its name; empty if not wanted.
+        contacts: The solver's contacts on the bodies that carry the probes; None if not wanted.
     """
 
     depth: Tensor
@@ -145,6 +160,8 @@ class Felt(NamedTuple):
     velocity: Vec | None
     angular: Vec | None
     distances: dict[str, Distance]
+    frames: dict[str, Frame]
+    contacts: Contacts | None
 
 
 def relate(
@@ -207,6 +224,7 @@ def feel(
     near: Sequence[Near],
     reach: Float[Tensor, "object taxel"],
     needs: Collection[str],
+    contacts: Contacts | None = None,
 ) -> Felt:
     """Return what the probes feel; the deepest object wins, the first among equals.
 
@@ -215,7 +233,8 @@ def feel(
         probes: The probes.
         near: The objects that are felt, the first of equals first.
         reach: Radius of each probe towards each of them [m]; −∞ where the probe is inactive or the pair cannot meet.
-        needs: Which optional parts of the answer are wanted: "normal", "motion", "distance".
+        needs: Which optional parts of the answer are wanted: "normal", "motion", "distance", "frame".
+        contacts: Handed through.
 
     Returns:
         Depth and what is wanted besides, at each probe.
@@ -225,6 +244,7 @@ def feel(
     depth, normal, linear, angular = zero, (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
     with_normal, with_motion = "normal" in needs, "motion" in needs and pairs.motion is not None
     distances: dict[str, Distance] = {}
+    frames: dict[str, Frame] = {}
     for target, radius in zip(near, reach, strict=True):
         if pairs.gate is not None:
             radius = radius + pairs.gate[:, target.pairs][:, target.pair]
@@ -238,9 +258,12 @@ def feel(
         if "distance" in needs:
             value = torch.where(radius > -torch.inf, target.distance, torch.inf)
             distances[target.name] = Distance(value, target.gradient)
+        if "frame" in needs:
+            rotation = planes.rot(part[:, target.pairs][:, target.pair] for part in pairs.rotation)
+            frames[target.name] = Frame(rotation, _gathered(pairs.offset, target.pairs, target.pair))
         depth = torch.maximum(depth, reached)
     velocity = planes.add(linear, planes.cross(angular, probes.pos)) if with_motion else None
-    return Felt(depth, normal if with_normal else None, velocity, angular if with_motion else None, distances)
+    return Felt(depth, normal if with_normal else None, velocity, angular if with_motion else None, distances, frames, contacts)
 
 
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:

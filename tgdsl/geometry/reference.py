@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -53,10 +53,32 @@ class ReferenceGeom:
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
-    """What one link's probes feel, in the link's frame: the fields of `query.Felt`, one row per taxel.
+class ReferenceContacts:
+    """The solver's contacts, each in the frame of its body: `contacts.Contacts` as a list.
 
-    `distance` [m] and its gradient `outward` are those of `Felt.distances`, one column per object.
+    Attributes:
+        body: Which body each is on.
+        pos: Contact points [m].
+        force: Force on the body [N].
+        torque: Torque on the body [N·m].
+        normal: Unit normal out of the object.
+        net: Whole force on each body [N].
+    """
+
+    body: Int[Array, " contact"]
+    pos: Float[Array, "contact 3"]
+    force: Float[Array, "contact 3"]
+    torque: Float[Array, "contact 3"]
+    normal: Float[Array, "contact 3"]
+    net: Float[Array, "body 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What a sensor's probes feel, in their links' frames: the fields of `query.Felt`, one row per taxel.
+
+    `distance` [m] and its gradient `outward` are those of `Felt.distances`, one column per object; `rotation` and `offset` [m]
+    those of `Felt.frames`.
     """
 
     depth: Float[Array, " taxel"]
@@ -65,6 +87,9 @@ class Touch:
     angular: Float[Array, "taxel 3"]
     distance: Float[Array, "taxel object"]
     outward: Float[Array, "taxel object 3"]
+    rotation: Float[Array, "taxel object 3 3"]
+    offset: Float[Array, "taxel object 3"]
+    contacts: ReferenceContacts | None = None
 
 
 def touch(
@@ -76,18 +101,21 @@ def touch(
     """Query the probes of one link against the objects that it may feel; None stands for one that it may not.
 
     The paper's equations word for word: q = p_L + R_L x, d = max(0, max_g (R − φ_g(q))), m = ∇φ at the deepest geom,
-    v = R_Lᵀ (v_C(q) − v_L(q)). A probe of zero radius is inactive.
+    v = R_Lᵀ (v_C(q) − v_L(q)). A probe whose radius is −∞ is inactive.
     """
     normal, velocity, angular = np.zeros((3, len(pos), 3))
     distance, outward = np.full((len(pos), len(objects)), np.inf), np.zeros((len(pos), len(objects), 3))
-    felt = Touch(np.zeros(len(pos)), normal, velocity, angular, distance, outward)
+    rotations, offsets = np.zeros((len(pos), len(objects), 3, 3)), np.zeros((len(pos), len(objects), 3))
+    felt = Touch(np.zeros(len(pos)), normal, velocity, angular, distance, outward, rotations, offsets)
     into_link = link.rotation.T
     for j, x in enumerate(pos):
         q = link.pos + link.rotation @ x
         for k, target in enumerate(objects):
-            if target is None or radius[j] <= 0:
+            if target is None or radius[j] == -np.inf:
                 continue
             body, geoms = target
+            felt.rotation[j, k] = body.rotation.T @ link.rotation
+            felt.offset[j, k] = body.rotation.T @ (link.pos - body.pos)
             for geom in geoms:
                 rotation = body.rotation @ geom.rotation
                 local = rotation.T @ (q - body.pos - body.rotation @ geom.pos)

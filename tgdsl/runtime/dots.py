@@ -117,4 +117,4 @@ def in_world(
 
 def sensor_of(touch: TactileModule, reading: str) -> str:
     """Return the name of the sensor that a reading is of."""
-    return next(sensor.name for sensor in touch.plan.sensors if reading in sensor.readings)
+    return next(sensor.name for sensor in touch.plan.sensors if any(reading == own.name for own in sensor.readings))

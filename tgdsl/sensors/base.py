@@ -3,12 +3,12 @@
 A kind is one file that holds, in this order: what it measures, its spec, `reference` (the definition, float64), `lower`
 (constants and state, no physics), `forward` (batched, in component planes), and last a `Kind` that ties them together.
 
-Shapes: `env` environments, `taxel` taxels of one sensor.
+Shapes: `env` environments, `taxel` taxels of one sensor, `body` bodies that carry them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,9 @@ from torch import Tensor
 from tgdsl.fields import TEXT_OR_OTHER, Selector, SpecModel, Text
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
+from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout
+from tgdsl.regions import RegionPart
 from tgdsl.sensors.noise import NoiseSpec
 
 
@@ -68,25 +70,43 @@ class Channel:
     unit: str
 
 
+@dataclass(frozen=True)
+class Memory:
+    """A tensor (env, *shape) that is carried from one call to the next: its value at rest, and its shape; None: (taxel,)."""
+
+    rest: float = 0.0
+    shape: tuple[int, ...] | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """A sensor, ready to be planned.
 
     Attributes:
-        channels: What a reading holds, in order.
-        constants: Arrays that `forward` gets as tensors: scalars, or shapes that end in (taxel,).
-        state: Rest value of each plane (env, taxel) that is carried from one call to the next.
+        channels: What the sensor's own reading holds, in order.
+        constants: Arrays that `forward` gets as tensors.
+        state: What is carried from one call to the next.
+        rows: What the reading has one row of: "taxel", or "body" for each body that carries taxels, in order.
+        reports: Further readings, with a row per body: `<sensor>/<name>` holds these channels.
+        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts".
         range: Distance from an object's surface up to which readings tell it apart [m], if more than the probe's radius.
-        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance".
+        radius: How far from each taxel objects are felt [m], (taxel,); default: the probes' radii. Inactive ones feel nothing.
+        slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
     """
 
     channels: tuple[Channel, ...]
     constants: Mapping[str, np.ndarray] = field(default_factory=dict)
-    state: Mapping[str, float] = field(default_factory=dict)
+    state: Mapping[str, Memory] = field(default_factory=dict)
+    rows: Literal["taxel", "body"] = "taxel"
+    reports: Mapping[str, tuple[Channel, ...]] = field(default_factory=dict)
     needs: frozenset[str] = frozenset()
     range: float = 0.0
+    radius: Float[np.ndarray, " taxel"] | None = None
+    slots: int = 0
 
 
+SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
+"""Returns the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
@@ -98,16 +118,16 @@ class Kind:
 
     Attributes:
         spec: Its pydantic model; `kind` is a `Literal` with the kind's name.
-        lower: `(spec, layout) → Lowered`; the layout holds the sensor's own taxels.
-        forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel), at least
-            those of `Lowered.channels`; pure, traceable; the new state has the keys of `Lowered.state`.
-        reference: `(spec, layout, touch, state) → (readings (taxel, channel), new state)` for one environment, in NumPy.
+        lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels. May raise `LowerError`.
+        forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel) or, of what has
+            a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old.
+        reference: `(spec, layout, touch, state) → (reading (row, channel), new state)` for one environment, in NumPy.
     """
 
     spec: type[ProbeSpec]
-    lower: Callable[[Any, Layout], Lowered]
+    lower: Callable[[Any, Layout, SurfaceOf], Lowered]
     forward: Callable[[Felt, Probes, Constants, State], tuple[Mapping[str, Tensor], State]]
-    reference: Callable[[Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "taxel channel"], dict[str, np.ndarray]]]
+    reference: Callable[[Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "row channel"], dict[str, np.ndarray]]]
 
     @property
     def name(self) -> str:

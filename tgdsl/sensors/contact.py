@@ -21,7 +21,18 @@ from tgdsl.fields import Radius
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, scalar
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    ContactProbeSpec,
+    Kind,
+    Lowered,
+    Memory,
+    ReferenceState,
+    State,
+    SurfaceOf,
+    scalar,
+)
 
 
 class ContactSpec(ContactProbeSpec):
@@ -59,7 +70,7 @@ def reference(
     return bit[:, None].astype(np.float64), {"bit": bit.astype(np.float64)}
 
 
-def lower(spec: ContactSpec, layout: Layout) -> Lowered:
+def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The bit is state only where the two thresholds differ."""
     constants = {"threshold": scalar(spec.threshold)}
     if spec.release == spec.threshold:
@@ -67,7 +78,7 @@ def lower(spec: ContactSpec, layout: Layout) -> Lowered:
     return Lowered(
         channels=(Channel("contact", "1"),),
         constants={**constants, "release_threshold": scalar(spec.release)},
-        state={"bit": 0.0},
+        state={"bit": Memory()},
     )
 
 

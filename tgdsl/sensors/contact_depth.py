@@ -23,7 +23,7 @@ from torch import Tensor
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
 
 
 class ContactDepthSpec(ContactProbeSpec):
@@ -40,7 +40,7 @@ def reference(
     return touch.depth[:, None], {}
 
 
-def lower(spec: ContactDepthSpec, layout: Layout) -> Lowered:
+def lower(spec: ContactDepthSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Depth needs neither normals nor constants."""
     return Lowered(channels=(Channel("depth", "m"),))
 

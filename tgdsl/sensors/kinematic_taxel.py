@@ -30,7 +30,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, scalar
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
 
 
 class KinematicTaxelSpec(ContactProbeSpec):
@@ -80,7 +80,7 @@ def _ordered(spec: KinematicTaxelSpec) -> tuple[str, ...]:
     return tuple(name for name in ("force", "torque") if name in spec.outputs)
 
 
-def lower(spec: KinematicTaxelSpec, layout: Layout) -> Lowered:
+def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Fold the sign of the model into the damping constants; leave out what no output needs."""
     constants = {
         "normal_stiffness": scalar(spec.normal_stiffness),

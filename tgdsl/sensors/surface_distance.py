@@ -27,7 +27,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, scalar
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
 
 
 class SurfaceDistanceSpec(ProbeSpec):
@@ -53,7 +53,7 @@ def reference(
     return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
 
 
-def lower(spec: SurfaceDistanceSpec, layout: Layout) -> Lowered:
+def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """One channel per object, and three more where the vector is wanted."""
     channels = [Channel(f"distance_{name}", "m") for name in spec.feels]
     if spec.nearest:

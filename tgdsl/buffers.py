@@ -1,0 +1,39 @@
+"""A Plan's arrays as the buffers of a module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+
+class Constants(nn.Module):
+    """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
+        """Make a buffer of each array, floats in `dtype`."""
+        super().__init__()
+        self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        for name, exact in self._exact.items():
+            self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Return the array of a path."""
+        return self._buffers[name]  # type: ignore[return-value]
+
+    def under(self, prefix: str, names: Sequence[str]) -> dict[str, Tensor]:
+        """Return some of the arrays below a path, by their own names."""
+        return {name: self[f"{prefix}/{name}"] for name in names}
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Constants:
+        before = dict(self._buffers)
+        super()._apply(fn, recurse)
+        for name, exact in self._exact.items():
+            old, new = before[name], self._buffers[name]
+            assert old is not None and new is not None
+            is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
+            if is_untouched:
+                self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
+        return self
