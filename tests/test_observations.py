@@ -3,6 +3,7 @@ import pytest
 import torch
 
 import tgdsl
+from tgdsl.errors import SpecError
 
 SCENE = """
 <mujoco><worldbody>
@@ -14,9 +15,17 @@ SCENE = """
 NORMALS = {"a": [[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1]], "b": [[0, 0, 1], [0.6, 0, 0.8]]}
 
 
-@pytest.fixture
-def touch(tmp_path):
-    (tmp_path / "scene.xml").write_text(SCENE)
+TERMS = {
+    "taxels": [{"type": "force", "of": "touch"}, {"type": "depth", "of": "depth"}],
+    "all": [{"type": "force_torque", "of": "touch"}],
+    "links": [{"type": "agg_force", "of": "depth"}, {"type": "agg_bool", "of": "contact"}],
+    "plain": [{"type": "agg_force", "of": "depth", "axes": "xyz", "scale": 2}, {"type": "bool", "of": "contact"}],
+    "any": [{"type": "agg_bool", "of": "contact", "more_than": 0}],
+}
+
+
+def observing(folder, terms):
+    (folder / "scene.xml").write_text(SCENE)
     layout = {
         link: {
             "method": "points",
@@ -25,27 +34,19 @@ def touch(tmp_path):
         }
         for link, rows in NORMALS.items()
     }
-    sensor = {"links": "*", "feels": ["item"]}
-    return tgdsl.compile(
-        {
-            "tgdsl": 1,
-            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": layout}}},
-            "objects": {"item": {"body": "item"}},
-            "sensors": {
-                "touch": {"kind": "kinematic_taxel", **sensor},
-                "depth": {"kind": "contact_depth", **sensor},
-                "contact": {"kind": "contact", **sensor},
-            },
-            "observations": {
-                "taxels": [{"type": "force", "of": "touch"}, {"type": "depth", "of": "depth"}],
-                "all": [{"type": "force_torque", "of": "touch"}],
-                "links": [{"type": "agg_force", "of": "depth"}, {"type": "agg_bool", "of": "contact"}],
-                "plain": [{"type": "agg_force", "of": "depth", "axes": "xyz", "scale": 2}, {"type": "bool", "of": "contact"}],
-                "any": [{"type": "agg_bool", "of": "contact", "more_than": 0}],
-            },
-        },
-        dtype=torch.float64,
-    )
+    kinds = {"touch": "kinematic_taxel", "depth": "contact_depth", "contact": "contact"}
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(folder / "scene.xml"), "layout": {"resolutions": {"r": layout}}},
+        "objects": {"item": {"body": "item"}},
+        "sensors": {name: {"kind": kind, "links": "*", "feels": ["item"]} for name, kind in kinds.items()},
+        "observations": terms,
+    }
+
+
+@pytest.fixture
+def touch(tmp_path):
+    return tgdsl.compile(observing(tmp_path, TERMS), dtype=torch.float64)
 
 
 @pytest.fixture
@@ -99,3 +100,19 @@ def test_the_plan_says_how_many_features_there_are(touch, readings):
     assert {group: part.shape[1] for group, part in found.items()} == planned
     real = touch.observe(touch(touch.example_state(2)))
     assert {group: tuple(part.shape) for group, part in real.items()} == {group: (2, n) for group, n in planned.items()}
+
+
+def test_none_adds_nothing(tmp_path, touch, readings):
+    document = observing(tmp_path, {"blind": [{"type": "none"}], "both": [{"type": "none"}, {"type": "depth", "of": "depth"}]})
+    groups = tgdsl.compile(document, dtype=torch.float64).observe(readings)
+    assert groups["blind"].shape == (3, 0)
+    torch.testing.assert_close(groups["both"], touch.observe(readings)["taxels"][:, 18:], rtol=0, atol=0)
+
+
+def test_a_reading_with_the_wrong_rows_is_a_mistake(tmp_path):
+    with pytest.raises(
+        SpecError, match='"link_bool" needs contact of each body, which "contact" does not read; it reads contact of each taxel'
+    ):
+        tgdsl.compile(observing(tmp_path, {"policy": [{"type": "link_bool", "of": "contact"}]}))
+    with pytest.raises(SpecError, match=r'"elastomer" needs displacement_x, .* of each taxel, which "touch" does not read'):
+        tgdsl.compile(observing(tmp_path, {"policy": [{"type": "elastomer", "of": "touch"}]}))
