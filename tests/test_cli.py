@@ -198,15 +198,17 @@ def test_run(base, tmp_path):
     assert lines[1].split() == ["link", "touch", "[N]", "bit", "[taxels]"]
     assert lines[3].split()[0] == "pad"
     assert lines[3].split()[2] == "6/6"
-    assert lines[4:] == [f"readings: {tmp_path}/out/readings.npz", f"picture:  {tmp_path}/out/picture.png"]
-    with np.load(tmp_path / "out" / "readings.npz") as archive:
+    out = tmp_path / "out"
+    assert lines[4:] == [f"readings: {out}/readings.npz", f"picture:  {out}/picture.png", f"overview: {out}/overview.png"]
+    with np.load(out / "readings.npz") as archive:
         np.testing.assert_allclose(archive["time"], 0.01 * np.arange(1, 31))
         np.testing.assert_allclose(archive["ctrl"][:, 0], [0] * 10 + list(np.linspace(0, -5, 10)) + [-5] * 10)
         assert archive["touch"].shape == (30, 1, 6, 3)
         assert archive["bit"].all()
         force = np.linalg.norm(archive["touch"][-1, 0].sum(axis=0))
     assert float(lines[3].split()[1]) == pytest.approx(force, abs=6e-4)
-    assert (tmp_path / "out" / "picture.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("picture.png", "overview.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
 def test_run_recorded_controls(base, tmp_path, here):

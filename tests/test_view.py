@@ -228,5 +228,5 @@ def test_environment_out_of_range(touch, sim, readings, tmp_path: Path, env: int
 
 
 def test_readings_of_another_module(touch, sim, tmp_path: Path) -> None:
-    with pytest.raises(TgdslError, match=r"^there is nothing to draw: the readings given hold none of this module's$"):
+    with pytest.raises(TgdslError, match=r"^there is nothing to draw: the readings given hold none of this module's taxels$"):
         picture(touch, sim, {}, tmp_path / "x.png")

@@ -101,7 +101,7 @@ class Run:
     substeps: int = 5
     """Physics steps per control step."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
-    """Folder for readings.npz and picture.png."""
+    """Folder for readings.npz, picture.png and, where there are several readings, overview.png."""
     compiled: bool = False
     """Fuse the module with torch.compile first."""
     set: Overrides = ()
@@ -112,6 +112,7 @@ class Run:
         from tqdm import tqdm
 
         from tgdsl.runtime.batch import simulate
+        from tgdsl.runtime.overview import overview
         from tgdsl.runtime.rollout import (
             Recorder,
             default_keyframes,
@@ -149,7 +150,10 @@ class Run:
         bar.close()
         recorder.write(self.out / "readings.npz", controls)
         print(f"readings: {self.out / 'readings.npz'}")
-        print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
+        if any(output.rows == "taxel" for output in touch.outputs):
+            print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
+        if len(touch.outputs) > 1 or all(output.rows == "body" for output in touch.outputs):
+            print(f"overview: {overview(touch, sim, readings, self.out / 'overview.png', title=self.document.stem)}")
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,13 @@ from tgdsl.taxels import image_indices, taxel_table
 
 @dataclass(frozen=True)
 class Output:
-    """One reading: its name, its sensor's kind, its shape after `env`, what it has rows of, and name and unit of each channel.
+    """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     Rows are the sensor's taxels (`rows` is "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
     """
 
     name: str
+    sensor: str
     kind: str
     shape: tuple[int, int]
     rows: str
@@ -97,6 +98,7 @@ class TactileModule(nn.Module):
         return tuple(
             Output(
                 reading.name,
+                sensor.name,
                 sensor.kind,
                 (reading.num_rows, len(reading.channels)),
                 reading.rows,

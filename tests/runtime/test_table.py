@@ -47,13 +47,13 @@ def readings() -> dict[str, torch.Tensor]:
     force = torch.tensor([[3.0, 0, 1], [0, 4, 2], [0, 0, 9], [-6, 0, 0], [0, 8, 0]])
     reading = torch.cat([force, torch.full((5, 3), 100.0)], dim=1)
     depth = torch.tensor([[1e-3], [2.5e-3], [0.0]])
-    bit, torque = torch.tensor([[1.0], [0.0]]), torch.tensor([[-0.5, 9, 9], [0.25, 9, 9]])
+    bit, torque = torch.tensor([[1.0], [0.0]]), torch.tensor([[-0.3, 0, 0.4], [0.1, 0, 0]])
     first = {"touch": reading, "depth": depth, "depth/clean": 2 * depth, "bit": bit, "twist": torque}
     return {name: torch.stack([0 * value, value]).requires_grad_() for name, value in first.items()}
 
 
 def test_numbers(touch):
-    # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque_x| 0.5
+    # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque| 0.5
     assert table(touch, readings(), env=1) == [
         "link  touch [N]  depth [m]  depth/clean [m]  bit [taxels]  twist [N·m]",
         "────  ─────────  ─────────  ───────────────  ────────────  ───────────",

@@ -45,17 +45,19 @@ class Taxels:
 
 @dataclass(frozen=True, eq=False)
 class Dots(Taxels):
-    """The taxels of one sensor in one environment, and what they read.
+    """The rows of one reading in one environment: taxels, or bodies, and what they read.
 
     Attributes:
         value: Magnitude of the reading, in `unit`.
         quantity: What is read, such as `|force|`.
         unit: Its unit, with the prefix that suits the values; empty for plain numbers.
+        vector: The reading itself in the world, in SI units, if it is a vector.
     """
 
     value: Float[Array, " taxel"]
     quantity: str
     unit: str
+    vector: Float[Array, "taxel 3"] | None = None
 
     @property
     def is_read(self) -> Bool[Array, " taxel"]:
@@ -78,7 +80,9 @@ class Dots(Taxels):
 
 
 def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: Tensor, env: int) -> Dots:
-    """Return where the taxels of a reading are in one environment, and the magnitude of what they read.
+    """Return where the taxels of a reading are in one environment, and what they read.
+
+    A reading of bodies has one dot for each, amid its taxels.
 
     Args:
         touch: The module.
@@ -87,11 +91,19 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         values: The reading of all environments.
         env: Which environment.
     """
-    table = touch.taxels[sensor_of(touch, output.name)]
+    table = touch.taxels[output.sensor]
     pose = Pose(sim.batch.xpos[env], sim.batch.xquat[env])
     pos, normal = in_world(sim.model, pose, table["body"], table["pos"], table["normal"])
+    size = np.sqrt(table["area"]) * (table["radius"] > 0)
+    bodies = np.array(table["body"])
+    if output.rows == "body":
+        member = np.array([bodies == body for body in output.bodies])
+        pos, normal, size = (np.array([part[own].mean(axis=0) for own in member]) for part in (pos, normal, 3 * size))
+        bodies = np.array(output.bodies)
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
-    value = np.linalg.norm(values[env].detach().cpu().double().numpy()[:, same], axis=1)
+    read = values[env].detach().cpu().double().numpy()[:, same]
+    value = np.linalg.norm(read, axis=1)
+    is_vector = len(same) == 3 and output.channels[0].endswith("_x")
     stem = output.channels[0].removesuffix("_x")
     unit = "" if output.units[0] == "1" else output.units[0]
     if unit and 0 < value.max() < 0.1:
@@ -99,8 +111,9 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
     return Dots(
         pos=pos,
         normal=normal,
-        size=np.sqrt(table["area"]) * (table["radius"] > 0),
+        size=size,
         value=value,
+        vector=in_world(sim.model, pose, bodies, np.zeros_like(pos), read)[1] if is_vector else None,
         quantity=f"|{stem}|" if len(same) > 1 else stem,
         unit=unit,
     )
@@ -113,8 +126,3 @@ def in_world(
     body = np.array([model.body(name).id for name in bodies], dtype=np.int64)
     rotation = Rotation.from_quat(pose.quat[body], scalar_first=True)
     return pose.pos[body] + rotation.apply(np.array(pos)), rotation.apply(np.array(normal))  # SciPy wants writable arrays
-
-
-def sensor_of(touch: TactileModule, reading: str) -> str:
-    """Return the name of the sensor that a reading is of."""
-    return next(sensor.name for sensor in touch.plan.sensors if any(reading == own.name for own in sensor.readings))

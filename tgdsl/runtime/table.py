@@ -16,8 +16,9 @@ from tgdsl.module import Output, TactileModule
 def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) -> list[str]:
     """Return the readings of one environment, link by link.
 
-    Each sensor has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
-    of taxels in contact; any other channel as its largest magnitude.
+    Each reading has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
+    of taxels in contact; any other vector, and any other channel, as the largest magnitude. Readings of bodies show the
+    link's body.
     """
     links = list(dict.fromkeys(link for sensor in touch.taxels.values() for link in sensor["link"]))
     header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in touch.outputs]
@@ -35,16 +36,18 @@ def _summary_unit(output: Output) -> str:
 
 
 def _cell(touch: TactileModule, output: Output, readings: Mapping[str, Tensor], link: str, env: int) -> str:
-    taxels = touch.taxels[output.name.removesuffix("/clean")]
+    taxels = touch.taxels[output.sensor]
     own = taxels["link"] == link
     if not own.any():
         return "–"
-    values = readings[output.name][env].detach().cpu().numpy()[own]
+    values = readings[output.name][env].detach().cpu().double().numpy()
+    values = values[[output.bodies.index(taxels["body"][own][0])]] if output.rows == "body" else values[own]
     if output.channels == ("contact",):
-        return f"{int(values.sum())}/{int(own.sum())}"
+        return f"{int(values.sum())}/{len(values)}"
     if output.channels[:3] == ("force_x", "force_y", "force_z"):
         return f"{np.linalg.norm(values[:, :3].sum(axis=0)):.3f}"
-    return f"{np.abs(values[:, 0]).max():.2e}"
+    is_vector = output.channels[0].endswith("_x")
+    return f"{np.linalg.norm(values[:, : 3 if is_vector else 1], axis=1).max():.2e}"
 
 
 class LiveTable:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
@@ -17,8 +18,20 @@ from torch import Tensor
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module import Output, TactileModule
 from tgdsl.runtime.batch import BatchSimulation
-from tgdsl.runtime.dots import Dots, Pose, dots_of, sensor_of
-from tgdsl.runtime.shot import camera_for, is_seen, rasterise, robot_bodies, screen_for, shaded, smaller, solid_of, unit
+from tgdsl.runtime.dots import Dots, Pose, dots_of
+from tgdsl.runtime.shot import (
+    Screen,
+    Shot,
+    camera_for,
+    is_seen,
+    rasterise,
+    robot_bodies,
+    screen_for,
+    shaded,
+    smaller,
+    solid_of,
+    unit,
+)
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
@@ -53,7 +66,7 @@ def picture(
         readings: What the module read, by name.
         path: PNG file to write; its folder is made if need be.
         env: Which environment.
-        reading: Which reading; default: a kinematic taxel's, if there is any, or else the first.
+        reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
         title: What to write above it all; default: the reading's name.
 
     Returns:
@@ -66,11 +79,12 @@ def picture(
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = dots_of(touch, sim, output, readings[output.name], env)
-    table = touch.taxels[sensor_of(touch, output.name)]
+    table = touch.taxels[output.sensor]
     norm = Normalize(0.0, float(dots.value.max()) or 1.0)
     figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    _draw_scene(figure.add_axes(VIEW), touch, sim, dots, table, env, norm)
+    width, height = (FINE * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
+    draw_dots(figure.add_axes(VIEW), scene_of(touch, sim, dots, env, width, height), dots, norm)
     _draw_maps(figure, dots, table, norm)
     resolution = touch.plan.origin.resolution
     figure.text(0.016, 0.955, title or output.name, size=19, weight="bold", color=INK, va="center")
@@ -84,9 +98,9 @@ def picture(
 
 
 def _chosen(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None) -> Output:
-    known = {output.name: output for output in touch.outputs if output.name in readings}
+    known = {output.name: output for output in touch.outputs if output.name in readings and output.rows == "taxel"}
     if not known:
-        raise ViewError("there is nothing to draw: the readings given hold none of this module's")
+        raise ViewError("there is nothing to draw: the readings given hold none of this module's taxels")
     if name is None:
         return next((output for output in known.values() if output.kind == "kinematic_taxel"), next(iter(known.values())))
     if name not in known:
@@ -97,19 +111,33 @@ def _chosen(touch: TactileModule, readings: Mapping[str, Tensor], name: str | No
 # The scene ------------------------------------------------------------------------------------------------------------
 
 
-def _draw_scene(
-    axes: Axes, touch: TactileModule, sim: BatchSimulation, dots: Dots, table: Array, env: int, norm: Normalize
-) -> None:
-    """Draw robot, felt objects and taxels; those behind a surface of the robot as rings if they read, else not at all."""
+class Backdrop(NamedTuple):
+    """The robot and the felt objects as pixels, row 0 at the bottom, and how they were drawn."""
+
+    image: Array
+    shot: Shot
+    screen: Screen
+
+
+def scene_of(touch: TactileModule, sim: BatchSimulation, dots: Dots, env: int, width: int, height: int) -> Backdrop:
+    """Draw robot and felt objects, seen from where some taxels are in view.
+
+    Args:
+        touch: The module.
+        sim: The scene.
+        dots: The taxels.
+        env: Which environment.
+        width: Columns, before `FINE` of them become one pixel.
+        height: Rows, likewise.
+    """
     model, pose = sim.model, Pose(sim.batch.xpos[env], sim.batch.xquat[env])
-    carriers = {model.body(name).id for name in table["body"]}
+    carriers = {model.body(link.body).id for link in touch.plan.links}
     framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects}
     hand, objects = (solid_of(sim.batch.get_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
     camera = camera_for(dots, pose.pos[min(framed)])
     box = _window(camera.project(hand.corners[frame] if frame.any() else dots.pos[:, None]), camera.project(objects.corners))
-    width, height = (FINE * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
     screen = screen_for(camera, box, width, height)
     shot = rasterise(screen.project(hand.corners), width, height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], _LIT, _OTHER)
@@ -117,18 +145,20 @@ def _draw_scene(
     veil = rasterise(screen.project(objects.corners), width, height)
     veil.face[veil.near < shot.near] = -1
     image = shaded(image, veil, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, screen.scale)
-    image = smaller(image, FINE)
-    axes.imshow(image, origin="lower", extent=(-0.5, width - 0.5, -0.5, height - 0.5), interpolation="nearest", aspect="auto")
+    return Backdrop(smaller(image, FINE), shot, screen)
+
+
+def draw_dots(axes: Axes, scene: Backdrop, dots: Dots, norm: Normalize) -> None:
+    """Draw taxels on their scene; those behind a surface of the robot as rings if they read, else not at all."""
+    screen = scene.screen
+    extent = (-0.5, screen.width - 0.5, -0.5, screen.height - 0.5)
+    axes.imshow(scene.image, origin="lower", extent=extent, interpolation="nearest", aspect="auto")
     axes.set_axis_off()
     axes.autoscale(False)
     at = screen.project(dots.pos)
-    _draw_dots(axes, at, is_seen(dots, at, shot, camera), dots, norm, screen.scale)
-    draw_ruler(axes, screen.scale, width, -44.0)
-
-
-def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, scale: float) -> None:
+    seen = is_seen(dots, at, scene.shot, screen.camera)
     size = np.minimum(dots.size, np.median(dots.size))
-    area = (np.clip(0.62 * scale / FINE * size, 3.5, 20.0) * 72 / DPI) ** 2
+    area = (np.clip(0.62 * screen.scale / FINE * size, 3.5, 20.0) * 72 / DPI) ** 2
     shown, hidden, rest = seen & dots.is_read, ~seen & dots.is_read, seen & ~dots.is_read & (dots.size > 0)
     axes.scatter(*at[rest, :2].T, s=0.3 * area[rest], c="#8d949e", linewidths=0, zorder=3)
     ring = _HEAT(norm(dots.value[hidden]))
@@ -136,6 +166,7 @@ def _draw_dots(axes: Axes, at: Array, seen: Array, dots: Dots, norm: Normalize, 
     order = np.argsort(dots.value[shown], kind="stable")
     place, value, size = at[shown, :2][order], dots.value[shown][order], area[shown][order]
     axes.scatter(*place.T, s=size, c=value, cmap=_HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
+    draw_ruler(axes, screen.scale, screen.width, -44.0)
 
 
 def draw_ruler(axes: Axes, scale: float, width: int, row: float) -> None:
