@@ -1,0 +1,256 @@
+"""Elastomer: error and time of the ways to apply its fixed operator, and what a planar convolution does to a curved fingertip.
+
+    python benchmarks/elastomer.py forms [--device cuda] [--num-envs 4096] [--out docs]
+    python benchmarks/elastomer.py curved
+
+`forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), in every form that such a pad
+can have: dense, fft, truncated svd, and dense with a clamped boundary. The error is that of the float32 form against the dense
+matrix in float64 (which the tests compare with the definition), over the largest displacement in the batch; of the clamped one,
+against its own float64. Times are medians of compiled calls, on a GPU of replayed CUDA graphs.
+
+`curved` compares the dense operator on the XHand1's and the Sharpa's fingertips with the operator of a regular grid in the mean
+plane of the same taxels, the one that a planar FFT computes: displacements in the links' frames, over the largest one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+from module import median_ms
+from torch import Tensor
+
+from tgdsl.geometry.surface import Surface
+from tgdsl.sensors.elastomer import blocks, operators
+from tgdsl.sensors.elastomer.kernels import Skin
+from tgdsl.sensors.elastomer.operators import Wish
+from tgdsl.sensors.elastomer.spec import ElastomerSpec
+
+PITCH = 1.5e-3
+"""Spacing of the markers of the square pads [m]."""
+EDGE = 1.5e-3
+"""How far the pad goes on beyond the outermost markers [m]."""
+FORMS: dict[str, dict[str, Any]] = {
+    "dense": {"operator": "dense"},
+    "fft": {"operator": "fft"},
+    "svd, 1e-3": {"operator": "svd", "tolerance": 1e-3},
+    "svd, 1e-2": {"operator": "svd", "tolerance": 1e-2},
+    "dense, clamped": {"operator": "dense", "thickness": 2e-3, "boundary": {}},
+    "svd, 1e-2, clamped": {"operator": "svd", "tolerance": 1e-2, "thickness": 2e-3, "boundary": {}},
+}
+
+
+def spec_of(**fields: Any) -> ElastomerSpec:
+    """Return a spec of the Gaussian kernel with the paper's numbers."""
+    return ElastomerSpec.model_validate({"kind": "elastomer", "links": "pad", "feels": ["ball"], **fields})
+
+
+def square(num: int) -> tuple[Skin, Surface]:
+    """Return a pad of num × num markers, and its surface: two triangles."""
+    line = (np.arange(num) - (num - 1) / 2) * PITCH
+    cell = np.stack(np.divmod(np.arange(num * num), num), axis=1)
+    pos = np.stack([line[cell[:, 1]], line[cell[:, 0]], np.zeros(num * num)], axis=1)
+    half = line[-1] + EDGE
+    corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
+    surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, dtype=np.int64), (("pad",),))
+    normal = np.broadcast_to([0.0, 0.0, 1.0], pos.shape).copy()
+    return Skin(pos, normal, np.full(len(pos), PITCH**2), cell, np.ones(len(pos), dtype=bool)), surface
+
+
+def presses(skin: Skin, num_envs: int, seed: int = 0) -> dict[str, Tensor]:
+    """Return what goes into each operator when spheres press into a pad and drag it: float64 planes (…, env, taxel)."""
+    rng = np.random.default_rng(seed)
+    extent = np.abs(skin.pos[:, :2]).max()
+    centre = rng.uniform(-extent, extent, (num_envs, 1, 2))
+    radius, depth = rng.uniform(4e-3, 12e-3, (num_envs, 1)), rng.uniform(1e-4, 1e-3, (num_envs, 1))
+    square = ((skin.pos[:, :2] - centre) ** 2).sum(axis=2)
+    h = np.maximum(0.0, depth - square / (2 * radius))
+    slip = rng.normal(scale=1e-4, size=(3, num_envs, 1)) * np.array([1.0, 1.0, 0.0])[:, None, None]
+    return {name: torch.from_numpy(value) for name, value in {"spread": h, "bulge": h**1.2, "drag": slip * h}.items()}
+
+
+def constants_of(skin: Skin, surface: Surface, fields: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the folded operators of one form."""
+    spec = spec_of(**fields)
+    pad = surface if spec.boundary is not None else None
+    found = {}
+    for name, response in blocks.responses(spec, skin, pad).items():
+        is_alike = not (name == "spread" and pad is not None)
+        folded = operators.fold(response, blocks.PLANES[name], skin, Wish(spec.operator, spec.tolerance), is_alike)
+        found |= {f"{name}/0/{key}": value for key, value in folded.items()}
+    return found
+
+
+def displacement(constants: dict[str, Tensor], inputs: dict[str, Tensor]) -> Tensor:
+    """Return the displacement planes (3, env, taxel) on a flat pad that looks along z, strengths 1."""
+    x, y, z = operators.apply(constants, "spread", [inputs["spread"]])
+    (bulge,) = operators.apply(constants, "bulge", [inputs["bulge"]])
+    (drag,) = operators.apply(constants, "drag", [inputs["drag"]])
+    return torch.stack([x + drag[0], y + drag[1], z + bulge])
+
+
+@dataclass(frozen=True)
+class Forms:
+    """Error and time of every form."""
+
+    device: str = "cpu"
+    """Where."""
+    num_envs: int = 1024
+    """Environments."""
+    sizes: tuple[int, ...] = (10, 20, 32)
+    """Markers along each side."""
+    repeats: int = 20
+    """Timed calls of each form."""
+    out: Path | None = None
+    """Folder for the plot."""
+
+    def run(self) -> None:
+        """Measure and print one row per pad and form."""
+        where = torch.cuda.get_device_name() if self.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+        print(f"torch {torch.__version__}, {where}, {self.num_envs} environments, float32, medians of {self.repeats}\n")
+        unit = "µs" if self.device == "cuda" else "time / dense"
+        print(f"| markers | form | numbers | error, of the largest displacement | {unit} |\n|{'---|' * 5}")
+        rows = [row for num in self.sizes for row in self._pad(num)]
+        if self.out is not None:
+            plot(rows, self.device, unit, self.out / f"elastomer-{self.device}.png")
+
+    def _pad(self, num: int) -> list[tuple[int, str, float, float]]:
+        skin, surface = square(num)
+        exact = {name: value.to(self.device) for name, value in presses(skin, self.num_envs).items()}
+        inputs = {name: value.float() for name, value in exact.items()}
+        calls, errors, bytes_of = {}, {}, {}
+        for form, fields in FORMS.items():
+            made = constants_of(skin, surface, fields)
+            dense = constants_of(skin, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields)
+            truth = displacement(on(dense, self.device, torch.float64), exact)
+            constants = on(made, self.device, torch.float32)
+            found = displacement(constants, inputs)
+            errors[form] = float((found.double() - truth).abs().max() / truth.abs().max())
+            bytes_of[form] = sum(value.size for value in made.values())
+            torch.compiler.reset()
+            compiled = torch.compile(displacement, fullgraph=True, dynamic=False) if form != "fft" else displacement
+            calls[form] = captured(lambda c=constants, f=compiled: f(c, inputs), self.device)
+        times = median_ms(calls, self.repeats, self.device)
+        rows = []
+        for form in FORMS:
+            cost = 1e3 * times[form] if self.device == "cuda" else times[form] / times["dense"]
+            print(f"| {num} × {num} | {form} | {bytes_of[form]} | {errors[form]:.1e} | {cost:.3g} |", flush=True)
+            rows.append((num, form, errors[form], cost))
+        return rows
+
+
+def on(constants: dict[str, np.ndarray], device: str, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return constants as tensors; floats in `dtype`."""
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(value)).to(device) for name, value in constants.items()}
+    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
+
+
+def captured(call: Callable[[], Any], device: str) -> Callable[[], Any]:
+    """Return a call that replays a CUDA graph of another; on a CPU the call itself."""
+    if device != "cuda":
+        return call
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream), torch.no_grad():
+        for _ in range(3):
+            call()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        call()
+    return graph.replay
+
+
+def plot(rows: list[tuple[int, str, float, float]], device: str, unit: str, path: Path) -> None:
+    """Draw error against time, one panel per pad."""
+    from matplotlib.figure import Figure
+
+    sizes = list(dict.fromkeys(row[0] for row in rows))
+    figure = Figure(figsize=(4.2 * len(sizes), 3.8), layout="constrained")
+    for axes, num in zip(figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0], sizes, strict=True):
+        for form, colour in zip(FORMS, ("#1b7f4d", "#3b6fb6", "#b5542c", "#e0a03a", "#7a4fa3", "#c2315b"), strict=True):
+            _, _, error, cost = next(row for row in rows if row[:2] == (num, form))
+            axes.scatter(cost, error, s=60, color=colour, label=form)
+        axes.set(title=f"{num} × {num} markers", xscale="log", yscale="log", xlabel=unit)
+        axes.grid(alpha=0.25)
+    figure.axes[0].set_ylabel("largest error / largest displacement")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    figure.savefig(path, dpi=110)
+
+
+@dataclass(frozen=True)
+class Curved:
+    """The planar convolution's error on fingertips."""
+
+    resolutions: tuple[str, ...] = ("med", "high")
+    """Resolutions of the hands' layouts."""
+
+    def run(self) -> None:
+        """Print one row per fingertip: how curved it is, and the largest and RMS error, of the dense operator and planar."""
+        from tgdsl.compiler.pipeline import layouts
+
+        print("| hand | fingertip | taxels | normals differ by | dense | planar, largest | planar, RMS |")
+        print("|---|---|---|---|---|---|---|")
+        for hand in ("xhand1", "sharpa"):
+            for resolution, layout in layouts({"tgdsl": 1, "robot": {"model": hand}}, resolutions=self.resolutions)[1].items():
+                links = [i for i, link in enumerate(layout.links) if link.name in layout.groups["tips"]]
+                for i in links[:2]:
+                    own = layout.link_id == i
+                    skin = Skin(layout.pos[own], layout.normal[own], layout.area[own], layout.cell[own], layout.radius[own] > 0)
+                    if (skin.cell < 0).any():
+                        continue
+                    angle = np.degrees(np.arccos(np.clip(skin.normal @ skin.normal.mean(axis=0), -1, 1)))
+                    exact, flat = responses_of(skin), responses_of(flattened(skin))
+                    h = bumps(skin)
+                    true, seen = (np.einsum("kji,ei->ekj", matrix, h) for matrix in (exact, flat))
+                    error, scale = np.linalg.norm(seen - true, axis=1), np.linalg.norm(true, axis=1).max()
+                    dense = np.linalg.norm(in_float32(skin, h) - true, axis=1).max() / scale
+                    name = f"{hand}, {resolution} | {layout.links[i].name} | {own.sum()} | {angle.max():.0f}°"
+                    planar = f"{100 * error.max() / scale:.0f} % | {100 * np.sqrt((error**2).mean()) / scale:.1f} %"
+                    print(f"| {name} | {dense:.0e} | {planar} |")
+
+
+def responses_of(skin: Skin) -> np.ndarray:
+    """Return the in-plane dilation per depth, (3, target, source)."""
+    return blocks.responses(spec_of(), skin, None)["spread"](np.arange(len(skin.pos)))[:, 0]
+
+
+def in_float32(skin: Skin, h: np.ndarray) -> np.ndarray:
+    """Return what a module's dense operator makes of depths (press, taxel), in float32."""
+    response = blocks.responses(spec_of(), skin, None)["spread"]
+    made = operators.fold(response, blocks.PLANES["spread"], skin, Wish("dense", None))
+    constants = on({f"spread/0/{key}": value for key, value in made.items()}, "cpu", torch.float32)
+    return torch.stack(operators.apply(constants, "spread", [torch.from_numpy(h).float()]), dim=1).double().numpy()
+
+
+def flattened(skin: Skin) -> Skin:
+    """Return the taxels as a regular grid in their mean plane, with one normal: what a planar FFT takes them for."""
+    normal = skin.normal.mean(axis=0)
+    normal /= np.linalg.norm(normal)
+    design = np.column_stack([skin.cell, np.ones(len(skin.cell))])
+    step = np.linalg.lstsq(design, skin.pos, rcond=None)[0]
+    down = step[0] - (step[0] @ normal) * normal
+    along = step[1] - (step[1] @ normal) * normal
+    along -= (along @ down) / (down @ down) * down
+    pos = design @ np.stack([down, along, skin.pos.mean(axis=0) - skin.cell.mean(axis=0) @ np.stack([down, along])])
+    return Skin(pos, np.broadcast_to(normal, pos.shape).copy(), skin.area, skin.cell, skin.is_active)
+
+
+def bumps(skin: Skin, num: int = 200) -> np.ndarray:
+    """Return depths (press, taxel) under balls of 5 mm that press 1 mm deep over random taxels [m]."""
+    chosen = np.random.default_rng(0).integers(len(skin.pos), size=num)
+    apart = np.linalg.norm(skin.pos[None] - skin.pos[chosen][:, None], axis=2)
+    return np.maximum(0.0, 1e-3 - apart**2 / (2 * 5e-3))
+
+
+Command = Annotated[Forms, tyro.conf.subcommand("forms")] | Annotated[Curved, tyro.conf.subcommand("curved")]
+
+if __name__ == "__main__":
+    start = time.perf_counter()
+    tyro.cli(Command).run()  # type: ignore[arg-type]
+    print(f"\n{time.perf_counter() - start:.0f} s")

@@ -1,0 +1,117 @@
+"""Anchors: where each taxel holds on to the object that it touches, and how far that place has been carried since.
+
+A taxel i takes an anchor e_i, the object's material point at the taxel, in the object's frame, when the deepest object is
+deeper than `enter`; it lets go when that object is farther than `exit` beyond the reach, or may no longer be felt. One object
+at a time holds an anchor: the deepest when it was taken, the first among equals. In the link's frame the displacement is
+
+    s_i = R_oᵀ (e_i − c_o) − x_i,        t_i = Π_ni(s_i)                                      [m]
+
+R_o, c_o how the object sees the link (`query.Frame`), x_i the taxel's place. With a friction cap, |t_i| ≤ `slip` h_i: beyond it
+the skin slides, t_i is scaled back, and the anchor is dragged along by as much.
+
+Shapes: planes (env, taxel); in `reference`, (taxel,) and (taxel, 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.geometry import planes, reference
+from tgdsl.geometry.planes import TINY, Vec
+from tgdsl.geometry.query import Felt
+from tgdsl.geometry.reference import Touch
+
+PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
+"""What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""
+
+
+class Law(NamedTuple):
+    """When anchors are taken, kept and dragged; numbers, or scalar tensors.
+
+    Attributes:
+        reach: Distance up to which objects are felt [m].
+        enter: Depth at which an anchor is taken [m].
+        exit: Distance beyond the reach at which it is let go [m].
+        slip: Largest displacement per depth [1]; None: it never slides.
+    """
+
+    reach: float | Tensor
+    enter: float | Tensor
+    exit: float | Tensor
+    slip: float | Tensor | None
+
+
+def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Tensor]) -> tuple[Vec, dict[str, Tensor]]:
+    """Return the tangential displacements t [m] and the new anchors."""
+    anchor, held_by = (state["anchor_x"], state["anchor_y"], state["anchor_z"]), state["object"]
+    zero = torch.zeros_like(felt.depth)
+    moved, holds = (zero, zero, zero), []
+    for k, (name, distance) in enumerate(felt.distances.items(), start=1):
+        frame = felt.frames[name]
+        holds.append((held_by == k) & ~(distance.value > law.reach + law.exit))
+        here = planes.rotate_back(frame.rotation, planes.sub(anchor, frame.offset))
+        moved = planes.where(holds[-1], planes.sub(here, pos), moved)
+    stretch = planes.sub(moved, planes.scale(planes.dot(moved, normal), normal))
+    kept, slides = (stretch, None) if law.slip is None else _capped(stretch, law.slip * felt.depth)
+    slid = planes.sub(kept, stretch)
+    is_free = ~torch.stack(holds).any(dim=0)
+    taken, holder, deepest = (zero, zero, zero), zero, zero + law.enter
+    for k, ((name, distance), is_held) in enumerate(zip(felt.distances.items(), holds, strict=True), start=1):
+        rotation, offset = felt.frames[name]
+        dragged = anchor
+        if slides is not None:
+            dragged = planes.where(slides, planes.add(anchor, planes.rotate(rotation, slid)), anchor)
+        depth = law.reach - distance.value
+        is_taken = is_free & (depth > torch.where(holder > 0, deepest + planes.TIE, deepest))
+        taken = planes.where(is_held, dragged, planes.where(is_taken, planes.add(planes.rotate(rotation, pos), offset), taken))
+        holder = torch.where(is_held | is_taken, float(k), holder)
+        deepest = torch.maximum(deepest, depth)
+    return kept, dict(zip(PLANES, (*taken, holder), strict=True))
+
+
+def _capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
+    """Return a vector scaled back to a length, and where it had to be; derivatives are finite everywhere."""
+    square = planes.dot(stretch, stretch)
+    slides = square > torch.clamp(limit * limit, min=TINY)
+    factor = torch.where(slides, limit / torch.sqrt(torch.where(slides, square, 1.0)), 1.0)
+    return planes.scale(factor, stretch), slides
+
+
+def advance_reference(
+    touch: Touch, pos: np.ndarray, normal: np.ndarray, law: Law, state: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return t (taxel, 3) [m] and the new anchors of one environment, taxel by taxel."""
+    found = np.zeros((len(pos), 3))
+    after = {name: np.zeros(len(pos)) for name in PLANES}
+    for i, (x, n) in enumerate(zip(pos, normal, strict=True)):
+        phi, rotation, offset = touch.distance[i], touch.rotation[i], touch.offset[i]
+        k = int(state["object"][i]) - 1
+        e = np.array([state[name][i] for name in PLANES[:3]])
+        if k >= 0 and not phi[k] > law.reach + law.exit:
+            s = rotation[k].T @ (e - offset[k]) - x
+            t = found[i] = s - (s @ n) * n
+            length = float(np.linalg.norm(t))
+            if law.slip is not None and length > law.slip * touch.depth[i] and length > 1e-15:
+                found[i] = t * (law.slip * touch.depth[i] / length)
+                e = e + rotation[k] @ (found[i] - t)
+        else:
+            k = _deepest(law.reach - phi, float(law.enter))
+            e = rotation[k] @ x + offset[k] if k >= 0 else np.zeros(3)
+        for name, value in zip(PLANES, (*e, k + 1), strict=True):
+            after[name][i] = value
+    return found, after
+
+
+def _deepest(depth: np.ndarray, enter: float) -> int:
+    """Return the deepest object, the first among equals; −1 if none is deeper than `enter`."""
+    chosen, most = -1, enter
+    for k, d in enumerate(depth):
+        if d > (most + reference.TIE if chosen >= 0 else most):
+            chosen = k
+        most = max(most, d)
+    return chosen

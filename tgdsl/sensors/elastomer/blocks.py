@@ -1,0 +1,119 @@
+"""A sensor's matrices, link by link: the kernels that its spec names, weighted, and with the edge of the pad clamped.
+
+Shapes: `taxel` taxels of one link, inactive ones among them: those neither press nor move.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.geometry.surface import Surface
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import SurfaceOf
+from tgdsl.sensors.elastomer.bonded_layer import Layer
+from tgdsl.sensors.elastomer.boundary import correction, element_size
+from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, Skin
+from tgdsl.sensors.elastomer.operators import Response, Wish, fold
+from tgdsl.sensors.elastomer.pad import unroll
+from tgdsl.sensors.elastomer.spec import ElastomerSpec
+
+PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3), "pressure": (3, 1)}
+"""Planes that each operator puts out and takes in."""
+
+
+def skin(layout: Layout, link: int) -> Skin:
+    """Return the taxels of one link; inactive ones, whose area may be nothing, get the others' mean."""
+    own = layout.link_id == link
+    is_active, area = layout.radius[own] > 0, layout.area[own]
+    mean = area[is_active].mean() if is_active.any() else 1.0
+    return Skin(layout.pos[own], layout.normal[own], np.where(is_active, area, mean), layout.cell[own], is_active)
+
+
+def gaussian(spec: ElastomerSpec, part: Skin) -> Gaussian:
+    """Return the paper's kernels for one link."""
+    smoothing = part.spacing if spec.thickness is None else spec.thickness
+    return Gaussian(spec.dilation_falloff, spec.shear_falloff, spec.compressibility, smoothing, spec.normalize == "peak")
+
+
+def elastic(spec: ElastomerSpec) -> Elastic:
+    """Return the elastic skin that a spec describes."""
+    assert spec.youngs_modulus is not None
+    thickness = np.inf if spec.kernel == "half_space" or spec.thickness is None else spec.thickness
+    modulus = spec.youngs_modulus / (2.0 * (1.0 + spec.poissons_ratio))
+    return Elastic(Layer(thickness, spec.marker_depth, modulus, spec.poissons_ratio))
+
+
+def weights(spec: ElastomerSpec, part: Skin) -> Float[np.ndarray, " taxel"]:
+    """Return a_i of the Gaussian kernel [1]; 0 for inactive taxels."""
+    area = np.ones(len(part.area)) if spec.model == "paper" else part.area / spec.reference_area
+    return np.where(part.is_active, area, 0.0)
+
+
+def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
+    """Return the constants of all operators of all links, `<operator>/<link>/<constant>`.
+
+    Raises:
+        LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
+    """
+    constants = {}
+    wish = Wish(spec.operator, spec.tolerance)
+    for i, link in enumerate(layout.links):
+        part = skin(layout, i)
+        pad = None if spec.boundary is None else surface_of(link.name, spec.boundary.pad)
+        for name, response in responses(spec, part, pad).items():
+            is_alike = not (name == "spread" and pad is not None)
+            folded = fold(response, PLANES[name], part, wish, is_alike)
+            constants |= {f"{name}/{i}/{key}": value for key, value in folded.items()}
+    return constants
+
+
+def responses(spec: ElastomerSpec, part: Skin, pad: Surface | None) -> dict[str, Response]:
+    """Return the operators of one link by name."""
+    is_active = part.is_active.astype(np.float64)[:, None]
+    if spec.kernel != "gaussian":
+        return _elastic_responses(spec, part, is_active)
+    kernel, weight = gaussian(spec, part), weights(spec, part)
+    clamped = None
+    if pad is not None:
+        clamped = kernel.spread(part.pos, part.normal, part.pos) + clamping(spec, part, pad)
+
+    def spread(source: np.ndarray) -> np.ndarray:
+        own = kernel.spread(part.pos, part.normal, part.pos[source]) if clamped is None else clamped[..., source]
+        return is_active * own * weight[source]
+
+    def bulge(source: np.ndarray) -> np.ndarray:
+        return is_active * kernel.bulge(part, source) * weight[source]
+
+    def drag(source: np.ndarray) -> np.ndarray:
+        return is_active * kernel.drag(part, source) * weight[source]
+
+    return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.has_shear else {})}
+
+
+def _elastic_responses(spec: ElastomerSpec, part: Skin, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:
+    material = elastic(spec)
+
+    def traction(source: np.ndarray) -> np.ndarray:
+        return is_active * material.displacement(part, source) * is_active[source, 0]
+
+    def pressure(source: np.ndarray) -> np.ndarray:
+        return -np.einsum("klji,il->kji", traction(source), part.normal[source])[:, None]
+
+    return {"traction": traction} if spec.has_shear else {"pressure": pressure}
+
+
+def clamping(spec: ElastomerSpec, part: Skin, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
+    """Return what clamping the pad's edge adds to `spread`: the edge is moved back by as much as it would move."""
+    assert spec.boundary is not None and spec.thickness is not None
+    added = np.zeros((3, 1, len(part.pos), len(part.pos)))
+    if not part.is_active.any():
+        return added
+    own, drag = np.flatnonzero(part.is_active), spec.boundary.drag
+    extent = float(np.ptp(pad.corners.reshape(-1, 3), axis=0).max())
+    sheet = unroll(pad, part.pos[own], part.normal[own], element_size(spec.thickness, drag, extent))
+    free = gaussian(spec, part).spread(sheet.edge_pos, sheet.edge_normal, part.pos)[:, 0]
+    back = -np.einsum("eak,kei->aei", sheet.edge_axes, free).reshape(-1, len(part.pos))
+    inside = (correction(sheet, spec.thickness, drag, spec.boundary.bulk) @ back).reshape(2, len(own), -1)
+    added[:, 0, own] = np.einsum("jak,aji->kji", sheet.taxel_axes, inside)
+    return added

@@ -1,0 +1,130 @@
+"""Displacement in an elastic layer that is bonded to a rigid base, under a load on a small patch of its free surface.
+
+By wavenumber k the equations of the layer 0 ≤ z ≤ t (z into it) separate. With u_x = V(z) sin kx, u_z = W(z) cos kx under
+the tractions τ sin kx and p cos kx on the free surface, Navier's equations have the four solutions (κ = 3 − 4ν)
+
+    V = (A + B z) e^(−kz),    W = (A + B z + κ B/k) e^(−kz),    and their mirror images in z → t − z, W → −W,
+
+in which ν = 1/2 is no exception, because λ div u = −4 G ν B e^(−kz) stays finite. Two conditions at the surface
+(σ_xz = −τ, σ_zz = −p) and two at the base (V = W = 0) give A and B: a 4 × 4 system per wavenumber. The horizontally polarised
+part is τ sinh(k(t − z)) / (G k cosh kt). Hankel integrals of order 0, 1 and 2 take both to the plane, the load spread over
+the same patch as in `half_space`, whose transform cuts the integrals off; they are tabulated once and interpolated.
+
+Source: the method is that of Burmister's layered elastic systems (1945); see also Johnson, *Contact Mechanics*, section 5.8.
+
+Shapes: `k` wavenumbers, `r` distances.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.special import j0, j1
+
+from tgdsl.sensors.elastomer.half_space import QUADRATIC, Profiles, patch_transform
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
+CUTOFF = 45.0
+"""Wavenumbers go up to CUTOFF/b, b of the patch: φ there is 1e-16."""
+STEPS_PER_PATCH = 32
+"""Distances in the table per b: cubic splines then err by some 1e-6 of the largest value."""
+BATCH = 4_000_000
+"""Bessel functions that are formed at once."""
+
+
+class Layer(NamedTuple):
+    """A layer: thickness t [m], depth z of the targets below its surface [m], shear modulus G [Pa], Poisson's ratio ν."""
+
+    thickness: float
+    depth: float
+    shear_modulus: float
+    poissons_ratio: float
+
+
+class Response(NamedTuple):
+    """Displacement per unit traction [m/Pa] at wavenumber k: u_x = V sin kx, u_z = W cos kx, and the transverse one."""
+
+    v_tangential: np.ndarray
+    w_tangential: np.ndarray
+    v_normal: np.ndarray
+    w_normal: np.ndarray
+    transverse: np.ndarray
+
+
+def response(k: np.ndarray, layer: Layer) -> Response:
+    """Return the layer's response at depth z to unit tractions at wavenumbers k > 0 [1/m]."""
+    t, z, nu = layer.thickness, layer.depth, layer.poissons_ratio
+    x, y = k * t, z / t
+    kappa, fall = 3.0 - 4.0 * nu, np.exp(-x)
+    one, none = np.ones_like(x), np.zeros_like(x)
+    # Lengths in units of t, stresses of G. Columns: A, B of the solution that falls from the surface, and of its mirror image.
+    system = np.stack(
+        [
+            np.stack([-2 * x, (1 - kappa) * one, 2 * x * fall, (2 * x - 1 + kappa) * fall], axis=-1),
+            np.stack([-2 * x, -4 * (1 - nu) * one, -2 * x * fall, -(2 * x + 4 - 4 * nu) * fall], axis=-1),
+            np.stack([fall, fall, one, none], axis=-1),
+            np.stack([fall, (1 + kappa / x) * fall, -one, -kappa / x], axis=-1),
+        ],
+        axis=-2,
+    )
+    loads = np.zeros((*x.shape, 4, 2))
+    loads[..., 0, 0] = loads[..., 1, 1] = -1.0
+    a, b, c, d = np.moveaxis(np.linalg.solve(system, loads), -2, 0)
+    down, up = np.exp(-x * y)[..., None], np.exp(-x * (1 - y))[..., None]
+    over = (kappa / x)[..., None]
+    v = (a + b * y) * down + (c + d * (1 - y)) * up
+    w = (a + b * (y + over)) * down - (c + d * (1 - y + over)) * up
+    unit = t / layer.shear_modulus
+    shear = np.exp(-x * y) * -np.expm1(-2 * x * (1 - y)) / (x * (1 + fall * fall))
+    return Response(unit * v[..., 0], unit * w[..., 0], unit * v[..., 1], unit * w[..., 1], unit * shear)
+
+
+def profiles(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
+    """Return the layer's profiles at distances r [m] from a patch of radius a [m], by Hankel quadrature."""
+    k, weight = _quadrature(float(np.max(r, initial=0.0)), layer, patch)
+    found = response(k, layer)
+    weight = weight * k * patch_transform(k, patch) / (4.0 * np.pi)
+    factors = np.stack(
+        [
+            2.0 * found.w_normal * weight,
+            (found.v_tangential + found.transverse) * weight,
+            2.0 * found.v_normal * weight,
+            -2.0 * found.w_tangential * weight,
+            (found.transverse - found.v_tangential) * weight,
+        ],
+        axis=1,
+    )
+    flat = np.reshape(r, -1)
+    parts = [_hankel(piece, k, factors) for piece in np.array_split(flat, max(1, -(-flat.size * k.size // BATCH)))]
+    normal, along, spread, lift, bend = np.concatenate(parts).T.reshape(5, *np.shape(r))
+    return Profiles(normal, spread, lift, along, bend)
+
+
+def tabulated(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
+    """Return `profiles` by cubic splines through a table up to the largest r."""
+    b = (1.0 + QUADRATIC) * patch
+    last = float(np.max(r, initial=0.0)) + b
+    knots = np.linspace(0.0, last, max(8, int(np.ceil(STEPS_PER_PATCH * last / b))) + 1)
+    table = np.stack(profiles(knots, layer, patch), axis=1)
+    return Profiles(*np.moveaxis(CubicSpline(knots, table)(r), -1, 0))
+
+
+def _quadrature(reach: float, layer: Layer, patch: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes k [1/m] and weights of Gauss' rule on panels that follow both J(kr) and the response."""
+    b = (1.0 + QUADRATIC) * patch
+    last = CUTOFF / b
+    panel = np.pi / max(reach, 2.0 * layer.thickness, 4.0 * b)
+    edges = np.linspace(0.0, last, int(np.ceil(last / panel)) + 1)
+    half = 0.5 * np.diff(edges)[:, None]
+    return (edges[:-1, None] + half * (1.0 + NODES)).reshape(-1), (half * WEIGHTS).reshape(-1)
+
+
+def _hankel(r: np.ndarray, k: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Return the integrals with J0 (two), J1 (two) and J2 (one) at each r."""
+    x = r[:, None] * k
+    zero, one = j0(x), j1(x)
+    is_small = x < 1e-3
+    two = np.where(is_small, x * x / 8.0, 2.0 * one / np.where(is_small, 1.0, x) - zero)
+    return np.concatenate([zero @ factors[:, :2], one @ factors[:, 2:4], two @ factors[:, 4:]], axis=1)

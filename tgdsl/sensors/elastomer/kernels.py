@@ -1,0 +1,132 @@
+"""The fixed matrices of an elastomer: what each source taxel of a link does to each target, per unit of its input.
+
+On a curved link, source i and target j meet in the target's tangent plane: their distance is that of the tangential offset
+r_ij = Π_nj(x_j − x_i), exact for every pair, and tangential loads are projected there. The Gaussian kernel is so by
+definition. For the elastic kernels it is an approximation, good as long as the normals of taxels that matter to each other
+differ by little: the surface is taken as flat between them, and its curvature and a link's far side are not seen.
+
+Shapes: `source`, `target` taxels; a matrix is (out, in, target, source), `out` and `in` planes of a vector or scalar.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tgdsl.sensors.elastomer import bonded_layer, half_space
+from tgdsl.sensors.elastomer.bonded_layer import Layer
+from tgdsl.sensors.elastomer.half_space import Profiles, patch_radius
+
+Matrix = Float[np.ndarray, "out in target source"]
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """The taxels of one link, body frame: positions [m], unit normals, areas [m²], grid cells, and which are active."""
+
+    pos: Float[np.ndarray, "taxel 3"]
+    normal: Float[np.ndarray, "taxel 3"]
+    area: Float[np.ndarray, " taxel"]
+    cell: Int[np.ndarray, "taxel 2"]
+    is_active: Bool[np.ndarray, " taxel"]
+
+    @property
+    def spacing(self) -> float:
+        """Root of the mean area of the active taxels [m]; 1 if there are none, for then nothing depends on it."""
+        return float(np.sqrt(self.area[self.is_active].mean())) if self.is_active.any() else 1.0
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """The paper's kernels, without their strengths.
+
+    Attributes:
+        dilation_falloff: λ_d [1/m²].
+        shear_falloff: λ_s [1/m²].
+        compressibility: c [1].
+        smoothing: ε [m].
+        is_normalized: Whether the in-plane part is divided by ḡ.
+    """
+
+    dilation_falloff: float
+    shear_falloff: float
+    compressibility: float
+    smoothing: float
+    is_normalized: bool
+
+    def spread(
+        self, pos: Float[np.ndarray, "target 3"], normal: Float[np.ndarray, "target 3"], source: Float[np.ndarray, "source 3"]
+    ) -> Matrix:
+        """Return r_ij (c g + (1 − c) ḡ/ρ̄ ρ) [m], (3, 1, target, source); over ḡ [1] if normalized."""
+        r = offset(pos, normal, source)
+        square = np.einsum("kji,kji->ji", r, r)
+        peak = np.exp(-0.5) / np.sqrt(2.0 * self.dilation_falloff)
+        local = np.exp(-self.dilation_falloff * square)
+        stretch = peak * 2.0 * self.smoothing / (square + self.smoothing**2)
+        size = self.compressibility * local + (1.0 - self.compressibility) * stretch
+        return (r * (size / peak if self.is_normalized else size))[:, None]
+
+    def bulge(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+        """Return g of the dilation, (1, 1, target, source)."""
+        return self._fall(self.dilation_falloff, skin, source)
+
+    def drag(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+        """Return g of the shear, (1, 1, target, source)."""
+        return self._fall(self.shear_falloff, skin, source)
+
+    def _fall(self, falloff: float, skin: Skin, source: np.ndarray) -> Matrix:
+        r = offset(skin.pos, skin.normal, skin.pos[source])
+        return np.exp(-falloff * np.einsum("kji,kji->ji", r, r))[None, None]
+
+
+@dataclass(frozen=True)
+class Elastic:
+    """A linear elastic skin.
+
+    Attributes:
+        layer: Its thickness [m], infinite for a half-space, the markers' depth [m], G [Pa] and ν.
+    """
+
+    layer: Layer
+
+    def profiles(self, r: np.ndarray, area: np.ndarray, mean_area: float, is_exact: bool = False) -> Profiles:
+        """Return displacement per force [m/N] at distances r [m], (…, source), from sources of some areas [m²].
+
+        A layer's loads are all spread over the link's mean area, a half-space's each over its own. `is_exact` evaluates a
+        layer's integrals at each r instead of interpolating.
+        """
+        layer = self.layer
+        if np.isinf(layer.thickness):
+            return half_space.half_space(r, layer.depth, patch_radius(area), layer.shear_modulus, layer.poissons_ratio)
+        find = bonded_layer.profiles if is_exact else bonded_layer.tabulated
+        return find(r, layer, float(patch_radius(mean_area)))
+
+    def displacement(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+        """Return displacement per traction [m/Pa], (3, 3, target, source), both vectors in the body's frame."""
+        n, m = skin.normal, skin.normal[source]
+        area = skin.area[source]
+        r = offset(skin.pos, n, skin.pos[source])
+        length = np.sqrt(np.einsum("kji,kji->ji", r, r))
+        e = r / np.where(length > 0, length, 1.0)
+        found = Profiles(*(part * area for part in self.profiles(length, area, float(skin.spacing**2))))
+        flat = np.eye(3)[:, :, None] - np.einsum("jk,jl->klj", n, n)
+        own = np.eye(3)[:, :, None] - np.einsum("ik,il->kli", m, m)
+        twist = found.along - found.bend
+        # A tangential traction stays as much as it lies in the target's plane; e lies in it already.
+        tangential = np.einsum("kpj,pli,ji->klji", flat, own, twist)
+        seen = np.einsum("pji,pli->lji", e, own)
+        tangential += np.einsum("kji,lji,ji->klji", e, seen, 2.0 * found.bend)
+        tangential -= np.einsum("jk,lji,ji->klji", n, seen, found.lift)
+        pressed = np.einsum("jk,ji->kji", n, found.normal) - e * found.spread
+        return tangential + np.einsum("kji,il->klji", pressed, m)
+
+
+def offset(
+    pos: Float[np.ndarray, "target 3"], normal: Float[np.ndarray, "target 3"], source: Float[np.ndarray, "source 3"]
+) -> Float[np.ndarray, "3 target source"]:
+    """Return r_ij = Π_nj(x_j − x_i) [m]."""
+    between = pos.T[:, :, None] - source.T[:, None, :]
+    along = np.einsum("kji,jk->ji", between, normal)
+    return between - normal.T[:, :, None] * along

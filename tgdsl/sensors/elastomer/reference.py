@@ -1,0 +1,89 @@
+"""The elastomer's definition in float64, target by target: the sums as they are printed, without any folded matrix.
+
+Shapes: `taxel` taxels of the sensor; `source` active taxels of one link.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import ReferenceState
+from tgdsl.sensors.elastomer import blocks
+from tgdsl.sensors.elastomer.anchors import Law, advance_reference
+from tgdsl.sensors.elastomer.kernels import Elastic
+from tgdsl.sensors.elastomer.spec import ElastomerSpec
+
+Array = np.ndarray
+
+
+def reference(
+    spec: ElastomerSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[Float[Array, "taxel 3"], dict[str, Array]]:
+    """Return the displacements [m] in the body's frame, without the boundary, and the anchors.
+
+    Raises:
+        NotImplementedError: If the edge is clamped: that is a matrix, and tested as one.
+    """
+    if spec.boundary is not None:
+        raise NotImplementedError("the reference has no clamped boundary")
+    shear, after = np.zeros((layout.num_taxels, 3)), {}
+    if spec.has_shear:
+        law = Law(spec.standoff, spec.enter, spec.exit, spec.slip)
+        shear, after = advance_reference(touch, layout.pos, layout.normal, law, state)
+    found = np.zeros((layout.num_taxels, 3))
+    for link in range(len(layout.links)):
+        own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
+        for j in own:
+            sources = _Sources(layout.pos[own], layout.normal[own], layout.area[own], touch.depth[own], shear[own])
+            move = _gaussian if spec.kernel == "gaussian" else _elastic
+            found[j] = move(spec, layout.pos[j], layout.normal[j], sources)
+    return found, after
+
+
+class _Sources:
+    """The sources of one link: positions [m], normals, areas [m²], depths [m], tangential displacements [m]."""
+
+    def __init__(self, pos: Array, normal: Array, area: Array, depth: Array, shear: Array):
+        self.pos, self.normal, self.area, self.depth, self.shear = pos, normal, area, depth, shear
+
+
+def _tangential(vectors: Array, n: Array) -> Array:
+    return vectors - np.outer(vectors @ n, n)
+
+
+def _gaussian(spec: ElastomerSpec, x: Array, n: Array, sources: _Sources) -> Array:
+    """Return u_j = Σ_i a_i (u^d_ij + u^s_ij) [m] of the paper's kernels."""
+    a = np.ones(len(sources.pos)) if spec.model == "paper" else sources.area / spec.reference_area
+    eps = np.sqrt(sources.area.mean()) if spec.thickness is None else spec.thickness
+    c, h = spec.compressibility, sources.depth
+    r = _tangential(x - sources.pos, n)
+    square = (r * r).sum(axis=1)
+    g, rho = np.exp(-spec.dilation_falloff * square), 1.0 / (square + eps**2)
+    g_peak, rho_peak = np.exp(-0.5) / np.sqrt(2.0 * spec.dilation_falloff), 1.0 / (2.0 * eps)
+    w = h * (c * g / g_peak + (1.0 - c) * rho / rho_peak) * (1.0 if spec.normalize == "peak" else g_peak)
+    dilation = spec.dilation_strength * (r.T @ (a * w) + n * np.sum(a * h**spec.depth_exponent * g))
+    fall = np.exp(-spec.shear_falloff * square)
+    return dilation + spec.shear_strength * (_tangential(sources.shear, n).T @ (a * h * fall))
+
+
+def _elastic(spec: ElastomerSpec, x: Array, n: Array, sources: _Sources) -> Array:
+    """Return u_j = Σ_i G(x_j − x_i) [τ_i, p_i] A_i [m], each profile of G evaluated at its own distance."""
+    assert spec.normal_stiffness is not None
+    material: Elastic = blocks.elastic(spec)
+    pressure = spec.normal_stiffness * sources.depth
+    stiffness = spec.normal_stiffness * spec.stiffness_ratio
+    tau = _tangential(np.where(sources.depth[:, None] > 0, stiffness * sources.shear, 0.0), n)
+    r = _tangential(x - sources.pos, n)
+    length = np.linalg.norm(r, axis=1)
+    e = r / np.where(length > 0, length, 1.0)[:, None]
+    g = material.profiles(length, sources.area, float(sources.area.mean()), is_exact=True)
+    total = np.zeros(3)
+    for i, area in enumerate(sources.area):
+        ahead = tau[i] @ e[i]
+        into = g.normal[i] * pressure[i] + g.lift[i] * ahead
+        along = g.spread[i] * pressure[i] * e[i] + g.along[i] * tau[i] + g.bend[i] * (2.0 * ahead * e[i] - tau[i])
+        total += area * (along - into * n)
+    return total

@@ -1,0 +1,153 @@
+"""What a user writes of an elastomer."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, model_validator
+
+from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Radius, SpecModel
+from tgdsl.regions import Region
+from tgdsl.sensors.base import ContactProbeSpec
+
+
+def _at_most_half(value: float) -> float:
+    if value > 0.5:
+        raise ValueError(f"{value:g} is out of range, expected at most 0.5")
+    return value
+
+
+def _at_most_one(value: float) -> float:
+    if value > 1.0:
+        raise ValueError(f"{value:g} is out of range, expected at most 1")
+    return value
+
+
+def _is_fraction(value: float) -> float:
+    if not 0.0 < value < 1.0:
+        raise ValueError(f"{value:g} is out of range, expected more than 0 and less than 1")
+    return value
+
+
+class BoundarySpec(SpecModel):
+    """An edge of the pad that cannot move in its plane."""
+
+    pad: Region = ()
+    """Part of each link's surface that is the pad: facing, box, sphere, geoms, or a list that means their intersection; empty:
+    all of it."""
+    drag: NonNegative = 3.0
+    """β, drag of the bonded back [1]."""
+    bulk: NonNegative = 0.0
+    """K, resistance to in-plane compression [1]."""
+
+
+class ElastomerSpec(ContactProbeSpec):
+    """Displacement of the markers in a soft skin."""
+
+    kind: Literal["elastomer"]
+    """Displacement of the markers in a soft skin [m]."""
+    kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
+    """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
+    model: Literal["tgdsl", "paper"] = "tgdsl"
+    """`paper` counts every taxel alike, whatever its area (gaussian)."""
+    normalize: Literal["none", "peak"] = "none"
+    """`peak` divides the in-plane dilation by the Gaussian's peak ḡ, as printed; s_d then has no unit (gaussian)."""
+    dilation_strength: Number = 100.0
+    """s_d, displacement per depth and distance [1/m] (gaussian)."""
+    shear_strength: Number = 100.0
+    """s_s, displacement per depth and shear [1/m] (gaussian); 0 turns shear off, for every kernel."""
+    dilation_falloff: Positive = 8000.0
+    """λ_d, falloff of the dilation [1/m²] (gaussian)."""
+    shear_falloff: Positive = 2000.0
+    """λ_s, falloff of the shear [1/m²] (gaussian)."""
+    depth_exponent: Positive = 1.2
+    """α, power of the depth in the bulge [1] (gaussian)."""
+    compressibility: Annotated[NonNegative, AfterValidator(_at_most_one)] = 1.0
+    """c, 1 for a local Gaussian spread, 0 for one that falls off as 1/r [1] (gaussian)."""
+    reference_area: Area = 6e-6
+    """Area of a taxel that counts once [m²] (gaussian)."""
+    thickness: PositiveLength | None = None
+    """Thickness of the elastomer [m] (gaussian: length ε, default the taxel spacing; bonded_layer)."""
+    poissons_ratio: Annotated[NonNegative, AfterValidator(_at_most_half)] = 0.5
+    """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
+    youngs_modulus: Positive | None = None
+    """E [Pa] (half_space, bonded_layer)."""
+    normal_stiffness: Positive | None = None
+    """K_n, pressure per depth [Pa/m] (half_space, bonded_layer)."""
+    marker_depth: Radius = 0.0
+    """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""
+    standoff: Radius = 0.0
+    """s, height of the undeformed skin above the taxels [m]."""
+    friction: NonNegative | None = None
+    """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
+    enter: Radius = 1e-5
+    """Depth at which a taxel takes hold of an object [m]."""
+    exit: Radius = 1e-4
+    """Distance at which it lets go [m]."""
+    boundary: BoundarySpec | None = None
+    """An edge that is clamped, for the in-plane dilation (gaussian); needs `thickness`."""
+    operator: Literal["auto", "dense", "fft", "svd"] = "auto"
+    """How the fixed operator is applied; `auto` takes the cheapest that is exact, or within `tolerance` if that is given."""
+    tolerance: Annotated[Positive, AfterValidator(_is_fraction)] | None = None
+    """Relative error that a truncated operator may have [1]; svd: 1e-3 if not given."""
+
+    @property
+    def has_shear(self) -> bool:
+        """Whether shear is computed."""
+        return self.shear_strength != 0.0
+
+    @property
+    def stiffness_ratio(self) -> float:
+        """Mindlin's tangential over normal stiffness of a contact, 2 (1 − ν)/(2 − ν)."""
+        return 2.0 * (1.0 - self.poissons_ratio) / (2.0 - self.poissons_ratio)
+
+    @property
+    def slip(self) -> float | None:
+        """Largest tangential displacement per depth, μ K_n/K_t [1]; None if the skin never slides."""
+        return None if self.friction is None else self.friction / self.stiffness_ratio
+
+    @model_validator(mode="after")
+    def _is_used(self) -> ElastomerSpec:
+        for name in sorted(self.model_fields_set & UNUSED[self.kernel]):
+            raise ValueError(f"`{name}` is not used by the kernel {self.kernel}, expected it to be left out")
+        if self.kernel != "gaussian" and self.has_shear and "shear_strength" in self.model_fields_set:
+            raise ValueError(f"`shear_strength` can only be 0, no shear, with the kernel {self.kernel}: K_t follows from K_n")
+        if not self.has_shear:
+            for name in sorted(self.model_fields_set & {"friction", "shear_falloff", "enter", "exit"}):
+                raise ValueError(f"`{name}` is not used without shear (`shear_strength: 0`), expected it to be left out")
+        for name in NEEDED[self.kernel]:
+            if getattr(self, name) is None:
+                raise ValueError(f"`{name}` is missing, the kernel {self.kernel} needs it")
+        return self
+
+    @model_validator(mode="after")
+    def _fits(self) -> ElastomerSpec:
+        if self.model == "paper" and "reference_area" in self.model_fields_set:
+            raise ValueError("`reference_area` is not used by `model: paper`, expected it to be left out")
+        if self.kernel == "bonded_layer" and self.thickness is not None and self.marker_depth > self.thickness:
+            raise ValueError(
+                f"`marker_depth` {self.marker_depth:g} m is below the layer, its `thickness` is {self.thickness:g} m"
+            )
+        if self.boundary is not None and self.thickness is None:
+            raise ValueError("`thickness` is missing, a clamped `boundary` needs it")
+        if self.boundary is not None and self.operator == "fft":
+            raise ValueError("`operator: fft` cannot hold a clamped `boundary`, expected dense, svd or auto")
+        if self.tolerance is not None and self.operator in ("dense", "fft"):
+            raise ValueError(f"`tolerance` is not used by `operator: {self.operator}`, expected it to be left out")
+        return self
+
+
+_GAUSSIAN = {"model", "normalize", "dilation_strength", "shear_falloff", "dilation_falloff", "depth_exponent", "reference_area"}
+_GAUSSIAN |= {"compressibility", "boundary"}
+UNUSED: dict[str, set[str]] = {
+    "gaussian": {"youngs_modulus", "normal_stiffness", "marker_depth"},
+    "half_space": _GAUSSIAN | {"thickness"},
+    "bonded_layer": _GAUSSIAN,
+}
+"""Fields that each kernel does not use."""
+NEEDED: dict[str, tuple[str, ...]] = {
+    "gaussian": (),
+    "half_space": ("youngs_modulus", "normal_stiffness"),
+    "bonded_layer": ("youngs_modulus", "normal_stiffness", "thickness"),
+}
+"""Fields without a default that each kernel needs."""
