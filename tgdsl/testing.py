@@ -226,6 +226,7 @@ class KindConformance:
     num_envs: ClassVar[int] = 12
     num_steps: ClassVar[int] = 3
     float32_tolerance: ClassVar[float] = FLOAT32_TOLERANCE
+    float64_tolerance: ClassVar[float] = FLOAT64_TOLERANCE
     is_differentiable: ClassVar[bool] = True
     """Whether readings follow poses smoothly, away from ties."""
     rest: ClassVar[float | tuple[float, ...]] = 0.0
@@ -285,7 +286,7 @@ class KindConformance:
         for gate in self._gates():
             module, reference = self.build(self.document(scene, **gate), torch.float64)
             for state in self.states(module):
-                assert_agrees(module(state)["s"], reference, state, FLOAT64_TOLERANCE)
+                assert_agrees(module(state)["s"], reference, state, self.float64_tolerance)
 
     def test_float32_equals_reference(self, scene: Path) -> None:
         """A float32 module that is given float64 poses loses no more than float32 must, under each gate."""

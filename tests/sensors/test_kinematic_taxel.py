@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+import tgdsl
 from sensors.scenes import module, state
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
@@ -14,6 +15,16 @@ class TestKinematicTaxel(KindConformance):
 class TestKinematicTaxelAsInThePaper(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"model": "paper", "outputs": ["force"]}
+
+
+class TestKinematicTaxelWithAllOptions(KindConformance):
+    kind = KINEMATIC_TAXEL
+    parameters = {"friction_cone": 0.5, "torque_about": "taxel", "balance": "solver", "slots": 2}
+
+
+class TestKinematicTaxelInTheCone(KindConformance):
+    kind = KINEMATIC_TAXEL
+    parameters = {"friction_cone": 0.2}
 
 
 BOX = '<geom type="box" size=".02 .02 .02"/>'
@@ -103,3 +114,142 @@ def test_what_is_not_needed_is_not_wanted(tmp_path):
     assert touch.inputs.fields == ("body_pos", "body_quat")
     force = module(tmp_path, [(0, 0, 0)], BOX, kind="kinematic_taxel", outputs=["force"])
     assert "spin_damping" not in force.plan.sensors[0].constants
+
+
+# the options
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(0.01, 0.02), (0.1, 0.2), (1.0, 0.4 * 500 * S), (100.0, 0.4 * 500 * S)])
+@pytest.mark.parametrize("model", ["tgdsl", "paper"])
+def test_friction_ends_at_the_cone(tmp_path, speed, expected, model):
+    """Up to μ f_n friction is k_t v, beyond it is μ f_n, in the direction of either model; the normal force is untouched."""
+    sensor = {"friction_cone": 0.4, "outputs": ["force"], "model": model}
+    x, y, z = read(tmp_path, sensor=sensor, linvel=[0.6 * speed, -0.8 * speed, 0])
+    sign = -1 if model == "paper" else 1
+    np.testing.assert_allclose([x, y], [sign * 0.6 * expected, -sign * 0.8 * expected], rtol=1e-12)
+    np.testing.assert_allclose(z, -500 * S, rtol=1e-12)
+
+
+def test_the_cone_is_that_of_the_whole_normal_force(tmp_path):
+    """Damping counts: an object that leaves fast enough to pull has no friction at all."""
+    sensor = {"friction_cone": 0.4, "outputs": ["force"]}
+    x, _, z = read(tmp_path, sensor=sensor, linvel=[10, 0, -100])
+    np.testing.assert_allclose(x, -0.4 * z, rtol=1e-12)
+    np.testing.assert_allclose(z, -(500 + 100) * S, rtol=1e-12)
+    x, y, z = read(tmp_path, sensor=sensor, linvel=[10, 0, 600])
+    assert z > 0
+    assert (x, y) == (0, 0)
+
+
+def test_a_cone_of_zero_is_no_friction(tmp_path):
+    np.testing.assert_allclose(
+        read(tmp_path, sensor={"friction_cone": 0, "outputs": ["force"]}, linvel=[1, 2, 0]), [0, 0, -500 * S], rtol=1e-12
+    )
+
+
+def test_torque_about_the_taxel_is_the_spin_alone(tmp_path):
+    """The lever of the force is left out: where the link's origin lies no longer matters."""
+    probe, motion = (0.01, -0.005, 0.0), {"linvel": [0.1, 0.2, 0], "angvel": [0, 0, 3]}
+    about_link = read(tmp_path, probe=probe, **motion)
+    about_taxel = read(tmp_path, probe=probe, sensor={"torque_about": "taxel"}, **motion)
+    np.testing.assert_array_equal(about_taxel[:3], about_link[:3])
+    np.testing.assert_allclose(about_taxel[3:], [0, 0, 6], atol=1e-12)
+    np.testing.assert_allclose(about_link[3:] - about_taxel[3:], np.cross(probe, about_link[:3]), atol=1e-15)
+    still = read(tmp_path, probe=probe, sensor={"torque_about": "taxel", "spin_damping": 0}, **motion)
+    np.testing.assert_array_equal(still[3:], [0, 0, 0])
+
+
+def balanced(tmp_path, probes, forces, normals=((0, 0, -1),), item=ABOVE, **sensor):
+    """Return readings of a pad whose solver has the given contacts, balanced and not."""
+    touch = module(tmp_path, probes, BOX, kind="kinematic_taxel", balance="solver", slots=4, **sensor)
+    scene = state(touch, **item)
+    for name in ("pos", "force", "torque", "normal"):
+        setattr(scene, f"contact_{name}", torch.zeros(1, 1, 4, 3, dtype=torch.float64))
+    scene.contact_force[0, 0, : len(forces)] = torch.tensor(forces, dtype=torch.float64)
+    scene.contact_normal[0, 0, : len(forces)] = torch.tensor(normals, dtype=torch.float64)
+    scene.contact_netforce = scene.contact_force.sum(dim=2)
+    plain = module(tmp_path, probes, BOX, kind="kinematic_taxel", **sensor)
+    return touch(scene)["s"][0].numpy(), plain(state(plain, **item))["s"][0].numpy()
+
+
+def test_balanced_taxels_press_with_the_solvers_force(tmp_path):
+    """The normal forces sum to Σ f_c · m_c, shear of the solver left out; shear and torque are scaled by the same factor."""
+    probes = [(x, y, 0) for x in (-0.01, 0, 0.01) for y in (0, 0.012)]
+    item = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}
+    found, plain = balanced(tmp_path, probes, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, item)
+    np.testing.assert_allclose(found[:, 2].sum(), -2.0, rtol=1e-12)
+    np.testing.assert_allclose(found, plain * (-2.0 / plain[:, 2].sum()), rtol=1e-12, atol=1e-15)
+
+
+def test_the_solvers_normal_is_the_contacts_own(tmp_path):
+    tilted = np.array([0.6, 0, -0.8])
+    found, _ = balanced(tmp_path, [(0, 0, 0)], [(3 * tilted + [0.08, 0.3, 0.06]).tolist()], [tilted.tolist()])
+    np.testing.assert_allclose(found[0, :3], [0, 0, -3], atol=1e-12)  # along the taxel's normal
+
+
+@pytest.mark.parametrize("item", [{"pos": [0, 0, 0.2]}, {**ABOVE, "linvel": [0, 0, 600]}], ids=["untouched", "pulling"])
+def test_where_no_taxel_is_pressed_the_solvers_force_is_not_carried(tmp_path, item):
+    found, plain = balanced(tmp_path, [(0, 0, 0), (0.01, 0, 0)], [[0, 0, -1.0]], item=item)
+    assert not found.any()
+    assert plain[:, 2].sum() >= 0
+
+
+def test_a_resting_cube_that_is_balanced_weighs_what_it_weighs(tmp_path):
+    """MuJoCo's cube on a pad of probes: 2.4525 N when balanced; by depth alone some other number."""
+    (tmp_path / "scene.xml").write_text(
+        "<mujoco><worldbody><body name='pad'><geom type='box' size='.05 .05 .01'/></body>"
+        "<body name='item' pos='0 0 .03'><freejoint/><geom type='box' size='.02 .02 .02' mass='.25'/></body></worldbody></mujoco>"
+    )
+    line = np.linspace(-0.025, 0.025, 6)
+    points = [{"pos": [float(x), float(y), 0.01], "normal": [0, 0, 1], "radius": 0.004} for x in line for y in line]
+    pressed = {}
+    for balance in ("solver", "none"):
+        touch = tgdsl.compile(
+            {
+                "tgdsl": 1,
+                "robot": {
+                    "model": str(tmp_path / "scene.xml"),
+                    "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+                },
+                "objects": {"item": {"body": "item"}},
+                "sensors": {"s": {"kind": "kinematic_taxel", "links": "pad", "feels": ["item"], "balance": balance}},
+            },
+            dtype=torch.float64,
+        )
+        sim = tgdsl.simulate(touch, 1, substeps=1500)
+        sim.step()
+        pressed[balance] = float(touch(sim.state())["s"][0, :, 2].sum())
+    np.testing.assert_allclose(pressed["solver"], -0.25 * 9.81, atol=1e-4)
+    assert abs(pressed["none"] + 0.25 * 9.81) > 1
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5])
+def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(tmp_path, alpha):
+    """Force against depth δ of a ball of radius B: F = k 2πB δ^(α+1)/((α+1) A), a power of α + 1 where Hertz has 1.5.
+
+    Probes of radius R below the skin, a taxel on each area A. Of one at r from the axis the geometric depth is
+    d = R + B − √(r² + (R + B − δ)²) = δ − r²/2B' with B' = R + B where δ ≪ B'; d = 0 at r² = 2B'δ, and over the disc
+    ∫ d^α 2πr dr/A = 2πB' ∫₀^δ d^α dd/A. The probes' own radius thus counts with the ball's.
+    """
+    reach, ball, pitch = 0.0005, 0.02, 1.25e-4
+    line = np.arange(-40, 41) * pitch
+    x, y = np.meshgrid(line, line)
+    inside = np.hypot(x, y) < 0.0049
+    probes = np.column_stack([x[inside], y[inside], np.full(inside.sum(), -reach)])
+    still = {"normal_damping": 0, "shear_damping": 0, "spin_damping": 0, "outputs": ["force"]}
+    touch = module(
+        tmp_path,
+        probes,
+        f'<geom type="sphere" size="{ball}"/>',
+        radius=reach,
+        kind="kinematic_taxel",
+        depth_exponent=alpha,
+        **still,
+    )
+    depths = np.array([1e-4, 2e-4, 4e-4])
+    forces = [-float(touch(state(touch, pos=[0, 0, ball - depth]))["s"][0, :, 2].sum()) for depth in depths]
+    expected = 500 * 2 * np.pi * (ball + reach) * depths ** (alpha + 1) / ((alpha + 1) * pitch**2)
+    np.testing.assert_allclose(forces, expected, rtol=0.02)
+    exponents = np.diff(np.log(forces)) / np.diff(np.log(depths))
+    np.testing.assert_allclose(exponents, alpha + 1, atol=0.02)
+    assert (np.abs(exponents - 1.5) > 0.4).all()  # no power of the depth is that of a half-space: 1.5 would take α of a half

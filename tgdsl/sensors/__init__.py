@@ -4,10 +4,30 @@ from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.sensors.elastomer import ELASTOMER
+from tgdsl.sensors.force_taxel import FORCE_TAXEL
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
+from tgdsl.sensors.link_contact import LINK_CONTACT
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 
-KINDS: tuple[Kind, ...] = (CONTACT_DEPTH, CONTACT, KINEMATIC_TAXEL, SURFACE_DISTANCE, ELASTOMER)
+KINDS: tuple[Kind, ...] = (
+    CONTACT_DEPTH,
+    CONTACT,
+    KINEMATIC_TAXEL,
+    SURFACE_DISTANCE,
+    ELASTOMER,
+    FORCE_TAXEL,
+    LINK_CONTACT,
+)
 """The kinds that come with tgdsl."""
 
-__all__ = ["CONTACT", "CONTACT_DEPTH", "ELASTOMER", "KINDS", "KINEMATIC_TAXEL", "SURFACE_DISTANCE", "Kind"]
+__all__ = [
+    "CONTACT",
+    "CONTACT_DEPTH",
+    "ELASTOMER",
+    "FORCE_TAXEL",
+    "KINDS",
+    "KINEMATIC_TAXEL",
+    "LINK_CONTACT",
+    "SURFACE_DISTANCE",
+    "Kind",
+]

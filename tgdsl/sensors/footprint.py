@@ -1,0 +1,214 @@
+"""Footprint: which share of a contact's force each taxel near it carries.
+
+A solver knows a contact as a point x_c with force f_c and torque τ_c; a skin has taxels around that point. The shares are
+
+    w_cj = (d_j/R_j + 10⁻³) k(|x_j − x_c|/r_f),   k(s) = (1 − s²)² for s < 1, else 0
+    λ⁰_cj = w_cj / Σ_j w_cj,   λ_cj ∝ λ⁰_cj exp(β · g_cj),   g_cj = (x_j − x_c) × f̂_c / r_f,   Σ_j λ_cj = 1
+    γ_c = t² (3 − 2t),   t = (1 − min_j |x_j − x_c|²/r_f²) / (3/4) between 0 and 1
+
+d_j depth and R_j radius of the probe, r_f the footprint's radius [m], f̂_c the force's direction, γ_c the fraction of the
+contact's force that the skin captures: 1 up to half a footprint from the nearest active taxel, 0 from a whole one. β is one
+vector per body. Of all shares it picks those with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c = Σ_c γ_c τ_c and the least relative
+entropy to λ⁰, contacts weighted by γ_c |f_c|: they never become negative, and a contact that is split in two of the same
+place and direction counts as the one. To first order β is the λ⁰-weighted least-norm correction. It is found by Newton's
+method on the convex dual in a fixed number of steps: with H the mean covariance of g and e the excess moment, both over Σ_c
+γ_c |f_c|,
+
+    s = (H + ε)⁻¹ H (H + ε)⁻¹ e,   β ← β − s / √(1 + s · H s + s · s / 10)
+
+which goes nowhere in directions in which no shares make a moment, as along the row where taxels stand in one, and is damped by
+what it would do to the shares. Where no shares have the moment (the contact lies outside the hull of the taxels that it covers)
+those on its side take more and more of it, and what is left is reported.
+
+Source: the maximum-entropy shape functions of Arroyo & Ortiz, *Int. J. Numer. Meth. Engng* 65 (2006), which meet a moment with
+non-negative shares in the same manner; the footprint as their prior and the moment of a force for that of a place are ours.
+
+Shapes: `*body` bodies, such as (env, body) or (env,); `contact` contacts of a body, `taxel` taxels of that body, both in the
+frame of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+
+UNREACHED = 1e-3
+"""Weight of a taxel that the object does not reach, in units of a probe's radius of depth: there is always someone to carry."""
+LEVENBERG = 1e-3
+"""Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
+DAMPING = 0.1
+"""What a step of β counts beside its effect on the shares [1]: it bounds steps where taxels of hardly any share decide."""
+NO_FORCE = 1e-12
+"""Force [N] below which a direction fades to zero."""
+
+
+class Footprint(NamedTuple):
+    """How one body's contacts are shared out.
+
+    Attributes:
+        share: γ_c λ_cj, fraction of each contact's force on each taxel.
+        residual: What the shares leave of the moment, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes
+            (*body,).
+    """
+
+    share: Float[Tensor, "*body contact taxel"]
+    residual: Vec
+
+
+def footprint(
+    pos: Vec,
+    is_active: Bool[Tensor, "*padding taxel"],
+    depth: Float[Tensor, "*body taxel"],
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    radius: Float[Tensor, "*padding"],
+    levenberg: Float[Tensor, " iteration"],
+) -> Footprint:
+    """Return the shares of contacts of bodies, and what they leave of the moment; derivatives are finite everywhere.
+
+    Args:
+        pos: Taxel positions [m], planes (taxel,) or (body, taxel).
+        is_active: Which taxels can carry.
+        depth: Depth of each probe over its radius [1].
+        point: Contact points [m], planes (*body, contact).
+        force: Forces on the body [N].
+        torque: Torques on the body at the contact points [N·m].
+        radius: Radius of a footprint r_f [m], one for all or (body,).
+        levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
+    """
+    arm = planes.vec((to[..., None, :] - at[..., None]) / radius[..., None, None] for to, at in zip(pos, point, strict=True))
+    apart = torch.where(is_active[..., None, :], planes.dot(arm, arm), 4.0)
+    weight = (depth[..., None, :] + UNREACHED) * (1 - apart).clamp(min=0) ** 2
+    near = ((1 - apart.amin(dim=-1)) / 0.75).clamp(0, 1)
+    captured = near * near * (3 - 2 * near)
+    strength = torch.sqrt(planes.dot(force, force) + NO_FORCE**2)
+    lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
+    load = captured * strength
+    total = load.sum(dim=-1) + NO_FORCE
+    wanted = planes.vec((captured * part).sum(dim=-1) / (radius * total) for part in torque)
+    share = _tilted(weight, lever, _tilt(weight, lever, load / total[..., None], wanted, levenberg))
+    left = planes.vec(
+        (captured * part).sum(dim=-1) - radius * (load * (share * g).sum(dim=-1)).sum(dim=-1)
+        for part, g in zip(torque, lever, strict=True)
+    )
+    return Footprint(captured[..., None] * share, left)
+
+
+def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:
+    """Return shares ∝ weight · exp(β · g), which sum to 1, or are all zero where all weights are."""
+    exponent = torch.where(weight > 0, planes.dot(planes.vec(part[..., None, None] for part in tilt), lever), 0.0)
+    weight = weight * torch.exp(exponent - exponent.detach().amax(dim=-1, keepdim=True))
+    total = weight.sum(dim=-1, keepdim=True)
+    return weight / torch.where(total == 0, 1.0, total)
+
+
+def _tilt(weight: Tensor, lever: Vec, load: Tensor, wanted: Vec, levenberg: Tensor) -> Vec:
+    """Return β [1], planes (*body,)."""
+    zero = torch.zeros_like(wanted[0])
+    tilt: Vec = (zero, zero, zero)
+    for least in levenberg.unbind():
+        share = _tilted(weight, lever, tilt)
+        mean = planes.vec((share * g).sum(dim=-1) for g in lever)
+        off = planes.vec(g - m[..., None] for g, m in zip(lever, mean, strict=True))
+        excess = planes.vec((load * m).sum(dim=-1) - w for m, w in zip(mean, wanted, strict=True))
+        spread = [(load * (share * off[i] * off[k]).sum(dim=-1)).sum(dim=-1) for i, k in _UPPER]
+        halfway = _solve(spread, least, excess)
+        step = _solve(spread, least, _times(spread, halfway))
+        size = planes.dot(step, _times(spread, step)) + DAMPING * planes.dot(step, step)
+        tilt = planes.sub(tilt, planes.scale(torch.rsqrt(1 + size), step))
+    return tilt
+
+
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def _times(matrix: list[Tensor], right: Vec) -> Vec:
+    """Return A b: planes, A symmetric, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    return planes.dot((xx, xy, xz), right), planes.dot((xy, yy, yz), right), planes.dot((xz, yz, zz), right)
+
+
+def _solve(matrix: list[Tensor], least: Tensor, right: Vec) -> Vec:
+    """Return (A + ε)⁻¹ b by LDLᵀ: planes, A symmetric positive semi-definite, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    first = xx + least
+    by_x, bz_x = xy / first, xz / first
+    second = torch.maximum(yy + least - by_x * xy, least / 2)  # exactly, it is at least ε; rounding can bring it below
+    cross = yz - by_x * xz
+    bz_y = cross / second
+    third = torch.maximum(zz + least - bz_x * xz - bz_y * cross, least / 2)
+    y = right[1] - by_x * right[0]
+    z = (right[2] - bz_x * right[0] - bz_y * y) / third
+    y = y / second - bz_y * z
+    return right[0] / first - by_x * y - bz_x * z, y, z
+
+
+def reference(
+    pos: Float[np.ndarray, "taxel 3"],
+    is_active: Bool[np.ndarray, " taxel"],
+    depth: Float[np.ndarray, " taxel"],
+    point: Float[np.ndarray, "contact 3"],
+    force: Float[np.ndarray, "contact 3"],
+    torque: Float[np.ndarray, "contact 3"],
+    radius: float,
+    levenberg: Sequence[float],
+) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, 3]]:
+    """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m]."""
+    num = len(point)
+    weight, captured = np.zeros((num, len(pos))), np.zeros(num)
+    strength = np.sqrt(np.sum(force**2, axis=1) + NO_FORCE**2)
+    for c in range(num):
+        apart = np.where(is_active, np.sum((pos - point[c]) ** 2, axis=1) / radius**2, 4.0)
+        weight[c] = (depth + UNREACHED) * np.maximum(0.0, 1.0 - apart) ** 2
+        t = np.clip((1.0 - apart.min()) / 0.75, 0.0, 1.0)
+        captured[c] = t**2 * (3.0 - 2.0 * t)
+    lever = [np.cross(pos - point[c], force[c] / strength[c]) / radius for c in range(num)]
+    load = captured * strength
+    total = load.sum() + NO_FORCE
+    beta = reference_beta(weight, lever, load / total, captured @ torque / (radius * total), levenberg)
+    shares = np.array([captured[c] * reference_tilt(weight[c], lever[c] @ beta) for c in range(num)]).reshape(num, len(pos))
+    carried = np.zeros(3)
+    for c in range(num):
+        for x, part in zip(pos, shares[c], strict=True):
+            carried += part * np.cross(x - point[c], force[c]) if part else 0.0
+    return shares, captured @ torque - carried
+
+
+def reference_beta(
+    weight: Float[np.ndarray, "contact taxel"],
+    lever: Sequence[Float[np.ndarray, "taxel 3"]],
+    load: Float[np.ndarray, " contact"],
+    wanted: Float[np.ndarray, 3],
+    levenberg: Sequence[float],
+) -> Float[np.ndarray, 3]:
+    """Return β [1] after the given steps."""
+    beta = np.zeros(3)
+    for least in levenberg:
+        excess, spread = -wanted, np.zeros((3, 3))
+        for c, part in enumerate(load):
+            share = reference_tilt(weight[c], lever[c] @ beta)
+            mean = share @ lever[c]
+            excess = excess + part * mean
+            spread += part * (share * (lever[c] - mean).T) @ (lever[c] - mean)
+        curvature = spread + least * np.eye(3)
+        step = np.linalg.solve(curvature, spread @ np.linalg.solve(curvature, excess))
+        beta -= step / np.sqrt(1.0 + step @ spread @ step + DAMPING * step @ step)
+    return beta
+
+
+def reference_tilt(weight: Float[np.ndarray, " taxel"], exponent: Float[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
+    """Return shares ∝ weight · exp(exponent) of the taxels that have any weight."""
+    share, has_weight = np.zeros(len(weight)), weight > 0
+    if has_weight.any():
+        share[has_weight] = weight[has_weight] * np.exp(exponent[has_weight] - exponent[has_weight].max())
+        share /= share.sum()
+    return share

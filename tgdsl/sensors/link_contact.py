@@ -1,0 +1,73 @@
+"""Link contact: what the solver says of each body, whatever its taxels: is it touched, and with which force.
+
+    f_b = Σ_o f_bo,   c_b = 1 if |f_b| > threshold, else 0                                    [N], [1]
+
+with f_bo the solver's whole contact force of object o on body b, in the frame of the body: all its contacts, none left out.
+One row per body that carries the sensor, in the order of the layout. Forces of several objects add up before they are compared:
+a body held between two objects that push equally reads their sum, zero, and no contact; give each object a sensor of its own to
+tell them apart. The bit steps, so it has no gradient.
+
+Source: MuJoCo's contact sensor with the reduction `netforce` (XML reference, sensor/contact).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from tgdsl.fields import NonNegative
+from tgdsl.geometry import planes
+from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
+
+
+class LinkContactSpec(ProbeSpec):
+    """Whether each body is in contact, and the force on it."""
+
+    kind: Literal["link_contact"]
+    """Contact bit [1] and the solver's force [N] of each body."""
+    outputs: Annotated[tuple[Literal["contact", "force"], ...], Field(min_length=1)] = ("contact", "force")
+    """What a reading holds, the bit before the force."""
+    threshold: NonNegative = 0.0
+    """Force above which a body counts as touched [N]."""
+
+
+def reference(
+    spec: LinkContactSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return c [1] and f [N] of the outputs asked for: (body, channel)."""
+    assert touch.contacts is not None
+    net = touch.contacts.net
+    is_touched = np.linalg.norm(net, axis=1) > spec.threshold
+    parts = {"contact": is_touched[:, None].astype(np.float64), "force": net}
+    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
+
+
+def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
+    """The net force alone is wanted: no slots."""
+    channels: list[Channel] = []
+    if "contact" in spec.outputs:
+        channels.append(Channel("contact", "1"))
+    if "force" in spec.outputs:
+        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
+    constants = {"threshold": scalar(spec.threshold)}
+    return Lowered(tuple(channels), rows="body", constants=constants, needs=frozenset({"contacts"}))
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the bit [1] and the force planes [N], by body."""
+    assert felt.contacts is not None
+    net = felt.contacts.net
+    readings = {f"force_{axis}": plane for axis, plane in zip("xyz", net, strict=True)}
+    size = planes.safe_sqrt(planes.dot(net, net))
+    readings["contact"] = torch.where(size.isnan(), size, (size > constants["threshold"]).to(size.dtype))
+    return readings, {}
+
+
+LINK_CONTACT = Kind(LinkContactSpec, lower, forward, reference)
