@@ -69,7 +69,7 @@ def explain(touch: TactileModule) -> str:
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
-    lines += _grids(touch)
+    lines += _grids(touch) + _fields(touch)
     lines += ["", "queries (each measures its probes once, whatever number of sensors they serve)"]
     for i, query in enumerate(plan.queries):
         against = ", ".join(_felt(plan.objects[o]) for o in query.objects) or "nothing"
@@ -128,6 +128,27 @@ def _grids(touch: TactileModule) -> list[str]:
                         f"{1e3 * accuracy['edge_max']:.3g} mm",
                     ]
     return ["", "meshes", *lines] if lines else []
+
+
+def _fields(touch: TactileModule) -> list[str]:
+    """Return what was measured of each field of moments."""
+    lines: dict[str, None] = {}
+    for moments in (answer.moments for query in touch.plan.queries for answer in query.answers if answer.moments):
+        for o, radii, row in zip(moments.objects, moments.radii, moments.accuracy, strict=True):
+            target = touch.plan.objects[o]
+            for i, accuracy in enumerate(row):
+                num = touch.plan.arrays[f"objects/{target.name}/moments/{moments.request}/num"][i]
+                which = f"variant {i // len(radii)}, " if target.num_variants > 1 else ""
+                nodes = f"{' × '.join(map(str, num))} nodes every {1e3 * accuracy['cell']:.3g} mm, {16 * int(num.prod())} bytes"
+                s0, s0_max, s1, s1_max = (
+                    f"{100 * accuracy[key]:.2g} %" for key in ("mass_rms", "mass_max", "first_rms", "first_max")
+                )
+                what = (
+                    f"  {target.name}, {which}radius {1e3 * accuracy['radius']:.3g} mm: {nodes}\n"
+                    f"    RMS error of S0 {s0} of full scale (largest {s0_max}), of S1 {s1} (largest {s1_max})"
+                )
+                lines[what] = None
+    return ["", "fields of moments", *lines] if lines else []
 
 
 def _observations(touch: TactileModule) -> list[str]:

@@ -24,8 +24,10 @@ from tgdsl.example import example_state
 from tgdsl.geometry.bvh import TriangleMesh
 from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.planes import split
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, measure, relate
+from tgdsl.moment_sources import moment_sources
 from tgdsl.plan import Inputs, Plan, PlannedObject
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.state import SceneState
@@ -297,7 +299,11 @@ class TactileModule(nn.Module):
             own = pairs if answer.is_gated else pairs._replace(gate=None)
             reach = self.constants[f"queries/{i}/{a}/reach"]
             found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
-            answers.append((feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found), probes))
+            felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)
+            if answer.moments is not None:
+                sources = moment_sources(self.plan, self.constants, f"queries/{i}/{a}/moments", answer.moments, tensors)
+                felt = with_moments(felt, own, probes, sources)
+            answers.append((felt, probes))
         return answers
 
     def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:

@@ -17,6 +17,12 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `queries/<i>/bodies` | (body,) | body indices of the links that carry its probes, if contacts are wanted |
 | `queries/<i>/<answer>/reach` | (object, taxel) | what an answer feels, see `geometry.query.feel` |
 | `queries/<i>/<answer>/contacts` | (body, object) | whose contacts: indices into `inputs.pairs`, or their number for none |
+| `queries/<i>/<answer>/moments/{pair,reach,radius_id}` | (object, taxel) | whose moments, see `geometry.nearby.MomentSource` |
+| `objects/<name>/moments/<request>/area` | (variant,) | area of its outer surface, planes left out |
+| `objects/<name>/moments/<request>/{plane_pos,plane_rotation}` | (plane, 3 or 9) | its planes in its body's frame |
+| `objects/<name>/moments/<request>/values` | (node, 4) | its fields, float32, see `geometry.moments.MomentField` |
+| `objects/<name>/moments/<request>/{first,num,origin,cell}` | (table, …) | where each is, by variant and radius |
+| `objects/<name>/moments/<request>/{points,weight,lists}` | (3, row), (variant,), (bin, slot) | its points instead |
 | `sensors/<name>/<constant>` | | what the kind's `lower` folded |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
 """
@@ -108,12 +114,32 @@ class PlannedObject:
 
 
 @dataclass(frozen=True)
+class PlannedMoments:
+    """Moments of objects' surfaces.
+
+    Attributes:
+        request: Number of the way in which they are found: a folder of the objects' arrays.
+        backend: How: "field" or "points".
+        objects: Indices of the objects.
+        radii: For each object the radii that it has fields of [m].
+        accuracy: For each object what was measured of each field, variant after variant: see `compiler.moments.FieldErrors`.
+    """
+
+    request: int
+    backend: Literal["field", "points"]
+    objects: tuple[int, ...]
+    radii: tuple[tuple[float, ...], ...]
+    accuracy: tuple[tuple[Mapping[str, float], ...], ...]
+
+
+@dataclass(frozen=True)
 class PlannedAnswer:
     """What some sensors feel of a query: which of its objects, whether they are gated, and what is wanted of them."""
 
     objects: tuple[int, ...]
     is_gated: bool
     needs: tuple[str, ...]
+    moments: PlannedMoments | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,12 +21,13 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.geometry.reference import ReferenceBody, ReferenceContacts, ReferenceGeom, Touch, touch
+from tgdsl.geometry.reference import ReferenceBody, ReferenceContacts, ReferenceGeom, ReferenceMoments, Touch, touch
 from tgdsl.module import TactileModule
 from tgdsl.plan import SLOT_FIELDS, Plan, PlannedObject
 from tgdsl.schema.load import load
@@ -96,6 +98,7 @@ class ReferenceModule:
         reach = plan.arrays[f"queries/{self.sensor.query}/{self.sensor.answer}/reach"]
         self.radius = reach.max(axis=0, initial=-np.inf)
         self.memory: dict[int, dict[str, np.ndarray]] = {}
+        self.tables: dict[tuple[int, int], MomentTable] = {}
 
     def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, np.ndarray]]]:
         """Return readings (env, taxel, channel) of a scene whose objects are shifted [m], and the memory after it."""
@@ -124,10 +127,39 @@ class ReferenceModule:
                 objects.append((self._body(state, env, target.body, shift), geoms) if is_felt else None)
             body = self._body(state, env, link.body, np.zeros(3))
             parts.append(touch(body, self.layout.pos[own], self.radius[own], objects))
-        names = [name for name in Touch.__dataclass_fields__ if name != "contacts"]
+        names = [name for name in Touch.__dataclass_fields__ if name not in ("contacts", "moments")]
         contacts = self._contacts(state, env) if "contacts" in answer.needs else None
         joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return Touch(**joined, contacts=contacts)
+        return Touch(**joined, contacts=contacts, moments=self._moments(state, env, shift))
+
+    def _moments(self, state: SceneState, env: int, shift: np.ndarray) -> ReferenceMoments | None:
+        """Return the moments of the objects that the sensor feels, in the world frame, from the plan's own tables."""
+        planned = self.plan.queries[self.sensor.query].answers[self.sensor.answer].moments
+        if planned is None:
+            return None
+        layout, num = self.layout, len(planned.objects)
+        mass, (first, velocity, angular) = np.zeros((layout.num_taxels, num)), np.zeros((3, layout.num_taxels, num, 3))
+        turn, area = np.zeros((layout.num_taxels, 3)), np.zeros(num)
+        for k, target in enumerate(self.plan.objects[o] for o in planned.objects):
+            variant = 0
+            if target.num_variants > 1 and state.variant is not None:
+                variant = int(state.variant[env, self.plan.inputs.objects.index(target.name)])
+            table = self.tables.setdefault(
+                (k, variant), MomentTable(self.plan, target.name, planned.request, variant, planned.radii[k])
+            )
+            area[k], body = table.area, self._body(state, env, target.body, shift)
+            for t, link_id in enumerate(layout.link_id):
+                name = layout.links[link_id].body
+                if layout.radius[t] <= 0 or name == target.body:
+                    continue
+                link = self._body(state, env, name, np.zeros(3))
+                q = link.pos + link.rotation @ layout.pos[t]
+                mass[t, k], about_q = table.at(body.rotation.T @ (q - body.pos), float(layout.radius[t]))
+                first[t, k] = link.rotation.T @ body.rotation @ about_q
+                velocity[t, k] = link.rotation.T @ (body.velocity_at(q) - link.velocity_at(q))
+                angular[t, k] = link.rotation.T @ (body.angvel - link.angvel)
+                turn[t] = link.rotation.T @ link.angvel
+        return ReferenceMoments(mass, first, velocity, angular, turn, area)
 
     def _contacts(self, state: SceneState, env: int) -> ReferenceContacts:
         """Return the contacts of the sensor's bodies with the objects that it feels, pair by pair and slot by slot."""
@@ -162,6 +194,52 @@ class ReferenceModule:
         absent = self.plan.arrays.get(f"objects/{target.name}/is_absent", np.zeros((variant + 1, len(size))))[variant]
         present = [g for g in range(len(size)) if not absent[g]]
         return [ReferenceGeom(target.shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
+
+
+class MomentTable:
+    """One object's moments by other means than the module's: SciPy's interpolation, a sum over all points, closed form."""
+
+    def __init__(self, plan: Plan, name: str, request: int, variant: int, radii: tuple[float, ...]):
+        """Find the tables of a variant of an object."""
+        prefix = f"objects/{name}/moments/{request}/"
+        self.arrays = {path.removeprefix(prefix): value for path, value in plan.arrays.items() if path.startswith(prefix)}
+        self.variant, self.radii = variant, radii
+        self.area = float(self.arrays["area"][variant])
+        self.fields: dict[float, RegularGridInterpolator] = {}
+
+    def at(self, point: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
+        """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]."""
+        total = np.zeros(4)
+        if "values" in self.arrays:
+            if radius not in self.fields:
+                self.fields[radius] = self._field(self.variant * len(self.radii) + self.radii.index(radius))
+            total += self.fields[radius](point)[0]
+        elif "lists" in self.arrays:
+            total += self._summed(point, radius)
+        for pos, rotation in zip(self.arrays["plane_pos"], self.arrays["plane_rotation"], strict=True):
+            normal = rotation.reshape(3, 3)[:, 2]
+            height = float(normal @ (point - pos))
+            d = min(abs(height), radius)
+            s0 = 2 * np.pi * (radius**3 / 6 - radius * d**2 / 2 + d**3 / 3)
+            total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
+        return float(total[0]), total[1:]
+
+    def _field(self, i: int) -> RegularGridInterpolator:
+        first, num, origin, cell = (self.arrays[name][i] for name in ("first", "num", "origin", "cell"))
+        values = self.arrays["values"][first : first + num.prod()].reshape(*num, 4).astype(np.float64)
+        axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
+        return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
+
+    @cached_property
+    def _points(self) -> np.ndarray:
+        lists, first = self.arrays["lists"], self.arrays["first"]
+        end = first[self.variant + 1] if self.variant + 1 < len(first) else len(lists)
+        return self.arrays["points"].T[np.unique(lists[first[self.variant] : end])]
+
+    def _summed(self, point: np.ndarray, radius: float) -> np.ndarray:
+        way = self._points - point
+        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.arrays["weight"][self.variant]
+        return np.array([weight.sum(), *(weight @ way)])
 
 
 def _row(field: Tensor | None, *index: int) -> np.ndarray:

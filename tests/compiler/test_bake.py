@@ -8,7 +8,7 @@ import torch
 import trimesh
 from surfaces import ball, box, plate, surface_of
 
-import tgdsl.compiler.bake as baking
+import tgdsl.compiler.cache as where
 from tgdsl.compiler.bake import METHODS, Baked, BakeError, bake
 from tgdsl.geometry.grid import one_grid
 from tgdsl.geometry.shapes import SHAPES
@@ -225,13 +225,13 @@ def test_without_a_writable_cache_it_works(monkeypatch, tmp_path):
 
 
 def test_where_the_cache_is(monkeypatch):
-    assert baking._cache_folder() == Path(os.environ["TGDSL_CACHE"])
+    assert where.folder() == Path(os.environ["TGDSL_CACHE"])
     monkeypatch.delenv("TGDSL_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", "/there")
-    assert baking._cache_folder() == Path("/there/tgdsl")
+    assert where.folder() == Path("/there/tgdsl")
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", "/home/someone")
-    assert baking._cache_folder() == Path("/home/someone/.cache/tgdsl")
+    assert where.folder() == Path("/home/someone/.cache/tgdsl")
 
 
 def test_the_same_every_time(monkeypatch, tmp_path):

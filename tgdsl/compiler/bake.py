@@ -14,24 +14,20 @@ Shapes: `n` points, `v` vertices, `f` faces, `x`, `y`, `z` nodes along the axes.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import os
-import tempfile
-import zipfile
-import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from tgdsl.compiler import cache
 from tgdsl.compiler.solid import Lattice, Solid
 from tgdsl.errors import BakeError
 from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.surface import Surface
 
-FORMAT = b"tgdsl grid 2"
+FORMAT = b"tgdsl grid 3"
 CHOICE_POINTS, REPORT_POINTS = 4096, 16384
 HEADROOM, CHOICE_PERCENTILE = 0.95, 99.3
 """The choice holds the tolerance with something to spare, nearly two standard deviations of a percentile of so few points, so
@@ -109,52 +105,30 @@ def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int =
     """
     if not (np.isfinite(surface.vertices).all() and len(surface.faces) and 0 < margin < np.inf and 0 < tolerance < np.inf):
         raise BakeError("a surface to bake needs faces, finite vertices, and a margin and a tolerance above 0")
-    digest = hashlib.sha256(FORMAT + np.array([margin, tolerance, budget], float).tobytes())
-    for array, dtype in ((surface.vertices, np.float64), (surface.faces, np.int64)):
-        digest.update(str(array.shape).encode() + np.ascontiguousarray(array, dtype).tobytes())
-    file = _cache_folder() / f"{digest.hexdigest()}.npz"
-    baked = _read(file)
-    if baked is None:
-        baked = _bake(Solid(surface, leaf=2 * tolerance), margin, tolerance, budget)
-        _write(file, baked)
-    return baked
+    limits = np.array([margin, tolerance, budget], float)
+    arrays = [limits, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
+
+    def make() -> Baked:
+        return _bake(Solid(surface, leaf=2 * tolerance), margin, tolerance, budget)
+
+    return cache.cached(cache.digest(FORMAT, arrays), make, _packed, _unpacked)
 
 
-def _cache_folder() -> Path:
-    if own := os.environ.get("TGDSL_CACHE"):
-        return Path(own)
-    shared = os.environ.get("XDG_CACHE_HOME")
-    return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "tgdsl"
+def _packed(baked: Baked) -> dict[str, np.ndarray]:
+    fields = {
+        field.name: np.asarray(getattr(baked, field.name)) for field in dataclasses.fields(baked) if field.name != "errors"
+    }
+    return fields | {"errors": np.array(dataclasses.astuple(baked.errors), float)}
 
 
-def _read(file: Path) -> Baked | None:
-    """Return what a cache file holds; None if there is none or it is damaged."""
-    try:
-        with file.open("rb") as raw, np.load(raw, allow_pickle=False) as found:
-            count, *errors = found["errors"].tolist()
-            errors[4] = int(errors[4])
-            values, method = found["values"], str(found["method"])
-            if values.dtype != np.float32 or not np.isfinite(values).all() or method not in METHODS:
-                return None
-            report, cell = Errors(int(count), *errors), float(found["cell"])
-            return Baked(values, found["origin"], cell, method, report, bool(found["is_watertight"]))
-    except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
-        return None
-
-
-def _write(file: Path, baked: Baked) -> None:
-    """Write a cache file, whole or not at all; a folder that cannot be written is left alone."""
-    temporary = None
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as out:
-            temporary = Path(out.name)
-            fields = {field.name: getattr(baked, field.name) for field in dataclasses.fields(baked)}
-            np.savez(out, allow_pickle=False, **fields | {"errors": np.array(dataclasses.astuple(baked.errors), float)})
-        temporary.replace(file)
-    except OSError:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+def _unpacked(found: Mapping[str, np.ndarray]) -> Baked:
+    count, *errors = found["errors"].tolist()
+    errors[4] = int(errors[4])
+    values, method = found["values"], str(found["method"])
+    if values.dtype != np.float32 or not np.isfinite(values).all() or method not in METHODS:
+        raise ValueError("a damaged grid")
+    report, cell = Errors(int(count), *errors), float(found["cell"])
+    return Baked(values, found["origin"], cell, method, report, bool(found["is_watertight"]))
 
 
 @dataclass(frozen=True, eq=False)

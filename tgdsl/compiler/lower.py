@@ -9,6 +9,7 @@ import numpy as np
 from tgdsl import observations
 from tgdsl.compiler import passes
 from tgdsl.compiler.felt import settle
+from tgdsl.compiler.moment_tables import moment_tables
 from tgdsl.compiler.passes import Draft, DraftSensor
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import BakeError, LowerError, did_you_mean
@@ -51,6 +52,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
     _settle(loaded, work)
+    _settle_moments(loaded, work)
     loaded.raise_problems()
     queries, answer_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
@@ -84,6 +86,27 @@ def _settle(loaded: Loaded, work: Draft) -> None:
             work.settled[name] = tuple(tuple(settle(geom, target, margin, name) for geom in geoms) for geoms in felt.variants)
         except BakeError as error:
             loaded.problems.append(loaded.problem(("objects", name), str(error)))
+
+
+def _settle_moments(loaded: Loaded, work: Draft) -> None:
+    """Compute the moments of objects beforehand; an object that has none, or too large ones, is a mistake."""
+    for sensor in work.sensors:
+        request = sensor.lowered.moments
+        if request is None:
+            continue
+        path: Path = ("sensors", sensor.name)
+        for i, name in enumerate(sensor.feels):
+            users = [s for s in work.sensors if s.lowered.moments == request and name in s.feels]
+            radii = sorted({float(r) for s in users for r in passes.reach_of(work, s) if r > 0})
+            try:
+                if (request, name) not in work.moments and radii:
+                    work.moments[request, name] = moment_tables(work.objects[name], request, radii)
+            except LowerError as error:
+                loaded.problems.append(loaded.problem((*path, *(["feels", i] if error.field else [])), error.what, error.hint))
+        areas = [work.moments[request, name].area for name in sensor.feels if (request, name) in work.moments]
+        if request.with_area and len(areas) == len(sensor.feels) and not sum(area.min() for area in areas) > 0:
+            what = f"{', '.join(sensor.feels)}: planes alone have no area to share the density among"
+            loaded.problems.append(loaded.problem(path, what, "give `reference_area`, or feel an object that is no plane"))
 
 
 def _sensor(work: Draft, part: DraftSensor, place: tuple[int, int], arrays: dict[str, np.ndarray]) -> PlannedSensor:

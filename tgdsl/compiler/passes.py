@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tgdsl.compiler.felt import FeltBody, FeltGeom, Settled
+from tgdsl.compiler.moment_tables import MomentTables, pack_moments
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import aligned
 from tgdsl.layout import Layout
 from tgdsl.plan import SLOT_FIELDS, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
-from tgdsl.sensors.base import Lowered
+from tgdsl.sensors.base import Lowered, MomentsRequest
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Draft:
             sensors' ranges are known.
         pairs: The (link body, object) pairs that are needed, sorted by object and link; set by `prune`.
         gated: Those of them whose contacts are needed.
+        moments: The moments of each object, for each way in which some sensor wants them found; set like `settled`.
     """
 
     layout: Layout
@@ -57,6 +59,7 @@ class Draft:
     settled: dict[str, tuple[tuple[Settled, ...], ...]] = field(default_factory=dict)
     pairs: list[Pair] = field(default_factory=list)
     gated: list[Pair] = field(default_factory=list)
+    moments: dict[tuple[MomentsRequest, str], MomentTables] = field(default_factory=dict)
 
     def bodies_of(self, taxels: np.ndarray) -> list[str]:
         """Return the body of each taxel."""
@@ -65,11 +68,20 @@ class Draft:
 
 @dataclass(eq=False)
 class DraftAnswer:
-    """What some sensors feel of a query: objects, gate, how far from each taxel [m], −∞ for inactive ones; what they need."""
+    """What some sensors feel of a query.
+
+    Attributes:
+        objects: Names of the objects.
+        is_gated: Whether they are felt only in contact.
+        radius: How far from each taxel [m]; −∞ for inactive ones.
+        request: How moments are found, if they are.
+        needs: What else they need.
+    """
 
     objects: tuple[str, ...]
     is_gated: bool
     radius: np.ndarray
+    request: MomentsRequest | None = None
     needs: set[str] = field(default_factory=set)
 
 
@@ -119,21 +131,21 @@ def _order(pair: Pair) -> tuple[str, str]:
 def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
     """Return the distinct queries, and which of them, and which answer of it, each sensor uses."""
     queries: dict[bytes, DraftQuery] = {}
-    answers: dict[tuple[bytes, tuple[str, ...], bool, bytes], DraftAnswer] = {}
+    answers: dict[tuple[bytes, tuple[str, ...], bool, bytes, MomentsRequest | None], DraftAnswer] = {}
     answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
-        probes, radius = sensor.taxels.tobytes(), _reach(work, sensor)
+        probes, radius, request = sensor.taxels.tobytes(), reach_of(work, sensor), sensor.lowered.moments
         query = queries.setdefault(probes, DraftQuery(sensor.taxels))
-        key = probes, sensor.feels, sensor.is_gated, radius.tobytes()
+        key = probes, sensor.feels, sensor.is_gated, radius.tobytes(), request
         if key not in answers:
-            answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius)
+            answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius, request)
             query.answers.append(answers[key])
         answers[key].needs.update(sensor.lowered.needs)
         answer_of[sensor.name] = list(queries).index(probes), query.answers.index(answers[key])
     return list(queries.values()), answer_of
 
 
-def _reach(work: Draft, sensor: DraftSensor) -> np.ndarray:
+def reach_of(work: Draft, sensor: DraftSensor) -> np.ndarray:
     """Return how far from each taxel a sensor feels objects [m]; −∞ for inactive probes."""
     radius = work.layout.radius[sensor.taxels]
     return np.where(radius > 0, radius if sensor.lowered.radius is None else sensor.lowered.radius, -np.inf)
@@ -141,12 +153,17 @@ def _reach(work: Draft, sensor: DraftSensor) -> np.ndarray:
 
 def margin(work: Draft, name: str) -> float | None:
     """Return the largest distance from an object's surface that any sensor asks for [m]; None if no sensor measures it."""
-    users = [s for s in work.sensors if name in s.feels and _is_measuring(_reach(work, s), s.lowered.needs)]
-    return max((max(float(_reach(work, s).max()), s.lowered.range) for s in users), default=None)
+    users = [s for s in work.sensors if name in s.feels and _is_measuring(reach_of(work, s), s.lowered.needs)]
+    return max((max(float(reach_of(work, s).max()), s.lowered.range) for s in users), default=None)
 
 
 def _is_measuring(radius: np.ndarray, needs: Collection[str]) -> bool:
-    """Return whether a sensor wants distances: one that reads contacts alone lets no probe reach anywhere."""
+    """Return whether a sensor wants distances: one that reads contacts alone lets no probe reach anywhere.
+
+    Nor does one that reads moments, unless it says what it wants of the nearest surface.
+    """
+    if "moments" in needs and not {"normal", "distance", "frame"} & set(needs):
+        return False
     return bool((radius > -np.inf).any()) or "distance" in needs
 
 
@@ -276,5 +293,10 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
             places = [[Pair(body, name) for name in reachable] for body in dict.fromkeys(bodies)]
             table = [[work.gated.index(p) if p in work.gated else len(work.gated) for p in row] for row in places]
             arrays[f"queries/{i}/{a}/contacts"] = np.array(table, dtype=np.int64)
-        answers.append(PlannedAnswer(tuple(felt.index(name) for name in chosen), answer.is_gated, tuple(sorted(answer.needs))))
+        moments = None
+        if answer.request is not None:
+            path, request = f"queries/{i}/{a}/moments", answer.request
+            moments = pack_moments(request, reachable, answer.radius, bodies, work.pairs, names, work.moments, path, arrays)
+        chosen_ids = tuple(felt.index(name) for name in chosen)
+        answers.append(PlannedAnswer(chosen_ids, answer.is_gated, tuple(sorted(answer.needs)), moments))
     query.planned = PlannedQuery(tuple(names.index(name) for name in felt), len(bodies), tuple(answers))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import igl
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -81,14 +81,15 @@ class Solid:
             raise BakeError("a surface to bake needs a face with an area")
         self._closed = vertices, np.ascontiguousarray(np.concatenate([faces, lids]))
         before, behind = self._sides(vertices[lids])
-        faces = np.concatenate([faces, lids[self._is_inside(before) != self._is_inside(behind)]])
+        faces = np.concatenate([faces, lids[self.is_inside(before) != self.is_inside(behind)]])
         self._creases = _creases(vertices, faces)
         self.leaf = max(leaf, 1e-3 * float(np.linalg.norm(np.ptp(vertices, axis=0))))
         self.corners = self._outer(vertices, faces, self.leaf)
         self._soup = self.corners.reshape(-1, 3), np.arange(3 * len(self.corners)).reshape(-1, 3)
         self._tree = _tree(*self._soup)
 
-    def _is_inside(self, pos: np.ndarray) -> np.ndarray:
+    def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return which points are inside."""
         if not len(pos):
             return np.zeros(0, bool)
         winding = np.abs(np.atleast_1d(igl.fast_winding_number(*self._closed, np.ascontiguousarray(pos))))
@@ -122,11 +123,11 @@ class Solid:
                 is_apart = np.reshape(tree.squared_distance(vertices, others, middle)[0], -1) > radius**2
                 is_done = is_apart | (radius <= leaf / 2)
                 before, behind = self._sides(corners[is_done])
-                is_inner = self._is_inside(before) & self._is_inside(behind)
+                is_inner = self.is_inside(before) & self.is_inside(behind)
                 is_cut[owner[is_done][is_inner]] = True
                 pieces.append(corners[is_done][~is_inner])
                 owners.append(owner[is_done][~is_inner])
-                corners, owner = _halved(corners[~is_done]), np.tile(owner[~is_done], 2)
+                corners, owner = halved(corners[~is_done]), np.tile(owner[~is_done], 2)
             outer += [whole[~is_cut], np.concatenate(pieces)[is_cut[np.concatenate(owners)]]]
         return np.concatenate(outer)
 
@@ -135,7 +136,7 @@ class Solid:
         pos = np.ascontiguousarray(pos)
         squared, _, nearest = self._tree.squared_distance(*self._soup, pos)
         length = np.sqrt(np.asarray(squared)).reshape(-1)
-        signed = np.where(self._is_inside(pos), -length, length)
+        signed = np.where(self.is_inside(pos), -length, length)
         way = pos - np.asarray(nearest).reshape(-1, 3)
         return signed, np.divide(way, signed[:, None], out=np.zeros_like(way), where=length[:, None] > 1e-9)
 
@@ -155,10 +156,10 @@ class Solid:
         regions = regions.reshape(-1)
         names, first = np.unique(regions, return_index=True)
         is_inside = np.zeros(int(names[-1]) + 1, bool)
-        is_inside[names] = self._is_inside(lattice.pos(first))
+        is_inside[names] = self.is_inside(lattice.pos(first))
         is_inside = is_inside[regions]
         near = np.flatnonzero(regions == 0)
-        is_inside[near] = self._is_inside(lattice.pos(near))
+        is_inside[near] = self.is_inside(lattice.pos(near))
         return np.where(is_inside, -length, length).astype(np.float32).reshape(lattice.shape)
 
     def edge_distance(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
@@ -183,7 +184,7 @@ def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
     return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 1e-9 * longest
 
 
-def _halved(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
+def halved(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
     """Return the two halves of each triangle, cut from the middle of its longest side; needles become stout."""
     length = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3

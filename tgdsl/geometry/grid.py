@@ -96,11 +96,11 @@ def _cubic_weights(t: Tensor) -> Nodes:
 def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[Tensor, Vec]:
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
     place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
-    inside = [_within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
+    inside = [within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
     # What is within TIE of the next cell counts as in it, so that a point at rest on a face of cells keeps its gradient.
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
     tie = TIE / grid.cell
-    lower = vec(_within((part + tie).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
+    lower = vec(within((part + tie).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
     value, *slopes = _sum_over_nodes(grid, lower, (along_x, along_y, along_z), first)
     way, direction = length_and_direction(
@@ -116,7 +116,8 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     return distance, gradient
 
 
-def _within(place: Tensor, last: Count) -> Tensor:
+def within(place: Tensor, last: Count) -> Tensor:
+    """Return a place along an axis, or its index, brought into the range from 0 to the last; what is no number stays none."""
     return place.clamp(0, last) if isinstance(last, int) else torch.minimum(place.clamp(min=0), last.to(place.dtype))
 
 
@@ -127,7 +128,7 @@ def _sum_over_nodes(
     _, num_y, num_z = grid.num
     strides = (num_y * num_z, num_z, 1)
     index = [
-        [_within(corner + first + k, num - 1) * stride for k in range(len(nodes))]
+        [within(corner + first + k, num - 1) * stride for k in range(len(nodes))]
         for corner, nodes, num, stride in zip(lower, along, grid.num, strides, strict=True)
     ]
     index[0] = [ix + grid.first for ix in index[0]]

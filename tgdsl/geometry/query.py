@@ -21,6 +21,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
 from tgdsl.geometry.contacts import Contacts
 from tgdsl.geometry.grid import METHODS, Grid
+from tgdsl.geometry.moments import Moments
 from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.geometry.shapes import SHAPES
 
@@ -31,10 +32,12 @@ class Motion(NamedTuple):
     Attributes:
         linear: Velocity of the object's material at the link's origin, less the link's own [m/s].
         angular: Relative angular velocity [rad/s].
+        turn: The link's own angular velocity [rad/s].
     """
 
     linear: Vec
     angular: Vec
+    turn: Vec
 
 
 class Pairs(NamedTuple):
@@ -153,6 +156,9 @@ class Felt(NamedTuple):
         distances: Distance to each object, by its name; empty if not wanted.
         frames: How each object sees the link, by its name; empty if not wanted.
         contacts: The solver's contacts on the bodies that carry the probes; None if not wanted.
+        moments: Moments of each object's surface, by its name, see `moments`; empty if not wanted, as the next two.
+        motions: Motion of each object relative to the link; only with moments.
+        area: Area of each object's outer surface, planes left out [m²], (case, 1).
     """
 
     depth: Tensor
@@ -162,6 +168,9 @@ class Felt(NamedTuple):
     distances: dict[str, Distance]
     frames: dict[str, Frame]
     contacts: Contacts | None
+    moments: dict[str, Moments]
+    motions: dict[str, Motion]
+    area: dict[str, Tensor]
 
 
 def relate(
@@ -199,9 +208,11 @@ def relate(
         slide = planes.sub(planes.split(linvel[:, target]), planes.split(linvel[:, link]))
         parts += planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
         parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
+        parts += planes.rotate_back(link_rotation, turn)
     # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
     parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
-    motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18])) if len(parts) > 12 else None
+    is_moving = len(parts) > 12
+    motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, gate)
 
 
@@ -253,17 +264,28 @@ def feel(
         if with_normal:
             normal = planes.where(is_deeper, target.gradient, normal)
         if with_motion and pairs.motion is not None:
-            linear = planes.where(is_deeper, _gathered(pairs.motion.linear, target.pairs, target.pair), linear)
-            angular = planes.where(is_deeper, _gathered(pairs.motion.angular, target.pairs, target.pair), angular)
+            linear = planes.where(is_deeper, gathered(pairs.motion.linear, target.pairs, target.pair), linear)
+            angular = planes.where(is_deeper, gathered(pairs.motion.angular, target.pairs, target.pair), angular)
         if "distance" in needs:
             value = torch.where(radius > -torch.inf, target.distance, torch.inf)
             distances[target.name] = Distance(value, target.gradient)
         if "frame" in needs:
             rotation = planes.rot(part[:, target.pairs][:, target.pair] for part in pairs.rotation)
-            frames[target.name] = Frame(rotation, _gathered(pairs.offset, target.pairs, target.pair))
+            frames[target.name] = Frame(rotation, gathered(pairs.offset, target.pairs, target.pair))
         depth = torch.maximum(depth, reached)
     velocity = planes.add(linear, planes.cross(angular, probes.pos)) if with_motion else None
-    return Felt(depth, normal if with_normal else None, velocity, angular if with_motion else None, distances, frames, contacts)
+    return Felt(
+        depth=depth,
+        normal=normal if with_normal else None,
+        velocity=velocity,
+        angular=angular if with_motion else None,
+        distances=distances,
+        frames=frames,
+        contacts=contacts,
+        moments={},
+        motions={},
+        area={},
+    )
 
 
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
@@ -307,5 +329,6 @@ def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple
     return planes.transpose_times(geom_rotation, rotation), planes.rotate_back(geom_rotation, moved)
 
 
-def _gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
+def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
+    """Return a vector of the pairs (env, pair) for each probe: those of an object, and which of them each probe's is."""
     return planes.vec(part[:, own][:, pair] for part in vector)

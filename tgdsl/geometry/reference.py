@@ -74,6 +74,27 @@ class ReferenceContacts:
 
 
 @dataclass(frozen=True, eq=False)
+class ReferenceMoments:
+    """Moments of objects' surfaces and the objects' motion, in the links' frames: those of `query.Felt` as arrays.
+
+    Attributes:
+        mass: S0 [m³].
+        first: S1 about the probe [m⁴].
+        velocity: Velocity of each object's material at the probe relative to the probe [m/s].
+        angular: Angular velocity of each object relative to the link [rad/s].
+        turn: The link's own angular velocity [rad/s].
+        area: Area of each object's outer surface, planes left out [m²].
+    """
+
+    mass: Float[Array, "taxel object"]
+    first: Float[Array, "taxel object 3"]
+    velocity: Float[Array, "taxel object 3"]
+    angular: Float[Array, "taxel object 3"]
+    turn: Float[Array, "taxel 3"]
+    area: Float[Array, " object"]
+
+
+@dataclass(frozen=True, eq=False)
 class Touch:
     """What a sensor's probes feel, in their links' frames: the fields of `query.Felt`, one row per taxel.
 
@@ -90,6 +111,7 @@ class Touch:
     rotation: Float[Array, "taxel object 3 3"]
     offset: Float[Array, "taxel object 3"]
     contacts: ReferenceContacts | None = None
+    moments: ReferenceMoments | None = None
 
 
 def touch(

@@ -7,6 +7,7 @@ from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.force_taxel import FORCE_TAXEL
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.sensors.link_contact import LINK_CONTACT
+from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 
 KINDS: tuple[Kind, ...] = (
@@ -14,6 +15,7 @@ KINDS: tuple[Kind, ...] = (
     CONTACT,
     KINEMATIC_TAXEL,
     SURFACE_DISTANCE,
+    PROXIMITY,
     ELASTOMER,
     FORCE_TAXEL,
     LINK_CONTACT,
@@ -28,6 +30,7 @@ __all__ = [
     "KINDS",
     "KINEMATIC_TAXEL",
     "LINK_CONTACT",
+    "PROXIMITY",
     "SURFACE_DISTANCE",
     "Kind",
 ]

@@ -78,6 +78,25 @@ class Memory:
     shape: tuple[int, ...] | None = None
 
 
+@dataclass(frozen=True)
+class MomentsRequest:
+    """How moments of objects' surfaces are found.
+
+    Attributes:
+        backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
+        num_points: Points of each object.
+        tolerance: Root mean square error of a field as a fraction of full scale.
+        max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
+        with_area: Whether the area of the felt objects is wanted, so that there must be one.
+    """
+
+    backend: Literal["field", "points"]
+    num_points: int
+    tolerance: float
+    max_bytes: int
+    with_area: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """A sensor, ready to be planned.
@@ -88,10 +107,11 @@ class Lowered:
         state: What is carried from one call to the next.
         rows: What the reading has one row of: "taxel", or "body" for each body that carries taxels, in order.
         reports: Further readings, with a row per body: `<sensor>/<name>` holds these channels.
-        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts".
+        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts", "moments".
         range: Distance from an object's surface up to which readings tell it apart [m], if more than the probe's radius.
         radius: How far from each taxel objects are felt [m], (taxel,); default: the probes' radii. Inactive ones feel nothing.
         slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
+        moments: How moments are found, if `needs` has "moments".
     """
 
     channels: tuple[Channel, ...]
@@ -103,6 +123,7 @@ class Lowered:
     range: float = 0.0
     radius: Float[np.ndarray, " taxel"] | None = None
     slots: int = 0
+    moments: MomentsRequest | None = None
 
 
 SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]

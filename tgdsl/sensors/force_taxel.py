@@ -41,7 +41,6 @@ from tgdsl.layout import Layout
 from tgdsl.sensors import footprint
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
 
-
 SPACINGS = 3.0
 """Default radius of a footprint, in spacings of the taxels: the middle of a square of four is within half of it."""
 

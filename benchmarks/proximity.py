@@ -1,0 +1,113 @@
+"""The proximity taxel by a baked field and by sampled points: error against the converged surface integral, and time.
+
+    python benchmarks/proximity.py [--device cuda] [--num-envs 1024] [--num-taxels 100] [--repeats 10] [--eager]
+
+A 4 cm cube and probes of 10 mm radius spread over a pad of its size, at random poses within reach. Medians of calls made in
+turn; errors are root mean squares of the normal force over its largest magnitude, against a field of a tolerance of 0.3 %.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+import tyro
+from module import median_ms
+
+import tgdsl
+from tgdsl.module import TactileModule
+from tgdsl.state import SceneState
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="pad"><freejoint/><geom type="box" size=".02 .02 .002"/></body>
+  <body name="cube"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+</worldbody></mujoco>
+"""
+ROOM = 2**29
+"""Budget of fields and lists [bytes]."""
+BACKENDS: dict[str, dict[str, Any]] = {
+    "field, 0.5 %": {"tolerance": 0.005},
+    "field, 2 %": {"tolerance": 0.02},
+    "5,000 points": {"backend": "points", "points": 5_000},
+    "100,000 points": {"backend": "points", "points": 100_000},
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time."""
+
+    device: str = "cpu"
+    """Where."""
+    num_envs: int = 1024
+    """Environments."""
+    num_taxels: int = 100
+    """Taxels, a square number."""
+    repeats: int = 10
+    """Timed calls of each module."""
+    eager: bool = False
+    """Whether to leave the modules uncompiled."""
+
+
+def module(folder: Path, options: Options, **sensor: Any) -> TactileModule:
+    """Return a module with one proximity sensor."""
+    path = folder / "scene.xml"
+    path.write_text(SCENE)
+    side = round(options.num_taxels**0.5)
+    line = [0.04 * ((i + 0.5) / side - 0.5) for i in range(side)]
+    points = [{"pos": [x, y, 0.002], "normal": [0, 0, 1], "radius": 0.01} for x in line for y in line]
+    layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(path), "layout": layout},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"s": {"kind": "proximity", "links": "pad", "feels": ["cube"], "max_bytes": ROOM, **sensor}},
+    }
+    return tgdsl.compile(document, device=options.device)
+
+
+def near(touch: TactileModule, num_envs: int) -> SceneState:
+    """Return random states in which the cube is in front of the pad, 0 to 8 mm away."""
+    state = touch.example_state(num_envs, dtype=torch.float32, spread=0.004)
+    assert state.body_pos is not None and state.body_quat is not None
+    pad, cube = (touch.inputs.bodies.index(name) for name in ("pad", "cube"))
+    state.body_pos[:, pad] = 0
+    state.body_quat[:] = 0.05 * state.body_quat
+    state.body_quat[..., 0] += 1
+    state.body_pos[:, cube, 2] += 0.027
+    return state
+
+
+def main(options: Options) -> None:
+    """Print one table."""
+    where = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {where}, {options.num_envs} × {options.num_taxels}, medians of {options.repeats}\n")
+    rows, calls, found = {}, {}, {}
+    with TemporaryDirectory() as folder, torch.no_grad():
+        exact = module(Path(folder), options, tolerance=0.003)
+        state = near(exact, options.num_envs)
+        true = exact(state)["s"][..., 2]
+        for name, sensor in BACKENDS.items():
+            start = time.perf_counter()
+            touch = module(Path(folder), options, **sensor)
+            rows[name] = time.perf_counter() - start, sum(b.numel() * b.element_size() for b in touch.constants.buffers())
+            found[name] = touch(state)["s"][..., 2]
+            if not options.eager:
+                touch.compile()
+            calls[name] = lambda touch=touch: touch(state)
+        times = median_ms(calls, options.repeats, options.device)
+    first = times[next(iter(times))]
+    print("| backend | error, RMS | largest | ms | ratio | constants, MiB | compiled in, s |\n|---|---|---|---|---|---|---|")
+    for name, (seconds, size) in rows.items():
+        error = (found[name] - true).abs() / true.abs().max()
+        rms = f"{100 * error.square().mean().sqrt():.2f} % | {100 * error.max():.2f} %"
+        print(f"| {name} | {rms} | {times[name]:.3f} | {times[name] / first:.1f} | {size / 2**20:.1f} | {seconds:.1f} |")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,226 @@
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from sensors.scenes import module, state
+from tgdsl.errors import SpecError
+from tgdsl.sensors.proximity import PROXIMITY
+from tgdsl.state import SceneState
+from tgdsl.testing import KindConformance
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+COARSE = 0.04
+"""Tolerance of fields whose accuracy is not the question."""
+
+
+class TestProximity(KindConformance):
+    kind = PROXIMITY
+    parameters = {"tolerance": COARSE}
+    gates = ()
+
+
+class TestProximityOverPointsAsInThePaper(KindConformance):
+    kind = PROXIMITY
+    parameters = {"backend": "points", "points": 600, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
+    gates = ()
+
+
+class TestProximityAsInThePaper(KindConformance):
+    kind = PROXIMITY
+    parameters = {"tolerance": COARSE, "model": "paper", "outputs": ["force"], "reference_area": 0.01}
+    gates = ()
+
+
+PLANE, CUBE = '<geom type="plane" size="1 1 .1"/>', '<geom type="box" size=".02 .02 .02"/>'
+R, AREA = 0.01, 6 * 0.04**2
+RHO = 100 / AREA
+
+
+def read(tmp_path, geom=PLANE, probe=(0, 0, 0), sensor=None, **item):
+    values = {"reference_area": AREA, "tolerance": COARSE, **(sensor or {})}
+    touch = module(tmp_path, [probe], geom, gate=None, kind="proximity", **values)
+    return touch(state(touch, **item))["s"][0, 0].numpy()
+
+
+def over_a_plane(d):
+    return 2 * np.pi * (R**3 / 6 - R * d**2 / 2 + d**3 / 3)
+
+
+def test_a_plane_in_front_pushes_the_sensor_back(tmp_path):
+    """The plane is turned upside down and 4 mm above the probe, whose normal is +z: S1 is along the normal, so no torque."""
+    readings = read(tmp_path, pos=[0.2, 0.1, 0.004], quat=[0, 1, 0, 0])
+    np.testing.assert_allclose(readings, [0, 0, -300 * RHO * over_a_plane(0.004), 0, 0, 0], rtol=1e-12, atol=1e-15)
+
+
+def test_a_plane_at_the_side_twists_the_sensor(tmp_path):
+    """A wall at x = 6 mm, seen by a probe along z: S1 = 6 mm S0 along x, τ = −k ρ S1 × a = +k ρ 6 mm S0 along y."""
+    quat = [np.sqrt(0.5), 0, -np.sqrt(0.5), 0]  # its normal points to −x
+    s0 = over_a_plane(0.006)
+    for about, arm in (("taxel", 0.0), ("link", 0.02)):
+        readings = read(tmp_path, probe=(0.02, 0, 0), sensor={"torque_about": about}, pos=[0.026, 0, 0], quat=quat)
+        force = -300 * RHO * s0
+        np.testing.assert_allclose(readings[:3], [0, 0, force], rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(readings[3:], [0, 300 * RHO * 0.006 * s0 - arm * force, 0], rtol=1e-12, atol=1e-15)
+
+
+def test_the_papers_model_pulls(tmp_path):
+    ours, paper = (read(tmp_path, sensor={"model": m}, pos=[0, 0, -0.003]) for m in ("tgdsl", "paper"))
+    np.testing.assert_allclose(paper, -ours, atol=1e-15)
+    assert paper[2] > 0
+
+
+def test_slip_drags_the_sensor_along_with_the_object(tmp_path):
+    """A cube that slides: f_t = k_s ρ S0 v_t, and the velocity along the normal does nothing."""
+    at = {"pos": [0, 0, -0.026]}
+    still = read(tmp_path, CUBE, **at)
+    sliding = read(tmp_path, CUBE, **at, linvel=[0.3, -0.1, 0.7])
+    s0 = -still[2] / (300 * RHO)
+    assert s0 == pytest.approx(over_a_plane(0.006), rel=0.1)
+    np.testing.assert_allclose(sliding - still, [10 * RHO * s0 * 0.3, -10 * RHO * s0 * 0.1, 0, 0, 0, 0], atol=1e-12)
+
+
+def turning(touch, spin, drift, **item):
+    """Return a state in which link and object turn as one rigid body."""
+    found = state(touch, **item)
+    assert found.body_pos is not None and found.body_angvel is not None and found.body_linvel is not None
+    for i in range(2):
+        found.body_angvel[0, i] = torch.tensor(spin)
+        found.body_linvel[0, i] = torch.tensor(drift + np.cross(spin, found.body_pos[0, i].numpy()))
+    return found
+
+
+def test_a_hand_that_turns_with_the_object_feels_slip_only_in_the_paper(tmp_path):
+    """The paper's slip is then ω × S1 with the absolute ω, here in the frame of the link."""
+    spin, at = np.array([1.0, -2.0, 0.5]), {"pos": [0, 0, -0.026]}
+    for model, slips in (("tgdsl", 0.0), ("paper", 1.0)):
+        touch = module(
+            tmp_path, [(0.004, 0, 0)], CUBE, gate=None, kind="proximity", model=model, tolerance=COARSE, reference_area=AREA
+        )
+        still = touch(state(touch, **at))["s"][0, 0].numpy()
+        moving = touch(turning(touch, spin, np.array([0.3, 0.1, -0.2]), **at))["s"][0, 0].numpy()
+        # S1 is known of the torque at rest but for its part along the normal; the cube's middle is below the probe.
+        sign = 1.0 if model == "paper" else -1.0
+        s1 = np.array([-still[4], still[3], 0]) * sign / (300 * RHO)
+        depth = ((moving - still)[0] / (10 * RHO) + spin[2] * s1[1]) / spin[1] if slips else 0.0
+        slip = slips * np.cross(spin, [s1[0], s1[1], depth])
+        np.testing.assert_allclose((moving - still)[:2], 10 * RHO * slip[:2], rtol=1e-9, atol=1e-13)
+        assert (abs((moving - still)[:2]) > 1e-6).all() == bool(slips)
+        assert not slips or depth < 0
+
+
+def test_the_whole_area_is_the_default_reference(tmp_path):
+    own = read(tmp_path, CUBE, sensor={"reference_area": None}, pos=[0, 0, -0.026])
+    np.testing.assert_allclose(own, read(tmp_path, CUBE, pos=[0, 0, -0.026]), rtol=1e-6, atol=1e-15)
+
+
+def test_points_and_field_agree_to_sampling_noise(tmp_path):
+    """200,000 points, some 6,500 of them within reach, err by √(1.5 / 6500) = 1.5 %; the field by less."""
+    line = np.linspace(-0.02, 0.02, 6)
+    probes = [(x, y, 0) for x in line for y in line]
+    found = []
+    for sensor in ({"tolerance": 0.01}, {"backend": "points", "points": 200_000, "max_bytes": 2**29}):
+        touch = module(tmp_path, probes, CUBE, gate=None, kind="proximity", reference_area=AREA, **sensor)
+        found.append(touch(state(touch, pos=[0.003, 0, -0.025]))["s"][0].numpy())
+    assert np.sqrt(np.mean((found[0] - found[1]) ** 2, axis=0)[2]) < 0.025 * np.abs(found[1][:, 2]).max()
+
+
+def test_the_mean_does_not_depend_on_the_number_of_taxels(tmp_path):
+    """Twice as many taxels on the same patch: the mean force changes by less than 2 %."""
+    means = []
+    for num in (10, 20):
+        line = ((np.arange(num) + 0.5) / num - 0.5) * 0.04
+        probes = [(x, y, 0) for x in line for y in line]
+        touch = module(tmp_path, probes, CUBE, gate=None, kind="proximity", reference_area=AREA, tolerance=COARSE)
+        means.append(touch(state(touch, pos=[0.003, 0, -0.024]))["s"][0, :, 2].mean().item())
+    assert means[1] == pytest.approx(means[0], rel=0.02)
+
+
+def test_stiffness_is_a_constant_that_gradients_reach(tmp_path):
+    touch = module(tmp_path, [(0, 0, 0)], CUBE, gate=None, kind="proximity", reference_area=AREA, tolerance=COARSE)
+    at = state(touch, pos=[0.002, 0, -0.024])
+    stiffness = touch.constants["sensors/s/stiffness"].requires_grad_()
+    force = touch(at)["s"][0, 0, 2]
+    (slope,) = torch.autograd.grad(force, stiffness)
+    assert slope.item() * stiffness.item() == pytest.approx(force.item(), rel=1e-12)  # the force at rest is linear in it
+
+
+def test_each_radius_has_its_own_field(tmp_path):
+    """Two radii in one layout read what each reads alone."""
+    touch, alone = [], []
+    for radii in ((0.01, 0.006), (0.01,), (0.006,)):
+        (tmp_path / "scene.xml").write_text(SCENE)
+        points = [{"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": r} for r in radii]
+        own = tgdsl.compile(document(tmp_path, points), dtype=torch.float64)
+        readings = own(state(own, pos=[0.004, 0, -0.023]))["s"][0]
+        (alone if len(radii) == 1 else touch).append(readings)
+    torch.testing.assert_close(touch[0], torch.cat(alone))
+    assert (touch[0][:, 2] < 0).all()
+
+
+SCENE = (
+    '<mujoco><worldbody><body name="pad"><freejoint/><geom size=".05"/></body>'
+    f'<body name="item"><freejoint/>{CUBE}</body><body name="floor"><geom type="plane" size="1 1 .1"/></body></worldbody></mujoco>'
+)
+
+
+def document(folder, probes, feels=("item",), target=None, **sensor):
+    (folder / "scene.xml").write_text(SCENE)
+    layout = {"resolutions": {"r": {"pad": {"method": "points", "points": probes}}}}
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(folder / "scene.xml"), "layout": layout},
+        "objects": {"item": {"body": "item", **(target or {})}, "floor": {"body": "floor"}},
+        "sensors": {"s": {"kind": "proximity", "links": "pad", "feels": list(feels), "tolerance": COARSE, **sensor}},
+    }
+
+
+POINT = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": R}
+
+
+@pytest.mark.parametrize("backend", ["field", "points"])
+def test_variants_are_as_many_single_runs(tmp_path, backend):
+    variants = [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]
+    own = {"backend": backend, "points": 500}
+    touch = tgdsl.compile(document(tmp_path, [POINT], target={"variants": variants}, **own), dtype=torch.float64)
+    at = touch.example_state(4, spread=0.004)
+    assert at.body_pos is not None and at.variant is not None
+    at.body_pos[:, touch.inputs.bodies.index("item"), 2] -= 0.024
+    together = touch(at)["s"]
+    for env in range(4):
+        target = {"geom": variants[int(at.variant[env, 0])]}
+        alone = tgdsl.compile(document(tmp_path, [POINT], target=target, **own), dtype=torch.float64)
+        values = {name: getattr(at, name)[env : env + 1] for name in alone.inputs.fields}
+        torch.testing.assert_close(alone(SceneState(**values))["s"][0], together[env], rtol=1e-12, atol=1e-15)
+    assert (together[:, 0, :3].abs().sum(dim=1) > 0).sum() >= 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"target": {"size": "per_env"}}, 'sensors.s.feels[0]: the size of body "item" is given per environment'),
+        ({"feels": ["floor"]}, "sensors.s: floor: planes alone have no area to share the density among; give `reference_area`"),
+        ({"max_bytes": 1000}, 'sensors.s: body "item": a field of moments of a tolerance of 0.04 at a radius of 10 mm needs'),
+        ({"tolerance": 0}, "sensors.s.tolerance: 0 is out of range, expected more than 0"),
+    ],
+)
+def test_mistakes(tmp_path, changes, message):
+    with pytest.raises(SpecError) as error:
+        tgdsl.compile(document(tmp_path, [POINT], **changes))
+    assert message in str(error.value)
+    assert len(error.value.problems) == 1, str(error.value)
+
+
+def test_only_moments_are_found(tmp_path):
+    """No distances are baked or measured for it, and the account says what the field costs."""
+    touch = tgdsl.compile(document(tmp_path, [POINT], outputs=["torque"]))
+    assert touch.inputs.fields == ("body_pos", "body_quat") and touch.plan.queries[0].objects == ()
+    text = touch.explain()
+    assert "fields of moments" in text and "item, radius 10 mm: " in text
+    force = tgdsl.compile(document(tmp_path, [POINT], feels=["item", "floor"]))
+    assert force.inputs.fields == ("body_pos", "body_quat", "body_linvel", "body_angvel")

@@ -1,0 +1,255 @@
+"""Moments of an object's outer surface, computed beforehand as fields on a lattice.
+
+See `geometry.moments` for what they are, `quadrature` for what the integrals are summed from. A field's nodes hold
+f − h²/12 ∇²f rather than f, with second differences over the cell h: linear interpolation lies above what curves upwards by
+h²/12 f'' on the mean, so that this takes the mean error away and leaves its spread (√(1/720) against √(1/120) of h² f''): a
+cell may be half as large again. Planes are exact and take no part.
+
+Shapes: `n` points, `x`, `y`, `z` nodes along the axes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tgdsl.compiler import cache
+from tgdsl.compiler.felt import FeltGeom
+from tgdsl.compiler.quadrature import Pieces, Quadrature, outer_surface
+from tgdsl.errors import BakeError
+from tgdsl.geometry.moments import MomentField, field_moments
+from tgdsl.geometry.planes import split
+
+FORMAT = b"tgdsl moments 1"
+CHOICE_POINTS, REPORT_POINTS = 1024, 2048
+HEADROOM = 0.95
+"""The choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too."""
+FINER = 2.0
+"""How many times finer than the field's the quadrature is that it is measured against."""
+BRICK = 6
+"""Nodes along the side of a brick that is computed at once."""
+AREA_RADIUS = 1e-3
+"""Longest side of the pieces that an object's area is summed from, where no radius asks for less [m]."""
+
+
+@dataclass(frozen=True)
+class FieldErrors:
+    """Errors at random points within the radius of the surface, none of which took part in the choice of the lattice.
+
+    All are fractions of full scale, the largest magnitude at these points.
+
+    Attributes:
+        mass_rms: Root mean square of the error of S0.
+        mass_max: Its largest.
+        first_rms: Root mean square of the length of the error of S1.
+        first_max: Its largest.
+    """
+
+    mass_rms: float
+    mass_max: float
+    first_rms: float
+    first_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class BakedField:
+    """Moments at the nodes of a lattice in the body's frame.
+
+    Attributes:
+        values: S0 [m³], S1 [m⁴], and their derivatives with respect to R if asked for; float32.
+        origin: Place of node (0, 0, 0) [m].
+        cell: Spacing of the nodes [m].
+        errors: What the lattice costs in accuracy.
+    """
+
+    values: Float[np.ndarray, "x y z channel"]
+    origin: Float[np.ndarray, " 3"]
+    cell: float
+    errors: FieldErrors
+
+
+def surface_area(geoms: Sequence[FeltGeom]) -> float:
+    """Return the area of an object's outer surface, planes left out [m²]."""
+    return cache.cached(
+        moments_key(geoms, b"area", AREA_RADIUS),
+        lambda: float(outer_surface(geoms, AREA_RADIUS).area.sum()),
+        lambda area: {"area": np.asarray(area)},
+        lambda found: float(found["area"]),
+    )
+
+
+def bake_field(
+    geoms: Sequence[FeltGeom], radius: float, tolerance: float = 5e-3, budget: int = 64 * 2**20, with_slope: bool = False
+) -> BakedField:
+    """Return the coarsest lattice found that holds the moments of an object's outer surface to a tolerance.
+
+    The tolerance bounds the root mean square of the errors of S0, and of S1 as a vector, over full scale, at random points
+    within the radius of the surface, against a quadrature much finer than the field's. Kept in the user's cache folder.
+
+    Args:
+        geoms: The geoms of one variant of an object.
+        radius: Sensing radius [m].
+        tolerance: Largest error, in the sense above, as a fraction of full scale.
+        budget: Largest size of the values [bytes].
+        with_slope: Whether to add the derivatives with respect to the radius; no tolerance holds for them.
+
+    Raises:
+        BakeError: Nothing to bake, or the tolerance needs more than the budget.
+    """
+    if not (0 < radius < np.inf and 0 < tolerance < 1):
+        raise BakeError(
+            f"a field of moments needs a radius above 0 and a tolerance between 0 and 1, found {radius}, {tolerance}"
+        )
+    return cache.cached(
+        moments_key(geoms, b"field", radius, tolerance, budget, float(with_slope)),
+        lambda: _bake(geoms, radius, tolerance, budget, with_slope),
+        _packed,
+        _unpacked,
+    )
+
+
+def moments_key(geoms: Sequence[FeltGeom], what: bytes, *limits: float | int) -> str:
+    """Return the key of what is computed of some geoms."""
+    arrays = [np.array(limits, float)]
+    for felt in geoms:
+        arrays += [np.frombuffer(felt.shape.encode(), np.uint8), felt.geom.size, felt.geom.pos, felt.geom.rotation]
+        arrays += [] if felt.surface is None else [felt.surface.vertices, felt.surface.faces]
+    return cache.digest(FORMAT + what, arrays)
+
+
+def _packed(baked: BakedField) -> dict[str, np.ndarray]:
+    errors = np.array(dataclasses.astuple(baked.errors), float)
+    return {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell), "errors": errors}
+
+
+def _unpacked(found: Mapping[str, np.ndarray]) -> BakedField:
+    values = found["values"]
+    if values.dtype != np.float32 or values.ndim != 4 or not np.isfinite(values).all():
+        raise ValueError("a damaged field")
+    return BakedField(values, found["origin"], float(found["cell"]), FieldErrors(*found["errors"].tolist()))
+
+
+def _bake(geoms: Sequence[FeltGeom], radius: float, tolerance: float, budget: int, with_slope: bool) -> BakedField:
+    # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.
+    spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), 4, 24))
+    pieces, fine = outer_surface(geoms, spacing), outer_surface(geoms, spacing / FINER)
+    if not len(pieces.area):
+        raise BakeError("there is no surface to bake moments of: planes are exact")
+    coarse, exact = pieces.quadrature(spacing), fine.quadrature(spacing / FINER)
+    held_back = _around(fine, radius, REPORT_POINTS, seed=2), _around(fine, radius, CHOICE_POINTS, seed=1)
+    report, choice = ((pos, moment_sums(exact, pos, radius, 4, block=1)) for pos in held_back)
+    channels = 8 if with_slope else 4
+    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be.
+    cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
+    while True:
+        origin, num = _lattice(coarse.pos, radius, cell)
+        needed = 4 * channels * int(np.prod(num))
+        if needed > budget:
+            raise BakeError(
+                f"a field of moments of a tolerance of {tolerance:g} at a radius of {1e3 * radius:g} mm needs about"
+                f" {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is {budget / 2**20:.3g} MiB ({budget} bytes);"
+                " raise the tolerance or the budget, or sum over points"
+            )
+        values = _fitted(_node_sums(coarse, origin, num, cell, radius, channels)).astype(np.float32)
+        errors = _errors(values, origin, cell, *choice)
+        worst = max(errors.mass_rms, errors.first_rms) / (HEADROOM * tolerance)
+        if worst <= 1:
+            return BakedField(values, origin, cell, _errors(values, origin, cell, *report))
+        cell /= float(np.clip(np.sqrt(worst), 1.05, 2.5))
+
+
+def _around(pieces: Pieces, radius: float, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
+    """Return points of balls around uniformly random points of a surface [m]."""
+    rng = np.random.default_rng(seed)
+    way = rng.normal(size=(count, 3))
+    way *= radius * np.cbrt(rng.uniform(size=(count, 1))) / np.linalg.norm(way, axis=1, keepdims=True)
+    return pieces.random(count, seed).pos + way
+
+
+def _lattice(pos: Float[np.ndarray, "m 3"], radius: float, cell: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    """Return origin and numbers of nodes: two layers more than reach the surface, so that the outermost fit is zero too."""
+    low, high = pos.min(axis=0) - radius, pos.max(axis=0) + radius
+    x, y, z = (int(num) + 5 for num in np.ceil((high - low) / cell))
+    return (low + high) / 2 - cell * np.array([x - 1, y - 1, z - 1]) / 2, (x, y, z)
+
+
+def moment_sums(
+    surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float, channels: int, block: int
+) -> Float[np.ndarray, "n channel"]:
+    """Return S0 [m³] and S1 [m⁴] at points, and their derivatives with respect to the radius: sums over points of a surface.
+
+    Args:
+        surface: Points with their areas.
+        pos: Where; so many as make a block should be neighbours [m].
+        radius: Sensing radius [m].
+        channels: 4, or 8 with the derivatives.
+        block: How many are computed at once.
+    """
+    found = np.zeros((len(pos), channels))
+    for start in range(0, len(pos), block):
+        own = pos[start : start + block]
+        middle = (own.min(axis=0) + own.max(axis=0)) / 2
+        reach = radius + np.linalg.norm(own - middle, axis=1).max()
+        near = np.array(surface.tree.query_ball_point(middle, reach), dtype=np.int64)
+        if not len(near):
+            continue
+        # About the middle, so that squares of small distances keep their digits.
+        points, here = torch.from_numpy(surface.pos[near] - middle), torch.from_numpy(own - middle)
+        weight = torch.relu(radius - torch.cdist(here, points))
+        area = torch.from_numpy(surface.area[near])[:, None]
+        parts = torch.cat([area, area * points], dim=1).T.contiguous()
+        for first in range(0, channels, 4):
+            sums = torch.nn.functional.linear(weight if first == 0 else (weight > 0).double(), parts)
+            sums[:, 1:] -= sums[:, :1] * here
+            found[start : start + block, first : first + 4] = sums.numpy()
+    return found
+
+
+def _node_sums(
+    surface: Quadrature, origin: Float[np.ndarray, 3], num: tuple[int, int, int], cell: float, radius: float, channels: int
+) -> Float[np.ndarray, "x y z channel"]:
+    """Return moments at the nodes of a lattice, brick by brick."""
+    index = np.stack(np.unravel_index(np.arange(int(np.prod(num))), num), axis=1)
+    values = np.zeros((len(index), channels))
+    bricks = np.asarray(np.ravel_multi_index(tuple((index // BRICK).T), tuple(n // BRICK + 1 for n in num)))
+    order = np.argsort(bricks, kind="stable")
+    near = surface.tree.query(origin + cell * index[order], distance_upper_bound=radius)[0] < np.inf
+    order = order[near]
+    ends = 1 + np.flatnonzero(np.diff(bricks[order], append=-1))
+    for nodes in np.split(order, ends[:-1]) if len(order) else []:
+        values[nodes] = moment_sums(surface, origin + cell * index[nodes], radius, channels, len(nodes))
+    return values.reshape(*num, channels)
+
+
+def _fitted(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x y z channel"]:
+    """Return the node values whose linear interpolation has no mean error: f − h²/12 ∇²f."""
+    fitted = values.copy()
+    for axis in range(3):
+        along = np.moveaxis(values, axis, 0)
+        np.moveaxis(fitted, axis, 0)[1:-1] -= (along[2:] - 2 * along[1:-1] + along[:-2]) / 12
+    return fitted
+
+
+def _errors(
+    values: Float[np.ndarray, "x y z channel"],
+    origin: Float[np.ndarray, 3],
+    cell: float,
+    pos: Float[np.ndarray, "n 3"],
+    true: Float[np.ndarray, "n 4"],
+) -> FieldErrors:
+    x, y, z, channels = values.shape
+    place = split(torch.from_numpy(origin))
+    field = MomentField(
+        torch.from_numpy(values.reshape(-1, channels)), 0, (x, y, z), place, torch.tensor(cell, dtype=torch.float64)
+    )
+    mass, first = field_moments(split(torch.from_numpy(pos)), field)
+    mass_error = np.abs(mass.numpy() - true[:, 0]) / np.abs(true[:, 0]).max()
+    first_error = np.linalg.norm(torch.stack(first, dim=1).numpy() - true[:, 1:4], axis=1)
+    first_error /= np.linalg.norm(true[:, 1:4], axis=1).max()
+    rms = [float(np.sqrt(np.mean(error**2))) for error in (mass_error, first_error)]
+    return FieldErrors(rms[0], float(mass_error.max()), rms[1], float(first_error.max()))

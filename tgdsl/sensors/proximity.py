@@ -1,0 +1,158 @@
+"""Proximity taxel: force and torque from how much of the objects' surfaces is within a sensing ball, and how it moves.
+
+    S0 = ∫ (R − |p − q|)₊ dA [m³]      S1 = ∫ (R − |p − q|)₊ (p − q) dA [m⁴]      ρ = density / A [1/m²]
+    f = −k ρ S0 a + k_s ρ Σ_t                                                       [N]
+    τ = −k ρ S1 × a                    Σ = S0 v + ω × S1,   Σ_t = Σ − (Σ · a) a     [N·m]
+
+summed over the felt objects, in the frame of the taxel's link. q place of the taxel, R its radius, a its outward normal, p the
+points of an object's outer surface, A the area of all felt objects (planes, which have none, left out) or `reference_area`, v
+velocity of the object's material at q relative to the taxel [m/s], ω angular velocity of the object relative to the link
+[rad/s]: Σ is ∫ (R − |p − q|) (v + ω × (p − q)) dA. Force and torque act on the link: what is in front pushes it back, and slip
+drags it along; the torque is about the taxel, or about the link's origin: τ + x × f. Nothing is gated by contact.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "ProximityTaxel", with its parameters as defaults. Its sum over N sampled
+points with ρ = density / N is density ∫ … dA / A for many points; `backend: points` sums over sampled points as it does.
+
+Departures: the paper's normal part and its torque have the opposite sign, +k ρ S0 a and +k ρ S1 × a, which push the sensor
+towards the object; and its slip is of v + ω_object × (p − q), with the object's absolute angular velocity, so that a hand that
+turns together with an object feels slip. `model: paper` keeps both. As in the paper the slip force has no part in the torque
+about the taxel.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field, StrictInt
+from torch import Tensor
+
+from tgdsl.fields import Area, NonNegative, Positive, Quantity
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.reference import Touch
+from tgdsl.layout import Layout
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    Kind,
+    Lowered,
+    MomentsRequest,
+    ProbeSpec,
+    ReferenceState,
+    State,
+    SurfaceOf,
+    scalar,
+)
+
+
+class ProximitySpec(ProbeSpec):
+    """Force and torque of each taxel from the surfaces near it."""
+
+    kind: Literal["proximity"]
+    """Force [N] and torque [N·m] of each taxel from the surfaces near it."""
+    backend: Literal["field", "points"] = "field"
+    """`field`: interpolated from a field that is computed beforehand; `points`: a sum over sampled points (the paper). Planes
+    are exact in both."""
+    points: Annotated[StrictInt, Field(ge=1)] = 5000
+    """Points of each object, for `backend: points`."""
+    tolerance: Annotated[float, Quantity("number", gt=0.0), Field(lt=1.0)] = 0.005
+    """Root mean square error that a field may have, as a fraction of full scale [1]."""
+    max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
+    """Largest size of an object's fields, or of its lists of points [bytes]."""
+    outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
+    """What a reading holds; what is not listed is not computed."""
+    normal_stiffness: NonNegative = 300.0
+    """k, force per depth [N/m]."""
+    shear_damping: NonNegative = 10.0
+    """k_s, force per depth and velocity [N·s/m²]."""
+    density: Positive = 100.0
+    """Weight of all that is felt: what the points' weights add up to [1]."""
+    reference_area: Area | None = None
+    """A, area that the density is spread over [m²]; default: that of all felt objects but for planes."""
+    torque_about: Literal["taxel", "link"] = "taxel"
+    """What the torque is about: the taxel (the paper), or the link's origin."""
+    model: Literal["tgdsl", "paper"] = "tgdsl"
+    """`paper` keeps the paper's sign of the normal part, and its slip with the object's absolute angular velocity."""
+
+    @property
+    def normal_sign(self) -> float:
+        """Sign of the normal part."""
+        return 1.0 if self.model == "paper" else -1.0
+
+
+def reference(
+    spec: ProximitySpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6)."""
+    near = touch.moments
+    assert near is not None
+    area = near.area.sum() if spec.reference_area is None else spec.reference_area
+    rho, rows = spec.density / area, []
+    for t, (x, a) in enumerate(zip(layout.pos, layout.normal, strict=True)):
+        force, torque = np.zeros(3), np.zeros(3)
+        for k in range(near.mass.shape[1]):
+            s0, s1 = near.mass[t, k], near.first[t, k]
+            omega = near.angular[t, k] + (near.turn[t] if spec.model == "paper" else 0.0)
+            slip = s0 * near.velocity[t, k] + np.cross(omega, s1)
+            force += spec.normal_sign * spec.normal_stiffness * rho * s0 * a
+            force += spec.shear_damping * rho * (slip - (slip @ a) * a)
+            torque += spec.normal_sign * spec.normal_stiffness * rho * np.cross(s1, a)
+        torque += np.cross(x, force) if spec.torque_about == "link" else 0.0
+        rows.append(np.concatenate([{"force": force, "torque": torque}[n] for n in ("force", "torque") if n in spec.outputs]))
+    return np.stack(rows), {}
+
+
+def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
+    """Fold sign and density into the stiffness; leave out what no output needs."""
+    constants = {
+        "normal": layout.normal.T,
+        "stiffness": scalar(spec.normal_sign * spec.normal_stiffness * spec.density),
+        "damping": scalar(spec.shear_damping * spec.density),
+        "is_absolute": np.asarray(spec.model == "paper"),
+    }
+    if spec.reference_area is not None:
+        constants["area"] = scalar(spec.reference_area)
+    channels: list[Channel] = []
+    if "force" in spec.outputs:
+        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
+    if "torque" in spec.outputs:
+        channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
+        constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
+    needs = {"moments"}
+    if spec.shear_damping and ("force" in spec.outputs or "about_link" in constants):
+        needs.add("motion")
+    request = MomentsRequest(spec.backend, spec.points, spec.tolerance, spec.max_bytes, spec.reference_area is None)
+    return Lowered(tuple(channels), constants, needs=frozenset(needs), moments=request)
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the force planes [N] and the torque planes [N·m]; what is not asked for is not used."""
+    normal = planes.split(constants["normal"].T)
+    zero = torch.zeros_like(felt.depth)
+    mass, first, slip = zero, (zero, zero, zero), (zero, zero, zero)
+    for name, near in felt.moments.items():
+        mass, first = mass + near.mass, planes.add(first, near.first)
+        if name in felt.motions:
+            slip = planes.add(slip, _slip(felt, name, probes, constants["is_absolute"]))
+    area = constants["area"] if "area" in constants else sum(felt.area.values(), start=zero[:1, :1])
+    stiffness, damping = constants["stiffness"] / area, constants["damping"] / area
+    slip = planes.sub(slip, planes.scale(planes.dot(slip, normal), normal))
+    force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
+    torque = planes.scale(stiffness, planes.cross(first, normal))
+    if "about_link" in constants:
+        torque = planes.add(torque, planes.cross(probes.pos, force))
+    return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
+
+
+def _slip(felt: Felt, name: str, probes: Probes, is_absolute: Tensor) -> Vec:
+    """Return Σ of an object [m⁴/s]."""
+    near, motion = felt.moments[name], felt.motions[name]
+    velocity = planes.add(motion.linear, planes.cross(motion.angular, probes.pos))
+    omega = planes.add(motion.angular, planes.scale(is_absolute, motion.turn))
+    return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
+
+
+PROXIMITY = Kind(ProximitySpec, lower, forward, reference)
