@@ -3,10 +3,10 @@
     python benchmarks/elastomer.py forms [--device cuda] [--num-envs 4096] [--out docs]
     python benchmarks/elastomer.py curved
 
-`forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), in every form that such a pad
-can have: dense, fft, truncated svd, and dense with a clamped boundary. The error is that of the float32 form against the dense
-matrix in float64 (which the tests compare with the definition), over the largest displacement in the batch; of the clamped one,
-against its own float64. Times are medians of compiled calls, on a GPU of replayed CUDA graphs.
+`forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), in every form that such a
+pad can have: dense, fft, truncated svd, and dense with a clamped boundary. The error is that of the float32 form against the
+dense matrix in float64 (which the tests compare with the definition), over the largest displacement in the batch; of the
+clamped one, against its own float64. Times are medians of compiled calls, on a GPU of replayed CUDA graphs.
 
 `curved` compares the dense operator on the XHand1's and the Sharpa's fingertips with the operator of a regular grid in the mean
 plane of the same taxels, the one that a planar FFT computes: displacements in the links' frames, over the largest one.

@@ -15,7 +15,7 @@ from torch import Tensor
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch import BatchSimulation
 from tgdsl.runtime.dots import Dots, dots_of
-from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, draw_dots, scene_of
+from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -64,12 +64,20 @@ def drawing(
     columns = min(len(outputs), 4)
     rows = -(-len(outputs) // columns)
     width, height = (FINE * round(0.94 * size * DPI) for size in (PANEL[0], 0.82 * PANEL[1]))
-    lead = max(dots, key=lambda own: own.is_read.sum())
-    scene = scene_of(touch, sim, lead, env, width, height)
+    has_taxels = any(output.rows == "taxel" for output in outputs)
+    lead = outputs.index(chosen_output(touch, readings)) if has_taxels else 0
+    scene = scene_of(touch, sim, dots[lead], env, width, height)
     figure = Figure(figsize=(columns * PANEL[0], rows * PANEL[1] + 0.5), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
-        rows, columns, left=0.01, right=0.99, bottom=0.02, top=1 - 1.0 / figure.get_figheight(), wspace=0.06, hspace=0.24
+        rows,
+        columns,
+        left=0.01,
+        right=0.99,
+        bottom=0.2 / figure.get_figheight(),
+        top=1 - 1.0 / figure.get_figheight(),
+        wspace=0.06,
+        hspace=0.3,
     )
     for i, (output, own) in enumerate(zip(outputs, dots, strict=True)):
         axes = figure.add_subplot(grid[i])

@@ -75,7 +75,7 @@ def picture(
     Raises:
         ViewError: If there is no such reading or environment.
     """
-    output = _chosen(touch, readings, reading)
+    output = chosen_output(touch, readings, reading)
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = dots_of(touch, sim, output, readings[output.name], env)
@@ -97,7 +97,12 @@ def picture(
     return path
 
 
-def _chosen(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None) -> Output:
+def chosen_output(touch: TactileModule, readings: Mapping[str, Tensor], name: str | None = None) -> Output:
+    """Return the reading of taxels that a picture is of: the one named, or a kinematic taxel's, or else the first.
+
+    Raises:
+        ViewError: If there is none.
+    """
     known = {output.name: output for output in touch.outputs if output.name in readings and output.rows == "taxel"}
     if not known:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's taxels")
