@@ -16,12 +16,21 @@ class Constants(nn.Module):
         """Make a buffer of each array, floats in `dtype`."""
         super().__init__()
         self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+        self._counts = {name: tuple(array[0].tolist()) for name, array in arrays.items() if name.endswith("/num")}
         for name, exact in self._exact.items():
             self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the array of a path."""
         return self._buffers[name]  # type: ignore[return-value]
+
+    def __contains__(self, name: str) -> bool:
+        """Return whether there is an array of a path."""
+        return name in self._buffers
+
+    def counts(self, name: str) -> tuple[int, int, int]:
+        """Return the first row of a table of node counts, `<path>/num`, as numbers that become part of compiled code."""
+        return self._counts[name]
 
     def under(self, prefix: str, names: Sequence[str]) -> dict[str, Tensor]:
         """Return some of the arrays below a path, by their own names."""

@@ -345,8 +345,8 @@ class TactileModule(nn.Module):
         values = self.constants[f"objects/{target.name}/{i}/values"]
         first, num, origin, cell = (self._chosen(target, f"{i}/{part}", variant) for part in ("first", "num", "origin", "cell"))
         if variant is None:
-            x, y, z = self.plan.arrays[f"objects/{target.name}/{i}/num"][0].tolist()
-            return Grid(values, 0, (x, y, z), split(origin[:, None]), cell[:, None])
+            counts = self.constants.counts(f"objects/{target.name}/{i}/num")
+            return Grid(values, 0, counts, split(origin[:, None]), cell[:, None])
         return Grid(values, first[:, None], split(num[:, None]), split(origin[:, None]), cell[:, None])
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:

@@ -43,7 +43,7 @@ def moment_sources(
                 num_pairs=target.num_pairs,
                 pair=pair,
                 radius=reach,
-                surface=_surface(plan, constants, table, planned.backend, variant, radius_id, len(radii)),
+                surface=_surface(constants, table, planned.backend, variant, radius_id, len(radii)),
                 planes=tuple(Plane(rot(own.unbind()), vec(at.unbind())) for own, at in zip(rotations, places, strict=True)),
                 area=(area if variant is None else area[variant])[:, None],
             )
@@ -52,10 +52,10 @@ def moment_sources(
 
 
 def _surface(
-    plan: Plan, constants: Constants, table: str, backend: str, variant: Tensor | None, radius_id: Tensor, num_radii: int
+    constants: Constants, table: str, backend: str, variant: Tensor | None, radius_id: Tensor, num_radii: int
 ) -> MomentField | PointCloud | None:
     """Return the table that each probe asks: one for all, or by variant (env, 1), by radius (taxel,), or by both."""
-    if f"{table}/first" not in plan.arrays:
+    if f"{table}/first" not in constants:
         return None
     which = None if variant is None else variant[:, None]
     if backend == "field" and num_radii > 1:
@@ -63,8 +63,7 @@ def _surface(
     first, num, origin, cell = (constants[f"{table}/{name}"] for name in ("first", "num", "origin", "cell"))
     start: Count = 0
     if which is None:
-        x, y, z = plan.arrays[f"{table}/num"][0].tolist()
-        counts: tuple[Count, Count, Count] = (x, y, z)
+        counts: tuple[Count, Count, Count] = constants.counts(f"{table}/num")
         place, side = split(origin[0]), cell[0]
     else:
         start, counts, place, side = first[which], split(num[which]), split(origin[which]), cell[which]
