@@ -2,6 +2,7 @@
 
     python benchmarks/elastomer.py forms [--device cuda] [--num-envs 4096] [--out docs]
     python benchmarks/elastomer.py curved
+    python benchmarks/elastomer.py cycle [--out docs/images]
 
 `forms` presses random spheres into square pads of n × n markers (the paper's Gaussian, with shear), in every form that such a
 pad can have: dense, fft, truncated svd, and dense with a clamped boundary. The error is that of the float32 form against the
@@ -10,6 +11,9 @@ clamped one, against its own float64. Times are medians of compiled calls, on a 
 
 `curved` compares the dense operator on the XHand1's and the Sharpa's fingertips with the operator of a regular grid in the mean
 plane of the same taxels, the one that a planar FFT computes: displacements in the links' frames, over the largest one.
+
+`cycle` presses a ball of 20 mm radius 1 mm deep into 121 × 121 taxels, moves it to and fro, and prints the friction force that
+the anchors carry beside the closed forms of a Winkler foundation and of an elastic half-space (Cattaneo, Mindlin).
 """
 
 from __future__ import annotations
@@ -26,8 +30,10 @@ import tyro
 from module import median_ms
 from torch import Tensor
 
+from tgdsl.geometry.reference import Touch
 from tgdsl.geometry.surface import Surface
 from tgdsl.sensors.elastomer import blocks, operators
+from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance_reference
 from tgdsl.sensors.elastomer.kernels import Skin
 from tgdsl.sensors.elastomer.operators import Wish
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
@@ -163,7 +169,11 @@ def captured(call: Callable[[], Any], device: str) -> Callable[[], Any]:
     graph = torch.cuda.CUDAGraph()
     with torch.no_grad(), torch.cuda.graph(graph):
         call()
-    return graph.replay
+
+    def replay(_inputs: Callable[[], Any] = call) -> None:  # the graph reads their memory, so they must live as long
+        graph.replay()
+
+    return replay
 
 
 def plot(rows: list[tuple[int, str, float, float]], device: str, unit: str, path: Path) -> None:
@@ -248,7 +258,68 @@ def bumps(skin: Skin, num: int = 200) -> np.ndarray:
     return np.maximum(0.0, 1e-3 - apart**2 / (2 * 5e-3))
 
 
+@dataclass(frozen=True)
+class Cycle:
+    """The stick-slip loop of the anchors."""
+
+    out: Path | None = None
+    """Folder for the plot."""
+
+    def run(self) -> None:
+        """Move a ball in a pad and compare."""
+        radius, depth, slip = 0.02, 1e-3, 0.4
+        line = np.linspace(-7e-3, 7e-3, 121)
+        x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
+        pos, normal = np.stack([x, y, 0 * x], axis=1), np.broadcast_to([0.0, 0.0, 1.0], (x.size, 3))
+        h = depth - (x * x + y * y) / (2 * radius)
+        law, state = Law(0.0, 0.0, 1e-2, slip), {name: np.zeros(x.size) for name in PLANES}
+        way = np.concatenate([np.linspace(0, 0.8, 33), np.linspace(0.8, -0.8, 65)[1:], np.linspace(-0.8, 0.8, 65)[1:]])
+        found = []
+        for s in way * slip * depth:
+            moved = np.broadcast_to([-s, 0.0, 0.0], (x.size, 1, 3))
+            touch = Touch(
+                np.maximum(h, 0), 0 * pos, 0 * pos, 0 * pos, -h[:, None], 0 * pos[:, None],
+                np.broadcast_to(np.eye(3), (x.size, 1, 3, 3)), moved,
+            )  # fmt: skip
+            carried, state = advance_reference(touch, pos, normal, law, state)
+            found.append(carried[:, 0].sum() / (slip * np.maximum(h, 0).sum()))
+        closed = {name: loop(way, power) for name, power in {"Winkler": 2.0, "Mindlin": 1.5}.items()}
+        print("| s/s* | anchors Q/μP | Winkler 1 − (1 − s/s*)² | Cattaneo–Mindlin 1 − (1 − s/s*)^1.5 |\n|---|---|---|---|")
+        for i in (*range(0, 33, 8), 64, 96, 128, 160):
+            print(f"| {way[i]:.2f} | {found[i]:.3f} | {closed['Winkler'][i]:.3f} | {closed['Mindlin'][i]:.3f} |")
+        apart = {name: np.abs(np.array(found) - values).max() for name, values in closed.items()}
+        print(f"\nlargest difference: Winkler {apart['Winkler']:.4f}, Cattaneo–Mindlin {apart['Mindlin']:.4f}")
+        if self.out is not None:
+            plot_cycle(way, np.array(found), closed, self.out / "elastomer-cycle.png")
+
+
+def loop(way: np.ndarray, power: float) -> np.ndarray:
+    """Return Q/μP of a loading to 0.8 s*, back to −0.8 s* and forth: 1 − (1 − s)^n, then by Masing's rule."""
+
+    def first(s: np.ndarray | float) -> Any:
+        return 1 - (1 - np.asarray(s)) ** power
+
+    back, forth = first(0.8) - 2 * first((0.8 - way) / 2), -first(0.8) + 2 * first((0.8 + way) / 2)
+    return np.concatenate([first(way[:33]), back[33:97], forth[97:]])
+
+
+def plot_cycle(way: np.ndarray, found: np.ndarray, closed: dict[str, np.ndarray], path: Path) -> None:
+    """Draw the loops."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.2, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(way, closed["Mindlin"], color="#b5542c", label="elastic half-space (Cattaneo, Mindlin)")
+    axes.plot(way, closed["Winkler"], color="#3b6fb6", label="Winkler foundation")
+    axes.plot(way[::4], found[::4], "o", markersize=3.5, color="#2b2f36", label="anchors on 121 × 121 taxels")
+    axes.set(xlabel="displacement s/s*", ylabel="friction force Q/μP")
+    axes.grid(alpha=0.25)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
 Command = Annotated[Forms, tyro.conf.subcommand("forms")] | Annotated[Curved, tyro.conf.subcommand("curved")]
+Command = Command | Annotated[Cycle, tyro.conf.subcommand("cycle")]
 
 if __name__ == "__main__":
     start = time.perf_counter()
