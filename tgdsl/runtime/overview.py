@@ -74,7 +74,7 @@ def drawing(
         columns,
         left=0.01,
         right=0.99,
-        bottom=0.2 / figure.get_figheight(),
+        bottom=0.34 / figure.get_figheight(),
         top=1 - 1.0 / figure.get_figheight(),
         wspace=0.06,
         hspace=0.3,
