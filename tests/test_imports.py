@@ -9,7 +9,19 @@ PACKAGE = Path(__file__).parents[1] / "tgdsl"
 FLOORS = {
     5: {"cli", "robot_commands", "rl", "report"},
     4: {"compiler", "runtime"},
-    3: {"schema", "module", "buffers", "moment_sources", "taxels", "example", "state", "scene", "artifact", "explain"},
+    3: {
+        "schema",
+        "module",
+        "buffers",
+        "moment_sources",
+        "felt_objects",
+        "taxels",
+        "example",
+        "state",
+        "scene",
+        "artifact",
+        "explain",
+    },
     2: {"sensors", "observations", "layout", "plan"},
     1: {"geometry", "units", "fields", "regions", "errors"},
 }

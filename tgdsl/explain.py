@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.module import TactileModule
-from tgdsl.plan import PlannedObject, PlannedSensor
+from tgdsl.plan import PlannedObject, PlannedPoints, PlannedSensor
 
 
 class _OperationCounter(TorchDispatchMode):
@@ -80,6 +81,8 @@ def explain(touch: TactileModule) -> str:
             extra = " with " + " and ".join(answer.needs) if answer.needs else ""
             what = f"depth{extra}, {gate}" if answer.objects else " and ".join(answer.needs)
             lines.append(f"    {users}: {what}")
+            if answer.points is not None:
+                lines += [f"      {line}" for line in _points(touch, answer.points)]
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
@@ -90,6 +93,17 @@ def _felt(target: PlannedObject) -> str:
     variants = [f"{target.num_variants} variants"] if target.num_variants > 1 else []
     size = ["its size given per environment"] if target.is_sized else []
     return f"{target.name} ({', '.join([*target.shapes, *variants, *size])})"
+
+
+def _points(touch: TactileModule, points: PlannedPoints) -> list[str]:
+    """Return which links the points of each object are measured against."""
+    plan, lines = touch.plan, []
+    assert plan.skin is not None
+    for o, links in zip(points.objects, points.links, strict=True):
+        lines.append(
+            f"{points.num_points} points of {plan.objects[o].name} against {', '.join(plan.skin.links[i] for i in links)}"
+        )
+    return lines
 
 
 def _links(touch: TactileModule) -> list[str]:
@@ -103,7 +117,8 @@ def _links(touch: TactileModule) -> list[str]:
 
 def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
     taxels = touch.plan.queries[sensor.query].num_taxels
-    memory = f"remembers {', '.join(sensor.state)}" if sensor.state else "no state"
+    size = torch.finfo(touch.dtype).bits // 8 * sum(math.prod(memory.shape) for memory in sensor.state.values())
+    memory = f"remembers {', '.join(sensor.state)} ({size} bytes per environment)" if sensor.state else "no state"
     lines = [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))
@@ -113,21 +128,31 @@ def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
 
 def _grids(touch: TactileModule) -> list[str]:
     """Return what was measured of each baked grid."""
-    lines = []
-    for target in touch.plan.objects:
+    lines, plan = [], touch.plan
+    for target in plan.objects:
         for variant, row in enumerate(target.accuracy):
+            name = f"{target.name}, variant {variant}" if target.num_variants > 1 else target.name
             for i, accuracy in enumerate(row):
-                if accuracy:
-                    num = touch.plan.arrays[f"objects/{target.name}/{i}/num"][variant]
-                    which = f"variant {variant}, geom {i}" if target.num_variants > 1 else f"geom {i}"
-                    lines += [
-                        f"  {target.name}, {which}: {target.shapes[i]} grid of {' × '.join(map(str, num))} nodes every "
-                        f"{1e3 * accuracy['cell']:.3g} mm, {4 * int(num.prod())} bytes",
-                        f"    distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} "
-                        f"mm), largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges "
-                        f"{1e3 * accuracy['edge_max']:.3g} mm",
-                    ]
+                lines += _grid(touch, name, f"objects/{target.name}", target.shapes, variant, i, accuracy)
+    for variant, (link, row) in enumerate(zip(plan.skin.links, plan.skin.accuracy, strict=True) if plan.skin else ()):
+        for i, accuracy in enumerate(row):
+            lines += _grid(touch, f"link {link}", "links", plan.skin.shapes if plan.skin else (), variant, i, accuracy)
     return ["", "meshes", *lines] if lines else []
+
+
+def _grid(
+    touch: TactileModule, name: str, path: str, shapes: Sequence[str], variant: int, i: int, accuracy: Mapping[str, float]
+) -> list[str]:
+    if not accuracy:
+        return []
+    num = touch.plan.arrays[f"{path}/{i}/num"][variant]
+    return [
+        f"  {name}, geom {i}: {shapes[i]} grid of {' × '.join(map(str, num))} nodes every "
+        f"{1e3 * accuracy['cell']:.3g} mm, {4 * int(num.prod())} bytes",
+        f"    distance: 99 % within {1e3 * accuracy['p99']:.3g} mm (asked: {1e3 * accuracy['tolerance']:.3g} "
+        f"mm), largest error {1e3 * accuracy['max']:.3g} mm; near sharp edges "
+        f"{1e3 * accuracy['edge_max']:.3g} mm",
+    ]
 
 
 def _fields(touch: TactileModule) -> list[str]:

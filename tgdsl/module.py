@@ -21,14 +21,13 @@ from tgdsl import observations
 from tgdsl.buffers import Constants
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
-from tgdsl.geometry.bvh import TriangleMesh
+from tgdsl.felt_objects import FeltObjects
 from tgdsl.geometry.contacts import Contacts, contacts
-from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.nearby import with_moments
-from tgdsl.geometry.planes import split
-from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, RaycastSurface, feel, measure, relate
+from tgdsl.geometry.points import with_points
+from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, measure, relate
 from tgdsl.moment_sources import moment_sources
-from tgdsl.plan import Inputs, Plan, PlannedObject
+from tgdsl.plan import Inputs, Plan
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
@@ -78,13 +77,8 @@ class TactileModule(nn.Module):
                 hint = did_you_mean(sensor.kind, known, "kinds")
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
-        self._raycast = {
-            f"{target.name}/{i}": _raycast_surface(plan, target, i)
-            for target in plan.objects
-            for i, shape in enumerate(target.shapes)
-            if shape == "raycast"
-        }
-        unused = ("layout/", *(f"objects/{part}/" for part in self._raycast))
+        self._felt_objects = FeltObjects(plan)
+        unused = ("layout/", *self._felt_objects.kept)
         self.constants = Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
         self.memory = nn.Module()
         self._compiled_core: Callable[..., Any] | None = None
@@ -170,7 +164,7 @@ class TactileModule(nn.Module):
         """
         pairs = self._pairs(tensors)
         measured = sorted({o for query in self.plan.queries for o in query.objects})
-        objects = {o: self._object(self.plan.objects[o], tensors) for o in measured}
+        objects = {o: self._felt_objects.felt(self.plan.objects[o], self.constants, tensors) for o in measured}
         answers = [self._query(i, pairs, objects, tensors) for i in range(len(self.plan.queries))]
         readings: dict[str, Tensor] = {}
         updated: dict[str, Tensor] = {}
@@ -303,51 +297,15 @@ class TactileModule(nn.Module):
             if answer.moments is not None:
                 sources = moment_sources(self.plan, self.constants, f"queries/{i}/{a}/moments", answer.moments, tensors)
                 felt = with_moments(felt, own, probes, sources)
+            if answer.points is not None:
+                path = f"queries/{i}/{a}/points"
+                met = self._felt_objects.point_sources(path, answer.points, self.constants, tensors)
+                felt = with_points(felt, own, met)
             answers.append((felt, probes))
         return answers
 
     def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:
         return contacts(tensors, self.constants[f"queries/{i}/bodies"], self.constants[f"queries/{i}/{a}/contacts"], self.dtype)
-
-    def _object(self, target: PlannedObject, tensors: dict[str, Tensor]) -> FeltObject:
-        """Return an object as each environment has it."""
-        place = self.inputs.objects.index(target.name) if target.name in self.inputs.objects else None
-        variant = tensors["variant"][:, place].long() if target.num_variants > 1 else None
-
-        size, is_absent = self._chosen(target, "size", variant), None
-        if target.is_sized:
-            own = tensors["object_size"][:, place, None].to(size.dtype).expand(-1, size.shape[1], -1)
-            size = own if variant is None else torch.where(self._chosen(target, "is_absent", variant)[..., None] > 0, size, own)
-        if variant is not None:
-            is_absent = self._chosen(target, "is_absent", variant) > 0
-        return FeltObject(
-            name=target.name,
-            first_pair=target.first_pair,
-            num_pairs=target.num_pairs,
-            shapes=target.shapes,
-            is_centred=target.is_centred,
-            size=size,
-            pos=self._chosen(target, "pos", variant),
-            rotation=self._chosen(target, "rotation", variant),
-            is_absent=is_absent,
-            variant=variant,
-            surfaces=tuple(self._surface(target, i, variant) for i in range(len(target.shapes))),
-        )
-
-    def _chosen(self, target: PlannedObject, path: str, variant: Tensor | None) -> Tensor:
-        """Return an array of an object with one row per environment, or a single one if it is the same in all."""
-        table = self.constants[f"objects/{target.name}/{path}"]
-        return table if variant is None else table[variant]
-
-    def _surface(self, target: PlannedObject, i: int, variant: Tensor | None) -> Grid | RaycastSurface | None:
-        if target.shapes[i] not in METHODS:
-            return self._raycast.get(f"{target.name}/{i}")
-        values = self.constants[f"objects/{target.name}/{i}/values"]
-        first, num, origin, cell = (self._chosen(target, f"{i}/{part}", variant) for part in ("first", "num", "origin", "cell"))
-        if variant is None:
-            counts = self.constants.counts(f"objects/{target.name}/{i}/num")
-            return Grid(values, 0, counts, split(origin[:, None]), cell[:, None])
-        return Grid(values, first[:, None], split(num[:, None]), split(origin[:, None]), cell[:, None])
 
     def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
         """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""
@@ -370,19 +328,6 @@ class TactileModule(nn.Module):
                     buffer = torch.zeros_like(value, dtype=self.dtype, device=self.device)
                     self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def _raycast_surface(plan: Plan, target: PlannedObject, i: int) -> RaycastSurface:
-    path = f"objects/{target.name}/{i}"
-    meshes: dict[tuple[bytes, bytes], TriangleMesh] = {}
-    found = []
-    for variant in range(target.num_variants):
-        vertices, faces = plan.arrays[f"{path}/{variant}/vertices"], plan.arrays[f"{path}/{variant}/faces"]
-        key = vertices.tobytes(), faces.tobytes()
-        if key not in meshes:
-            meshes[key] = TriangleMesh(vertices, faces)
-        found.append(meshes[key])
-    return RaycastSurface(tuple(found), float(plan.arrays[f"{path}/max_distance"]))
 
 
 def _has_cpp_compiler() -> bool:

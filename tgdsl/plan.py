@@ -23,6 +23,9 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `objects/<name>/moments/<request>/values` | (node, 4) | its fields, float32, see `geometry.moments.MomentField` |
 | `objects/<name>/moments/<request>/{first,num,origin,cell}` | (table, …) | where each is, by variant and radius |
 | `objects/<name>/moments/<request>/{points,weight,lists}` | (3, row), (variant,), (bin, slot) | its points instead |
+| `objects/<name>/points/<number>/{points,area}` | (3, variant, point), (variant,) | its points, by their number |
+| `links/…` | (link, …) | the geoms of links that points may meet, as those of an object: a variant is a link |
+| `queries/<i>/<answer>/points/<object>/{pair,link}` | (link,) | who meets it, see `geometry.points` |
 | `sensors/<name>/<constant>` | | what the kind's `lower` folded |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
 """
@@ -42,7 +45,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 3
+FORMAT = 4
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -133,6 +136,40 @@ class PlannedMoments:
 
 
 @dataclass(frozen=True)
+class PlannedPoints:
+    """Points of objects that links may meet.
+
+    Attributes:
+        num_points: Points of each object.
+        objects: Indices of the objects.
+        links: For each object the links that may meet it: indices into `PlannedSkin.links`.
+        taxels: For each object and link the first of its taxels among the query's, and one beyond the last.
+    """
+
+    num_points: int
+    objects: tuple[int, ...]
+    links: tuple[tuple[int, ...], ...]
+    taxels: tuple[tuple[tuple[int, int], ...], ...]
+
+
+@dataclass(frozen=True)
+class PlannedSkin:
+    """The links' own surfaces that points are measured against: like an object that has a variant for each link.
+
+    Attributes:
+        links: Names of the links.
+        shapes: How the distance to each geom is found.
+        is_centred: Which of them share the bodies' frames.
+        accuracy: What was measured of each link's geoms: see `PlannedObject`.
+    """
+
+    links: tuple[str, ...]
+    shapes: tuple[str, ...]
+    is_centred: tuple[bool, ...]
+    accuracy: tuple[tuple[Mapping[str, float], ...], ...]
+
+
+@dataclass(frozen=True)
 class PlannedAnswer:
     """What some sensors feel of a query: which of its objects, whether they are gated, and what is wanted of them."""
 
@@ -140,6 +177,7 @@ class PlannedAnswer:
     is_gated: bool
     needs: tuple[str, ...]
     moments: PlannedMoments | None = None
+    points: PlannedPoints | None = None
 
 
 @dataclass(frozen=True)
@@ -283,6 +321,7 @@ class Plan:
         links: Links that carry taxels.
         groups: Links of each link group.
         objects: What taxels feel.
+        skin: The links' own surfaces, if points of objects are measured against them.
         queries: Geometry queries.
         sensors: Sensors, in the document's order.
         observations: Observation terms, in the document's order.
@@ -296,6 +335,7 @@ class Plan:
     links: tuple[Link, ...]
     groups: Mapping[str, tuple[str, ...]]
     objects: tuple[PlannedObject, ...]
+    skin: PlannedSkin | None
     queries: tuple[PlannedQuery, ...]
     sensors: tuple[PlannedSensor, ...]
     observations: tuple[PlannedObservation, ...]

@@ -27,7 +27,16 @@ from torch import Tensor
 
 from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.geometry.reference import ReferenceBody, ReferenceContacts, ReferenceGeom, ReferenceMoments, Touch, touch
+from tgdsl.geometry.reference import (
+    ReferenceBody,
+    ReferenceContacts,
+    ReferenceGeom,
+    ReferenceMoments,
+    ReferencePoints,
+    Touch,
+    distance_to,
+    touch,
+)
 from tgdsl.module import TactileModule
 from tgdsl.plan import SLOT_FIELDS, Plan, PlannedObject
 from tgdsl.schema.load import load
@@ -127,10 +136,41 @@ class ReferenceModule:
                 objects.append((self._body(state, env, target.body, shift), geoms) if is_felt else None)
             body = self._body(state, env, link.body, np.zeros(3))
             parts.append(touch(body, self.layout.pos[own], self.radius[own], objects))
-        names = [name for name in Touch.__dataclass_fields__ if name not in ("contacts", "moments")]
+        names = [name for name in Touch.__dataclass_fields__ if name not in ("contacts", "moments", "points")]
         contacts = self._contacts(state, env) if "contacts" in answer.needs else None
         joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return Touch(**joined, contacts=contacts, moments=self._moments(state, env, shift))
+        points = self._points(state, env, shift)
+        return Touch(**joined, contacts=contacts, moments=self._moments(state, env, shift), points=points)
+
+    def _points(self, state: SceneState, env: int, shift: np.ndarray) -> tuple[ReferencePoints, ...]:
+        """Return the points of objects where they may meet links, by way of the world frame and one at a time."""
+        planned, skin = self.plan.queries[self.sensor.query].answers[self.sensor.answer].points, self.plan.skin
+        if planned is None or skin is None:
+            return ()
+        own = {link.name: (i, link.body) for i, link in enumerate(self.layout.links)}
+        found = []
+        for o, links in zip(planned.objects, planned.links, strict=True):
+            target = self.plan.objects[o]
+            body, variant = self._body(state, env, target.body, shift), self._variant(target, state, env)
+            table = f"objects/{target.name}/points/{planned.num_points}"
+            world = self.plan.arrays[f"{table}/points"][:, variant].T @ body.rotation.T + body.pos
+            area = float(self.plan.arrays[f"{table}/area"][variant])
+            for row in links:
+                i, name = own[skin.links[row]]
+                link, geoms = self._body(state, env, name, np.zeros(3)), self._placed("links", skin.shapes, row)
+                pos = (world - link.pos) @ link.rotation
+                phi, gradient = (np.array(part) for part in zip(*(distance_to(geoms, z) for z in pos), strict=True))
+                if not self._is_felt(state, env, name, target.name):
+                    phi = np.full(len(pos), np.inf)
+                found.append(ReferencePoints(np.flatnonzero(self.layout.link_id == i), pos, phi, gradient, area))
+        return tuple(found)
+
+    def _is_felt(self, state: SceneState, env: int, link: str, target: str) -> bool:
+        """Return whether the gate of a pair is open."""
+        if not self.plan.queries[self.sensor.query].answers[self.sensor.answer].is_gated:
+            return True
+        pairs = [(pair.link, pair.object) for pair in self.plan.inputs.pairs]
+        return state.contact_found is not None and bool(state.contact_found[env, pairs.index((link, target))] > 0)
 
     def _moments(self, state: SceneState, env: int, shift: np.ndarray) -> ReferenceMoments | None:
         """Return the moments of the objects that the sensor feels, in the world frame, from the plan's own tables."""
@@ -141,9 +181,7 @@ class ReferenceModule:
         mass, (first, velocity, angular) = np.zeros((layout.num_taxels, num)), np.zeros((3, layout.num_taxels, num, 3))
         turn, area = np.zeros((layout.num_taxels, 3)), np.zeros(num)
         for k, target in enumerate(self.plan.objects[o] for o in planned.objects):
-            variant = 0
-            if target.num_variants > 1 and state.variant is not None:
-                variant = int(state.variant[env, self.plan.inputs.objects.index(target.name)])
+            variant = self._variant(target, state, env)
             table = self.tables.setdefault(
                 (k, variant), MomentTable(self.plan, target.name, planned.request, variant, planned.radii[k])
             )
@@ -184,16 +222,23 @@ class ReferenceModule:
         )
         return ReferenceBody(pos + shift, quat, linvel, angvel)
 
+    def _variant(self, target: PlannedObject, state: SceneState, env: int) -> int:
+        if target.num_variants == 1 or state.variant is None:
+            return 0
+        return int(state.variant[env, self.plan.inputs.objects.index(target.name)])
+
     def _geoms(self, target: PlannedObject, state: SceneState, env: int) -> list[ReferenceGeom]:
-        variant, place = 0, self.plan.inputs.objects.index(target.name) if target.name in self.plan.inputs.objects else -1
-        if target.num_variants > 1 and state.variant is not None:
-            variant = int(state.variant[env, place])
-        size, pos, rotation = (self.plan.arrays[f"objects/{target.name}/{p}"][variant] for p in ("size", "pos", "rotation"))
+        geoms = self._placed(f"objects/{target.name}", target.shapes, self._variant(target, state, env))
         if target.is_sized and state.object_size is not None:
-            size = state.object_size[env, place].double().numpy()[None].repeat(len(size), axis=0)
-        absent = self.plan.arrays.get(f"objects/{target.name}/is_absent", np.zeros((variant + 1, len(size))))[variant]
+            size = state.object_size[env, self.plan.inputs.objects.index(target.name)].double().numpy()
+            geoms = [dataclasses.replace(geom, size=size) for geom in geoms]
+        return geoms
+
+    def _placed(self, path: str, shapes: tuple[str, ...], variant: int) -> list[ReferenceGeom]:
+        size, pos, rotation = (self.plan.arrays[f"{path}/{key}"][variant] for key in ("size", "pos", "rotation"))
+        absent = self.plan.arrays.get(f"{path}/is_absent", np.zeros((variant + 1, len(size))))[variant]
         present = [g for g in range(len(size)) if not absent[g]]
-        return [ReferenceGeom(target.shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
+        return [ReferenceGeom(shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
 class MomentTable:

@@ -21,7 +21,7 @@ class TestElastomer(KindConformance):
 
 class TestElastomerAsInThePaper(KindConformance):
     kind = ELASTOMER
-    parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4}
+    parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
 
 
 class TestHalfSpace(KindConformance):

@@ -61,7 +61,7 @@ class Skin:
             )
             for k in range(phi.shape[1])
         }
-        return Felt(plane(depth), None, None, None, distances, frames, None)
+        return Felt(plane(depth), None, None, None, distances, frames, None, {}, {}, {}, {})
 
 
 HERE = ([0.0, 0, 0], [0.0, 0, 0])
@@ -214,7 +214,7 @@ def test_gradients_are_finite_at_every_corner(dtype):
     along = torch.tensor([[0.0, 0.0, 0.0, 1e-3, 5e-4]], dtype=dtype, requires_grad=True)
     zero, one = torch.zeros(1, num, dtype=dtype), torch.ones(1, num, dtype=dtype)
     frame = Frame((one, zero, zero, zero, one, zero, zero, zero, one), (-along, zero, zero))
-    felt = Felt(depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame}, None)
+    felt = Felt(depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame}, None, {}, {}, {}, {})
     state = dict.fromkeys(PLANES[:3], zero) | {"object": torch.tensor([[0.0, 1, 1, 1, 1]], dtype=dtype)}
     flat = (zero[0], zero[0], zero[0])
     slip = torch.tensor(0.5, dtype=dtype, requires_grad=True)

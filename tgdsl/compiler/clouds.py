@@ -1,4 +1,4 @@
-"""Points sampled on an object's outer surface, with lists of those within reach: see `geometry.moments.PointCloud`.
+"""Points sampled on an object's outer surface, plain, or with lists of those within reach (`geometry.moments.PointCloud`).
 
 Shapes: `n` points, `bin` cubes of a lattice, `slot` places of a list.
 """
@@ -15,12 +15,15 @@ from scipy.spatial import KDTree
 
 from tgdsl.compiler import cache
 from tgdsl.compiler.felt import FeltGeom
-from tgdsl.compiler.moments import moments_key
+from tgdsl.compiler.moments import AREA_RADIUS, moments_key
 from tgdsl.compiler.quadrature import outer_surface
 from tgdsl.errors import BakeError
 
 SLACK = 1e-6
 """By how much lists reach farther than the radius, for the rounding of a float32 [m]."""
+
+FINENESS = 200
+"""Pieces along a large object that points are drawn from: no more, so that their number stays bounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,36 @@ class Cloud:
     num: tuple[int, int, int]
     origin: Float[np.ndarray, " 3"]
     cell: float
+
+
+def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """Return points drawn alike from all of an object's outer surface [m], always the same ones, and its whole area [m²].
+
+    Kept in the user's cache folder.
+
+    Args:
+        geoms: The geoms of one variant of an object, none of them a plane.
+        count: Number of points.
+
+    Raises:
+        BakeError: A mesh has no face with an area.
+    """
+
+    def make() -> tuple[np.ndarray, float]:
+        pieces = outer_surface(geoms, max(AREA_RADIUS, max(map(_extent, geoms)) / FINENESS))
+        return pieces.random(count, seed=0).pos, float(pieces.area.sum())
+
+    return cache.cached(
+        moments_key(geoms, b"points", AREA_RADIUS, FINENESS, count),
+        make,
+        lambda sampled: {"pos": sampled[0], "area": np.asarray(sampled[1])},
+        lambda found: (found["pos"], float(found["area"])),
+    )
+
+
+def _extent(felt: FeltGeom) -> float:
+    """Return about how long a geom is [m]."""
+    return float(np.ptp(felt.surface.vertices, axis=0).max() if felt.surface is not None else 2 * felt.geom.size.max())
 
 
 def sample_cloud(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int = 64 * 2**20) -> Cloud:

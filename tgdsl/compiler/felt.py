@@ -135,7 +135,7 @@ def settle(felt: FeltGeom, target: ObjectSpec, margin: float, name: str) -> Sett
         felt: The geom.
         target: What the document says of the object.
         margin: Largest distance from the surface that any sensor asks for [m].
-        name: The object's name, for warnings.
+        name: What warnings call the object or link: "object cube".
 
     Raises:
         BakeError: If no grid within the object's budget holds its tolerance.
@@ -148,7 +148,7 @@ def settle(felt: FeltGeom, target: ObjectSpec, margin: float, name: str) -> Sett
         return Settled("raycast", arrays, {})
     baked = bake(felt.surface, margin, target.tolerance, target.max_bytes)
     if not baked.is_watertight:
-        what = f"object {name}: {felt.geom.shown} is not closed; what is inside is decided by its winding number"
+        what = f"{name}: {felt.geom.shown} is not closed; what is inside is decided by its winding number"
         warnings.warn(what, stacklevel=2)
     arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
     accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
@@ -166,7 +166,7 @@ def _warn_of_hull(felt: FeltGeom, margin: float, name: str) -> None:
     depth = float(np.sqrt(np.max(squared)))
     if depth > margin:
         warnings.warn(
-            f"object {name}: MuJoCo collides the convex hull of {felt.geom.shown}, up to {1e3 * depth:.1f} mm off the mesh, "
+            f"{name}: MuJoCo collides the convex hull of {felt.geom.shown}, up to {1e3 * depth:.1f} mm off the mesh, "
             "and that hull is felt; `surface` names what to feel instead",
             stacklevel=2,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -10,11 +11,14 @@ from tgdsl import observations
 from tgdsl.compiler import passes
 from tgdsl.compiler.felt import settle
 from tgdsl.compiler.moment_tables import moment_tables
-from tgdsl.compiler.passes import Draft, DraftSensor
+from tgdsl.compiler.passes import Draft, DraftQuery, DraftSensor
+from tgdsl.compiler.point_tables import cloud, own_geoms, planned_skin
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import BakeError, LowerError, did_you_mean
+from tgdsl.layout import Link
 from tgdsl.plan import Origin, Plan, PlannedMemory, PlannedObservation, PlannedReading, PlannedSensor, SceneFile
 from tgdsl.schema.load import Loaded
+from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel
@@ -53,11 +57,12 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
     _settle(loaded, work)
     _settle_moments(loaded, work)
+    _settle_points(loaded, resolved, work)
     loaded.raise_problems()
     queries, answer_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
-    sensors = tuple(_sensor(work, part, answer_of[part.name], arrays) for part in work.sensors)
+    sensors = tuple(_sensor(work, part, queries, answer_of[part.name], arrays) for part in work.sensors)
     terms = _observations(loaded, resolved, work, sensors, arrays)
     loaded.raise_problems()
     return Plan(
@@ -66,6 +71,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         links=work.layout.links,
         groups=work.layout.groups,
         objects=objects,
+        skin=planned_skin(work.skins),
         queries=tuple(query.planned for query in queries),
         sensors=sensors,
         observations=terms,
@@ -83,7 +89,9 @@ def _settle(loaded: Loaded, work: Draft) -> None:
         if margin is None:
             continue
         try:
-            work.settled[name] = tuple(tuple(settle(geom, target, margin, name) for geom in geoms) for geoms in felt.variants)
+            work.settled[name] = tuple(
+                tuple(settle(geom, target, margin, f"object {name}") for geom in geoms) for geoms in felt.variants
+            )
         except BakeError as error:
             loaded.problems.append(loaded.problem(("objects", name), str(error)))
 
@@ -109,7 +117,46 @@ def _settle_moments(loaded: Loaded, work: Draft) -> None:
             loaded.problems.append(loaded.problem(path, what, "give `reference_area`, or feel an object that is no plane"))
 
 
-def _sensor(work: Draft, part: DraftSensor, place: tuple[int, int], arrays: dict[str, np.ndarray]) -> PlannedSensor:
+def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft) -> None:
+    """Sample objects, and decide how distances to the links that they meet are found; what has no surface is a mistake."""
+    for sensor in (sensor for sensor in work.sensors if sensor.lowered.points is not None):
+        request, path = sensor.lowered.points, ("sensors", sensor.name)
+        assert request is not None
+        for i, name in enumerate(sensor.feels):
+            try:
+                if (request.num_points, name) not in work.clouds:
+                    work.clouds[request.num_points, name] = cloud(work.objects[name], request.num_points)
+            except LowerError as error:
+                loaded.problems.append(loaded.problem((*path, "feels", i), error.what, error.hint))
+        for link in work.layout.take(sensor.taxels).links:
+            if link.name in work.skins:
+                continue
+            margin = _skin_margin(work, link)
+            geoms = own_geoms(resolved, link.name)
+            try:
+                settled = tuple(settle(geom, ObjectSpec(body=link.body), margin, f"link {link.name}") for geom in geoms)
+                work.skins[link.name] = geoms, settled
+            except BakeError as error:
+                what = f'link "{link.name}": {error}'
+                loaded.problems.append(loaded.problem((*path, "links"), what, "or use `anchors: taxels`"))
+
+
+def _skin_margin(work: Draft, link: Link) -> float:
+    """Return the largest distance from a link's own surface that any sensor on it asks for [m].
+
+    Where sensors tell nothing apart outside the surface, the probes' radii say how deep points come.
+    """
+    found = []
+    for sensor in work.sensors:
+        own = work.layout.take(sensor.taxels)
+        if sensor.lowered.points is not None and link in own.links:
+            found += [sensor.lowered.points.range, float(own.radius.max())]
+    return max(found)
+
+
+def _sensor(
+    work: Draft, part: DraftSensor, queries: Sequence[DraftQuery], place: tuple[int, int], arrays: dict[str, np.ndarray]
+) -> PlannedSensor:
     lowered, num_taxels = part.lowered, len(part.taxels)
     for name, value in lowered.constants.items():
         arrays[f"sensors/{part.name}/{name}"] = value
@@ -118,10 +165,15 @@ def _sensor(work: Draft, part: DraftSensor, place: tuple[int, int], arrays: dict
     def reading(name: str, kind: Literal["taxel", "body"], channels: tuple[Channel, ...]) -> PlannedReading:
         return PlannedReading(name, kind, rows[kind], tuple(c.name for c in channels), tuple(c.unit for c in channels))
 
-    own = [reading(name, lowered.rows, lowered.channels) for name in part.readings]
+    readings = [reading(name, lowered.rows, lowered.channels) for name in part.readings]
     reports = [reading(f"{part.name}/{key}", "body", channels) for key, channels in lowered.reports.items()]
-    memory = {n: PlannedMemory(m.rest, (num_taxels,) if m.shape is None else m.shape) for n, m in lowered.state.items()}
-    return PlannedSensor(part.name, part.kind, *place, tuple(sorted(lowered.constants)), memory, (*own, *reports))
+    points = queries[place[0]].planned.answers[place[1]].points
+    num_points = 0 if points is None else points.num_points * sum(map(len, points.links))
+    shapes = {None: (num_taxels,), "points": (num_points,)}
+    memory = {
+        n: PlannedMemory(m.rest, m.shape if isinstance(m.shape, tuple) else shapes[m.shape]) for n, m in lowered.state.items()
+    }
+    return PlannedSensor(part.name, part.kind, *place, tuple(sorted(lowered.constants)), memory, (*readings, *reports))
 
 
 def _observations(

@@ -7,18 +7,19 @@ writes the index tables.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltBody, FeltGeom, Settled
+from tgdsl.compiler.felt import FeltBody, Settled
+from tgdsl.compiler.geom_tables import accuracy, geom_tables, is_centred, placed_geoms
 from tgdsl.compiler.moment_tables import MomentTables, pack_moments
+from tgdsl.compiler.point_tables import Skin, pack_points, skin_rows
 from tgdsl.compiler.robot import Model
-from tgdsl.compiler.variants import aligned
 from tgdsl.layout import Layout
 from tgdsl.plan import SLOT_FIELDS, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
-from tgdsl.sensors.base import Lowered, MomentsRequest
+from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,8 @@ class Draft:
         pairs: The (link body, object) pairs that are needed, sorted by object and link; set by `prune`.
         gated: Those of them whose contacts are needed.
         moments: The moments of each object, for each way in which some sensor wants them found; set like `settled`.
+        clouds: The points of each object, by their number; set like `settled`, as the next.
+        skins: The own geoms of each link that points may meet, by its name.
     """
 
     layout: Layout
@@ -60,6 +63,8 @@ class Draft:
     pairs: list[Pair] = field(default_factory=list)
     gated: list[Pair] = field(default_factory=list)
     moments: dict[tuple[MomentsRequest, str], MomentTables] = field(default_factory=dict)
+    clouds: dict[tuple[int, str], dict[str, np.ndarray]] = field(default_factory=dict)
+    skins: dict[str, Skin] = field(default_factory=dict)
 
     def bodies_of(self, taxels: np.ndarray) -> list[str]:
         """Return the body of each taxel."""
@@ -75,6 +80,7 @@ class DraftAnswer:
         is_gated: Whether they are felt only in contact.
         radius: How far from each taxel [m]; −∞ for inactive ones.
         request: How moments are found, if they are.
+        points: Which points of objects are wanted, if any.
         needs: What else they need.
     """
 
@@ -82,6 +88,7 @@ class DraftAnswer:
     is_gated: bool
     radius: np.ndarray
     request: MomentsRequest | None = None
+    points: PointsRequest | None = None
     needs: set[str] = field(default_factory=set)
 
 
@@ -131,14 +138,15 @@ def _order(pair: Pair) -> tuple[str, str]:
 def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
     """Return the distinct queries, and which of them, and which answer of it, each sensor uses."""
     queries: dict[bytes, DraftQuery] = {}
-    answers: dict[tuple[bytes, tuple[str, ...], bool, bytes, MomentsRequest | None], DraftAnswer] = {}
+    answers: dict[tuple[Hashable, ...], DraftAnswer] = {}
     answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
-        probes, radius, request = sensor.taxels.tobytes(), reach_of(work, sensor), sensor.lowered.moments
+        probes, radius = sensor.taxels.tobytes(), reach_of(work, sensor)
+        wanted = sensor.lowered.moments, sensor.lowered.points
         query = queries.setdefault(probes, DraftQuery(sensor.taxels))
-        key = probes, sensor.feels, sensor.is_gated, radius.tobytes(), request
+        key = probes, sensor.feels, sensor.is_gated, radius.tobytes(), *wanted
         if key not in answers:
-            answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius, request)
+            answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius, *wanted)
             query.answers.append(answers[key])
         answers[key].needs.update(sensor.lowered.needs)
         answer_of[sensor.name] = list(queries).index(probes), query.answers.index(answers[key])
@@ -175,47 +183,12 @@ def fold(work: Draft) -> dict[str, np.ndarray]:
     for name in work.objects:
         if name not in work.settled:
             continue  # nobody measures the distance to it
-        _, rows = _geoms(work, name)
-        for key, absent in (("size", np.ones(3)), ("pos", np.zeros(3)), ("rotation", np.eye(3))):
-            felt = [[absent if part is None else getattr(part[0].geom, key) for part in row] for row in rows]
-            arrays[f"objects/{name}/{key}"] = np.array(felt).reshape(len(rows), len(rows[0]), -1)
-        if len(rows) > 1:
-            arrays[f"objects/{name}/is_absent"] = np.array([[part is None for part in row] for row in rows])
-        for i, column in enumerate(zip(*rows, strict=True)):
-            arrays |= {f"objects/{name}/{i}/{key}": value for key, value in _surfaces(column).items()}
+        arrays |= geom_tables(f"objects/{name}", placed_geoms(work.objects[name].variants, work.settled[name])[1])
+    if work.skins:
+        arrays |= geom_tables("links", skin_rows(work.skins)[1])
+    for (num, name), cloud in work.clouds.items():
+        arrays |= {f"objects/{name}/points/{num}/{key}": value for key, value in cloud.items()}
     return arrays
-
-
-Placed = tuple[FeltGeom, Settled]
-
-
-def _geoms(work: Draft, name: str) -> tuple[tuple[str, ...], list[list[Placed | None]]]:
-    """Return how the distance to each geom of an object is found, and the geoms that its variants have there."""
-    settled = work.settled[name]
-    shapes, tables = aligned([[part.shape for part in variant] for variant in settled])
-    parts = [list(zip(*pair, strict=True)) for pair in zip(work.objects[name].variants, settled, strict=True)]
-    return shapes, [[None if i is None else own[i] for i in table] for own, table in zip(parts, tables, strict=True)]
-
-
-def _surfaces(column: Sequence[Placed | None]) -> dict[str, np.ndarray]:
-    """Return the arrays of a geom's grids or triangles, variant after variant; one that lacks it has another's."""
-    like = next(part[1].arrays for part in column if part is not None)
-    owned = [like if part is None else part[1].arrays for part in column]
-    if "vertices" in like:
-        triangles = {f"{v}/{key}": own[key] for v, own in enumerate(owned) for key in ("vertices", "faces")}
-        return {**triangles, "max_distance": like["max_distance"]}
-    if "values" not in like:
-        return {}
-    distinct = list({id(own): own for own in owned}.values())
-    place = [next(i for i, own in enumerate(distinct) if own is found) for found in owned]
-    starts = np.cumsum([0, *(own["values"].size for own in distinct)])
-    return {
-        "values": np.concatenate([own["values"].reshape(-1) for own in distinct]),
-        "first": starts[place],
-        "num": np.array([own["values"].shape for own in owned]),
-        "origin": np.array([own["origin"] for own in owned]),
-        "cell": np.array([own["cell"] for own in owned]),
-    }
 
 
 def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarray]) -> tuple[tuple[PlannedObject, ...], Inputs]:
@@ -258,16 +231,18 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
 
 def _object(work: Draft, name: str) -> PlannedObject:
     num_variants = len(work.objects[name].variants)
-    shapes, rows = _geoms(work, name) if name in work.settled else ((), [[]] * num_variants)
+    shapes, rows = (), [[]] * num_variants
+    if name in work.settled:
+        shapes, rows = placed_geoms(work.objects[name].variants, work.settled[name])
     own = [i for i, pair in enumerate(work.pairs) if pair.object == name]
     return PlannedObject(
         name=name,
         body=work.objects[name].body,
         shapes=shapes,
-        is_centred=tuple(all(part is None or part[0].geom.is_centred for part in column) for column in zip(*rows, strict=True)),
+        is_centred=is_centred(rows),
         first_pair=own[0],
         num_pairs=len(own),
-        accuracy=tuple(tuple({} if part is None else dict(part[1].accuracy) for part in row) for row in rows),
+        accuracy=accuracy(rows),
         is_sized=work.objects[name].is_sized,
     )
 
@@ -276,9 +251,9 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
     measuring = [answer for answer in query.answers if _is_measuring(answer.radius, answer.needs)]
     felt = [name for name in dict.fromkeys(name for answer in measuring for name in answer.objects) if name in names]
     bodies = work.bodies_of(query.taxels)
-    own = {name: [pair for pair in work.pairs if pair.object == name] for name in felt}
+    of_object = {name: [pair for pair in work.pairs if pair.object == name] for name in felt}
     pairs = {name: [Pair(body, name) for body in bodies] for name in felt}
-    index = [[own[name].index(pair) if pair in own[name] else 0 for pair in pairs[name]] for name in felt]
+    index = [[of_object[name].index(pair) if pair in of_object[name] else 0 for pair in pairs[name]] for name in felt]
     arrays[f"queries/{i}/taxels"] = query.taxels
     arrays[f"queries/{i}/pos"] = work.layout.pos[query.taxels].T
     arrays[f"queries/{i}/pair"] = np.array(index, dtype=np.int64).reshape(len(felt), len(bodies))
@@ -297,6 +272,10 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
         if answer.request is not None:
             path, request = f"queries/{i}/{a}/moments", answer.request
             moments = pack_moments(request, reachable, answer.radius, bodies, work.pairs, names, work.moments, path, arrays)
+        points = None
+        if answer.points is not None:
+            path, layout = f"queries/{i}/{a}/points", work.layout.take(query.taxels)
+            points = pack_points(answer.points, reachable, layout, work.pairs, allowed, names, list(work.skins), path, arrays)
         chosen_ids = tuple(felt.index(name) for name in chosen)
-        answers.append(PlannedAnswer(chosen_ids, answer.is_gated, tuple(sorted(answer.needs)), moments))
+        answers.append(PlannedAnswer(chosen_ids, answer.is_gated, tuple(sorted(answer.needs)), moments, points))
     query.planned = PlannedQuery(tuple(names.index(name) for name in felt), len(bodies), tuple(answers))

@@ -145,6 +145,24 @@ class Frame(NamedTuple):
     offset: Vec
 
 
+class MetPoints(NamedTuple):
+    """Points sampled on one object, as the links that they may meet see them; planes (env, link, point), in each link's frame.
+
+    Attributes:
+        taxels: First of each link's taxels, and one beyond the last.
+        pos: Where they are now [m].
+        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed.
+        gradient: Its unit gradient.
+        area: Surface of the object that each stands for [m²], (case, 1).
+    """
+
+    taxels: tuple[tuple[int, int], ...]
+    pos: Vec
+    distance: Tensor
+    gradient: Vec
+    area: Tensor
+
+
 class Felt(NamedTuple):
     """The answer, at the geom that each probe is deepest in; planes of shape (env, taxel), in the link's frame.
 
@@ -159,6 +177,7 @@ class Felt(NamedTuple):
         moments: Moments of each object's surface, by its name, see `moments`; empty if not wanted, as the next two.
         motions: Motion of each object relative to the link; only with moments.
         area: Area of each object's outer surface, planes left out [m²], (case, 1).
+        points: Points of each object that some link may meet, by its name, see `points`; empty if not wanted.
     """
 
     depth: Tensor
@@ -171,6 +190,7 @@ class Felt(NamedTuple):
     moments: dict[str, Moments]
     motions: dict[str, Motion]
     area: dict[str, Tensor]
+    points: dict[str, MetPoints]
 
 
 def relate(
@@ -244,7 +264,7 @@ def feel(
         probes: The probes.
         near: The objects that are felt, the first of equals first.
         reach: Radius of each probe towards each of them [m]; −∞ where the probe is inactive or the pair cannot meet.
-        needs: Which optional parts of the answer are wanted: "normal", "motion", "distance", "frame".
+        needs: Which optional parts of the answer are wanted here: "normal", "motion", "distance", "frame".
         contacts: Handed through.
 
     Returns:
@@ -285,18 +305,40 @@ def feel(
         moments={},
         motions={},
         area={},
+        points={},
     )
 
 
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
     """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
-    least, outward = None, None
+    frames = []
     for g in range(len(target.shapes)):
         rotation, offset = _link_in_geom(pairs, own, target, g)
-        rotation = planes.rot(part[:, pair] for part in rotation)
-        offset = planes.vec(part[:, pair] for part in offset)
-        distance, gradient = _to_geom(planes.add(planes.rotate(rotation, probes.pos), offset), target, g)
-        gradient = planes.rotate_back(rotation, gradient)
+        frames.append(Frame(planes.rot(part[:, pair] for part in rotation), planes.vec(part[:, pair] for part in offset)))
+    return _union(probes.pos, frames, target)
+
+
+def body_distance(point: Vec, target: FeltObject) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points in a body's own frame to the union of its geoms, and its gradient there."""
+    frames = []
+    for g, is_centred in enumerate(target.is_centred):
+        turn = planes.rot(target.rotation[:, g, None].unbind(-1))
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = turn
+        offset = planes.vec(-part for part in planes.rotate_back(turn, planes.split(target.pos[:, g, None])))
+        frames.append(None if is_centred else Frame((xx, yx, zx, xy, yy, zy, xz, yz, zz), offset))
+    return _union(point, frames, target)
+
+
+def _union(point: Vec, frames: Sequence[Frame | None], target: FeltObject) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] to the nearest geom, the first among equals, and its gradient in the points' frame.
+
+    `frames` say how each geom sees the points; None: they are in its frame already.
+    """
+    least, outward = None, None
+    for g, frame in enumerate(frames):
+        local = point if frame is None else planes.add(planes.rotate(frame.rotation, point), frame.offset)
+        distance, gradient = _to_geom(local, target, g)
+        gradient = gradient if frame is None else planes.rotate_back(frame.rotation, gradient)
         if target.is_absent is not None:
             distance = torch.where(target.is_absent[:, g, None], torch.inf, distance)
         if least is None or outward is None:

@@ -95,6 +95,25 @@ class ReferenceMoments:
 
 
 @dataclass(frozen=True, eq=False)
+class ReferencePoints:
+    """Points sampled on one object, in the frame of one link that they may meet: a row of `query.MetPoints` as arrays.
+
+    Attributes:
+        taxels: The link's taxels.
+        pos: Where they are [m].
+        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed.
+        gradient: Its unit gradient.
+        area: Surface that each stands for [m²].
+    """
+
+    taxels: Int[Array, " own"]
+    pos: Float[Array, "point 3"]
+    distance: Float[Array, " point"]
+    gradient: Float[Array, "point 3"]
+    area: float
+
+
+@dataclass(frozen=True, eq=False)
 class Touch:
     """What a sensor's probes feel, in their links' frames: the fields of `query.Felt`, one row per taxel.
 
@@ -112,6 +131,7 @@ class Touch:
     offset: Float[Array, "taxel object 3"]
     contacts: ReferenceContacts | None = None
     moments: ReferenceMoments | None = None
+    points: tuple[ReferencePoints, ...] = ()
 
 
 def touch(
@@ -152,6 +172,17 @@ def touch(
                 felt.velocity[j] = into_link @ (body.velocity_at(q) - link.velocity_at(q))
                 felt.angular[j] = into_link @ (body.angvel - link.angvel)
     return felt
+
+
+def distance_to(geoms: Sequence[ReferenceGeom], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:
+    """Return the signed distance [m] of a point in a body's frame to its geoms, and its gradient; the first of equals wins."""
+    least, outward = np.inf, np.zeros(3)
+    for geom in geoms:
+        phi, gradient = signed_distance(geom.shape, geom.size, geom.rotation.T @ (point - geom.pos))
+        if phi < least - TIE:
+            outward = geom.rotation @ gradient
+        least = min(phi, least)
+    return least, outward
 
 
 def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:

@@ -72,10 +72,15 @@ class Channel:
 
 @dataclass(frozen=True)
 class Memory:
-    """A tensor (env, *shape) that is carried from one call to the next: its value at rest, and its shape; None: (taxel,)."""
+    """A tensor (env, *shape) that is carried from one call to the next.
+
+    Attributes:
+        rest: Its value at rest.
+        shape: Its shape; None: (taxel,); "points": one row of all points of `Felt.points`, one after the other.
+    """
 
     rest: float = 0.0
-    shape: tuple[int, ...] | None = None
+    shape: tuple[int, ...] | Literal["points"] | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,19 @@ class MomentsRequest:
     with_area: bool
 
 
+@dataclass(frozen=True)
+class PointsRequest:
+    """Points that are sampled on the outer surface of each object and measured against the links' own surfaces.
+
+    Attributes:
+        num_points: Points of each object.
+        range: Distance from a link's surface up to which readings tell it apart [m].
+    """
+
+    num_points: int
+    range: float
+
+
 @dataclass(frozen=True, eq=False)
 class Lowered:
     """A sensor, ready to be planned.
@@ -107,11 +125,13 @@ class Lowered:
         state: What is carried from one call to the next.
         rows: What the reading has one row of: "taxel", or "body" for each body that carries taxels, in order.
         reports: Further readings, with a row per body: `<sensor>/<name>` holds these channels.
-        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts", "moments".
+        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts", "moments",
+            "points".
         range: Distance from an object's surface up to which readings tell it apart [m], if more than the probe's radius.
         radius: How far from each taxel objects are felt [m], (taxel,); default: the probes' radii. Inactive ones feel nothing.
         slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
         moments: How moments are found, if `needs` has "moments".
+        points: Which points, if `needs` has "points".
     """
 
     channels: tuple[Channel, ...]
@@ -124,6 +144,7 @@ class Lowered:
     radius: Float[np.ndarray, " taxel"] | None = None
     slots: int = 0
     moments: MomentsRequest | None = None
+    points: PointsRequest | None = None
 
 
 SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]

@@ -57,7 +57,7 @@ def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Ten
         here = planes.rotate_back(frame.rotation, planes.sub(anchor, frame.offset))
         moved = planes.where(holds[-1], planes.sub(here, pos), moved)
     stretch = planes.sub(moved, planes.scale(planes.dot(moved, normal), normal))
-    kept, slides = (stretch, None) if law.slip is None else _capped(stretch, law.slip * felt.depth)
+    kept, slides = (stretch, None) if law.slip is None else capped(stretch, law.slip * felt.depth)
     slid = planes.sub(kept, stretch)
     is_free = ~torch.stack(holds).any(dim=0)
     taken, holder, deepest = (zero, zero, zero), zero, zero + law.enter
@@ -74,7 +74,7 @@ def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Ten
     return kept, dict(zip(PLANES, (*taken, holder), strict=True))
 
 
-def _capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
+def capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
     """Return a vector scaled back to a length, and where it had to be; derivatives are finite everywhere."""
     square = planes.dot(stretch, stretch)
     slides = square > torch.clamp(limit * limit, min=TINY)

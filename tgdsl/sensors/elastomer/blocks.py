@@ -88,7 +88,7 @@ def responses(spec: ElastomerSpec, part: Skin, pad: Surface | None) -> dict[str,
     def drag(source: np.ndarray) -> np.ndarray:
         return is_active * kernel.drag(part, source) * weight[source]
 
-    return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.has_shear else {})}
+    return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.anchored == "taxels" else {})}
 
 
 def _elastic_responses(spec: ElastomerSpec, part: Skin, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:

@@ -15,11 +15,18 @@ with G the displacement [m/N] at the markers' depth in a half-space (`half_space
 (`bonded_layer`), tractions in [Pa]. With friction |τ_i| ≤ μ p_i, and the same cap |t_i| ≤ μ h_i K_n/K_t holds for the Gaussian.
 All vectors are in the frame of the taxel's link. Inactive taxels neither press nor move.
 
+With `anchors: points` (Gaussian) the shear's sources are N points on each object, for each link that they may meet
+(`point_anchors`): φ is the signed distance to the link, z_p its place, e_p that where it sank in, A the object's area,
+
+    Σ_p w s_s Π_nj(z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²),    h_p = max(0, s − φ(z_p)),    w = A/(N A_ref)      [m]
+
 Source: Chung et al., *Tactile Genesis*, appendix, "ElastomerTaxel"; K_t/K_n by Mindlin (Johnson, *Contact Mechanics*, 7.4).
 
-Departures: the paper anchors points that are sampled on the object, ours are the taxels' own: four numbers per taxel, any
-surface, and shear becomes a fixed matrix too, but its sources are as sparse as the taxels. Offsets are exact for each pair on
-curved links. Sums are weighted with the taxels' areas, so that they do not grow with their number (`model: paper`: a_i = 1).
+Departures: the paper anchors points that are sampled on the object (`anchors: points`, the default under `model: paper`); by
+default anchors are the taxels' own: four numbers per taxel instead of four per point and link, planes and objects of any size
+too, and shear becomes a fixed matrix, but its sources are as sparse as the taxels. Points follow an object's small features and
+a patch that leaves the taxels behind, with the noise of a random sample. Offsets are exact for each pair on curved links. Sums
+are weighted with areas, so that they do not grow with the number of taxels or points (`model: paper`: a_i = 1, w = 1).
 The printed formula divides the in-plane part by ḡ (`normalize: peak`), the code behind the paper's experiments does not
 (default): with the paper's numbers 1 mm of depth would move markers by some 20 mm. The clamped boundary is solved on the pad's
 own outline. Without friction an elastic skin sticks to what it touches until that leaves, and its shear then ends at once.
@@ -35,9 +42,10 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.layout import Layout
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, Memory, State, SurfaceOf, scalar
-from tgdsl.sensors.elastomer import anchors, operators
+from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, Memory, PointsRequest, State, SurfaceOf, scalar
+from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
+from tgdsl.sensors.elastomer.point_anchors import Markers
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 
@@ -56,7 +64,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     else:
         constants |= {"dilation_strength": scalar(spec.dilation_strength), "depth_exponent": scalar(spec.depth_exponent)}
     reach = np.full(layout.num_taxels, spec.standoff)
-    if not spec.has_shear:
+    if spec.anchored is None:
         return Lowered(CHANNELS, constants, radius=reach)
     constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
     if spec.slip is not None:
@@ -65,20 +73,34 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants["shear_stiffness"] = scalar(spec.normal_stiffness * spec.stiffness_ratio)
     else:
         constants["shear_strength"] = scalar(spec.shear_strength)
-    state = {name: Memory() for name in anchors.PLANES}
-    needs = frozenset({"distance", "frame"})
-    return Lowered(CHANNELS, constants, state, needs=needs, range=spec.standoff + spec.exit, radius=reach)
+    span = spec.standoff + spec.exit
+    if spec.anchored == "taxels":
+        state = {name: Memory() for name in anchors.PLANES}
+        return Lowered(CHANNELS, constants, state, needs=frozenset({"distance", "frame"}), range=span, radius=reach)
+    constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
+    if spec.model != "paper":
+        constants["reference_area"] = scalar(spec.reference_area)
+    state = {name: Memory(shape="points") for name in point_anchors.PLANES}
+    request = PointsRequest(spec.points, span)
+    return Lowered(CHANNELS, constants, state, needs=frozenset({"points"}), range=span, radius=reach, points=request)
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the displacement planes [m] and the new anchors."""
     normal = planes.split(constants["normal"].T)
-    shear, after = None, {}
+    shear, pulls, after = None, None, {}
     if "enter" in constants:
         law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
-        shear, after = anchors.advance(felt, probes.pos, normal, law, state)
+        if "shear_falloff" in constants:
+            pulls, after = point_anchors.advance(list(felt.points.values()), law, state)
+        else:
+            shear, after = anchors.advance(felt, probes.pos, normal, law, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian
     found = move(felt.depth, shear, normal, constants)
+    if pulls is not None:
+        markers = Markers(probes.pos, normal, constants["shear_falloff"], constants.get("reference_area"))
+        dragged = point_anchors.drag(list(felt.points.values()), pulls, markers, felt.depth.shape[0])
+        found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after
 
 

@@ -14,6 +14,7 @@ from tgdsl.sensors.base import ReferenceState
 from tgdsl.sensors.elastomer import blocks
 from tgdsl.sensors.elastomer.anchors import Law, advance_reference
 from tgdsl.sensors.elastomer.kernels import Elastic
+from tgdsl.sensors.elastomer.point_anchors import reference_drag
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 
 Array = np.ndarray
@@ -29,17 +30,21 @@ def reference(
     """
     if spec.boundary is not None:
         raise NotImplementedError("the reference has no clamped boundary")
-    shear, after = np.zeros((layout.num_taxels, 3)), {}
-    if spec.has_shear:
-        law = Law(spec.standoff, spec.enter, spec.exit, spec.slip)
+    shear, found, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
+    law = Law(spec.standoff, spec.enter, spec.exit, spec.slip)
+    if spec.anchored == "taxels":
         shear, after = advance_reference(touch, layout.pos, layout.normal, law, state)
-    found = np.zeros((layout.num_taxels, 3))
+    elif spec.anchored == "points":
+        area = None if spec.model == "paper" else spec.reference_area
+        args = layout.pos, layout.normal, law, spec.shear_falloff, area, state
+        drag, after = reference_drag(touch.points, *args)
+        found = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
     for link in range(len(layout.links)):
         own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
         for j in own:
             sources = _Sources(layout.pos[own], layout.normal[own], layout.area[own], touch.depth[own], shear[own])
             move = _gaussian if spec.kernel == "gaussian" else _elastic
-            found[j] = move(spec, layout.pos[j], layout.normal[j], sources)
+            found[j] += move(spec, layout.pos[j], layout.normal[j], sources)
     return found, after
 
 

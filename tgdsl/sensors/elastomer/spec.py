@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, model_validator
+from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Radius, SpecModel
 from tgdsl.regions import Region
@@ -80,8 +80,13 @@ class ElastomerSpec(ContactProbeSpec):
     """s, height of the undeformed skin above the taxels [m]."""
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
+    anchors: Literal["taxels", "points"] | None = None
+    """What takes hold: each taxel of the object that it touches, or `points` sampled on each object of the skin that they touch
+    (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
+    points: Annotated[StrictInt, Field(ge=1)] = 1000
+    """Points of each object, for `anchors: points`."""
     enter: Radius = 1e-5
-    """Depth at which a taxel takes hold of an object [m]."""
+    """Depth at which a taxel takes hold of an object, or a point of the skin [m]."""
     exit: Radius = 1e-4
     """Distance at which it lets go [m]."""
     boundary: BoundarySpec | None = None
@@ -95,6 +100,12 @@ class ElastomerSpec(ContactProbeSpec):
     def has_shear(self) -> bool:
         """Whether shear is computed."""
         return self.shear_strength != 0.0
+
+    @property
+    def anchored(self) -> Literal["taxels", "points"] | None:
+        """What takes hold; None without shear."""
+        default = "points" if self.model == "paper" else "taxels"
+        return (self.anchors or default) if self.has_shear else None
 
     @property
     def stiffness_ratio(self) -> float:
@@ -113,8 +124,12 @@ class ElastomerSpec(ContactProbeSpec):
         if self.kernel != "gaussian" and self.has_shear and "shear_strength" in self.model_fields_set:
             raise ValueError(f"`shear_strength` can only be 0, no shear, with the kernel {self.kernel}: K_t follows from K_n")
         if not self.has_shear:
-            for name in sorted(self.model_fields_set & {"friction", "shear_falloff", "enter", "exit"}):
+            for name in sorted(self.model_fields_set & {"friction", "shear_falloff", "enter", "exit", "anchors", "points"}):
                 raise ValueError(f"`{name}` is not used without shear (`shear_strength: 0`), expected it to be left out")
+        if self.kernel != "gaussian" and self.anchors == "points":
+            raise ValueError(f"`anchors: points` is for the kernel gaussian, expected `taxels` with the kernel {self.kernel}")
+        if self.anchored == "taxels" and "points" in self.model_fields_set:
+            raise ValueError("`points` is not used by `anchors: taxels`, expected it to be left out")
         for name in NEEDED[self.kernel]:
             if getattr(self, name) is None:
                 raise ValueError(f"`{name}` is missing, the kernel {self.kernel} needs it")

@@ -1,0 +1,51 @@
+"""Points that are sampled on objects, where links see them, and how deep they are in the links' own surfaces.
+
+Shapes: `env` environments, `link` links that may meet one object, `point` points of it, `case` 1, or `env` if the object
+differs between environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.query import Felt, FeltObject, MetPoints, Pairs, body_distance
+
+
+class PointSource(NamedTuple):
+    """The points of one object, and the links that they may meet.
+
+    Attributes:
+        object: The object's name.
+        pair: Index of the pair of each link and the object.
+        taxels: First of each link's taxels, and one beyond the last.
+        points: Places in the object's frame [m].
+        area: Surface that each stands for [m²].
+        links: The links' own surfaces, each in the frame of its body: an object whose cases are links.
+    """
+
+    object: str
+    pair: Int[Tensor, " link"]
+    taxels: tuple[tuple[int, int], ...]
+    points: tuple[Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"]]
+    area: Float[Tensor, "case 1"]
+    links: FeltObject
+
+
+def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Felt:
+    """Return an answer with the points of objects added, gated as the pairs are."""
+    found = {}
+    for source in sources:
+        rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
+        offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
+        pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
+        distance, gradient = body_distance(pos, source.links)
+        if pairs.gate is not None:
+            distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
+        found[source.object] = MetPoints(source.taxels, pos, distance, gradient, source.area)
+    return felt._replace(points=found)

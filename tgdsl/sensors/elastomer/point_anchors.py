@@ -1,0 +1,145 @@
+"""Anchors on points of the objects, as in the paper: where each point was when it sank into the skin, and how far it came.
+
+A point p of an object, z_p its place in the link's frame and φ the signed distance to the link's own surface, takes the anchor
+e_p = z_p when it is deeper than `enter` in the skin, and lets go when it is farther than `exit` above it, or may no longer be
+felt. With h_p = max(0, s − φ(z_p)) its depth [m], s the skin's height, and m_p = ∇φ(z_p), it moves the markers j by
+
+    u_j = s_s Π_nj Σ_p w_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²)                     [m]
+
+w_p the area that it stands for over the reference area, 1 under `model: paper`. With a friction cap t_p = Π_mp(z_p − e_p) is at
+most |t_p| = `slip` h_p: beyond it the point slides, and its anchor is dragged along by as much.
+
+Shapes: planes (env, link, point) of one object; in the state all objects one after the other, flat; `taxel` markers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.geometry.query import MetPoints
+from tgdsl.geometry.reference import ReferencePoints
+from tgdsl.sensors.elastomer.anchors import Law, capped
+
+PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
+"""What is carried from call to call: e_p in the link's frame [m], and 1 where the point holds on."""
+BLOCK = 64
+"""Points that are summed at once where nothing fuses the sum, so that memory stays bounded."""
+
+
+class Markers(NamedTuple):
+    """Markers of all links: positions [m] and normals, planes (taxel,); λ_s [1/m²]; A_ref [m²], or None: points count once."""
+
+    pos: Vec
+    normal: Vec
+    falloff: Tensor
+    reference_area: Tensor | None
+
+
+class Pull(NamedTuple):
+    """The points of one object, planes (env, link, point) in each link's frame: z_p [m], and (z_p − e_p) h_p [m²]."""
+
+    pos: Vec
+    strength: Vec
+
+
+def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
+    """Return what the points of each object pull with, and the new anchors."""
+    pulls, after, start = [], {name: [] for name in PLANES}, 0
+    for points in met:
+        shape = points.distance.shape[1:]
+        end = start + shape[0] * shape[1]
+        x, y, z, held = (state[name][:, start:end].unflatten(1, shape) for name in PLANES)
+        anchor, start = (x, y, z), end
+        is_held = (held > 0) & ~(points.distance > law.reach + law.exit)
+        depth = torch.relu(law.reach - points.distance)
+        zero = torch.zeros_like(depth)
+        moved = planes.where(is_held, planes.sub(points.pos, anchor), (zero, zero, zero))
+        if law.slip is not None:
+            stretch = planes.sub(moved, planes.scale(planes.dot(moved, points.gradient), points.gradient))
+            kept, slides = capped(stretch, law.slip * depth)
+            slid = planes.sub(stretch, kept)
+            moved, anchor = planes.sub(moved, slid), planes.where(slides, planes.add(anchor, slid), anchor)
+        is_taken = ~is_held & (law.reach - points.distance > law.enter)
+        taken = planes.where(is_held, anchor, planes.where(is_taken, points.pos, (zero, zero, zero)))
+        parts = (*points.pos, *planes.scale(depth, moved), *taken, (is_held | is_taken).to(zero.dtype))
+        # Stacked, they are stored once per point; a compiler that fuses would else form them anew for every marker.
+        stored = torch.stack(parts, dim=1).unbind(1)
+        pulls.append(Pull(planes.vec(stored[:3]), planes.vec(stored[3:6])))
+        for name, plane in zip(PLANES, stored[6:], strict=True):
+            after[name].append(plane.flatten(1))
+    return pulls, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}
+
+
+def drag(met: Sequence[MetPoints], pulls: Sequence[Pull], markers: Markers, num_envs: int) -> Vec:
+    """Return u_j / s_s of all markers [m²], planes (env, taxel)."""
+    num_taxels = markers.pos[0].shape[0]
+    zero = markers.pos[0].new_zeros((num_envs, num_taxels))
+    total = (zero, zero, zero)
+    for points, pull in zip(met, pulls, strict=True):
+        weight = 1.0 if markers.reference_area is None else points.area / markers.reference_area
+        for link, (first, last) in enumerate(points.taxels):
+            pos, normal = (planes.vec(part[first:last] for part in vector) for vector in (markers.pos, markers.normal))
+            own = Pull(*(planes.vec(part[:, link] for part in vector) for vector in pull))
+            found = _summed(own, markers._replace(pos=pos, normal=normal))
+            around = (first, num_taxels - last)
+            total = planes.add(total, planes.vec(torch.nn.functional.pad(weight * part, around) for part in found))
+    return planes.sub(total, planes.scale(planes.dot(total, markers.normal), markers.normal))
+
+
+def _summed(pull: Pull, markers: Markers) -> Vec:
+    """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of one link's markers; point planes (env, point)."""
+    num_envs, num = pull.pos[0].shape
+    # A compiler fuses kernel and sum into one loop, whatever the length.
+    step = num if torch.compiler.is_compiling() else BLOCK
+    x, normal = (planes.vec(part[:, None] for part in vector) for vector in (markers.pos, markers.normal))
+    zero = pull.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
+    total = (zero, zero, zero)
+    for start in range(0, num, step):
+        z, own = (planes.vec(part[:, None, start : start + step] for part in vector) for vector in pull)
+        way = planes.sub(x, z)
+        along = planes.dot(way, normal)
+        fall = torch.exp(-markers.falloff * (planes.dot(way, way) - along * along))
+        total = planes.add(total, planes.vec((fall * part).sum(dim=-1) for part in own))
+    return total
+
+
+def reference_drag(
+    met: Sequence[ReferencePoints],
+    pos: Float[np.ndarray, "taxel 3"],
+    normal: Float[np.ndarray, "taxel 3"],
+    law: Law,
+    falloff: float,
+    reference_area: float | None,
+    state: Mapping[str, np.ndarray],
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return u_j / s_s (taxel, 3) [m²] and the new anchors of one environment, point by point."""
+    found, row = np.zeros((len(pos), 3)), 0
+    after = {name: np.zeros_like(state[name]) for name in PLANES}
+    for points in met:
+        weight = 1.0 if reference_area is None else points.area / reference_area
+        for z, phi, m in zip(points.pos, points.distance, points.gradient, strict=True):
+            e, holds = np.array([state[name][row] for name in PLANES[:3]]), state["held"][row] > 0
+            h = max(0.0, law.reach - phi)
+            if holds and phi <= law.reach + law.exit:
+                t = (z - e) - ((z - e) @ m) * m
+                length = float(np.linalg.norm(t))
+                if law.slip is not None and length > law.slip * h and length > 1e-15:
+                    e = e + t * (1.0 - law.slip * h / length)
+                for j in points.taxels:
+                    r, s = (v - (v @ normal[j]) * normal[j] for v in (pos[j] - z, z - e))
+                    found[j] += weight * h * s * np.exp(-falloff * (r @ r))
+            else:
+                holds = law.reach - phi > law.enter
+                e = z if holds else np.zeros(3)
+            for name, value in zip(PLANES, (*e, float(holds)), strict=True):
+                after[name][row] = value
+            row += 1
+    return found, after
