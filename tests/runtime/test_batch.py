@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.module import SHAPES, TactileModule
+from tgdsl.module import TactileModule
 from tgdsl.runtime.batch import BatchSimulation, simulate
+from tgdsl.state import SHAPES
 
 TOLERANCE = 1e-12
 """Both sides are float64 and the same solver; what is left is the order of a few sums and products."""
