@@ -510,6 +510,27 @@ class KindConformance:
             for gradient in torch.autograd.grad(total, tensors, allow_unused=True):
                 assert gradient is None or torch.isfinite(gradient).all()
 
+    def test_gradients_of_parameters_equal_finite_differences(self, scene: Path) -> None:
+        """Derivatives with respect to the kind's scalar constants are those of the readings; all of them are finite."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        state = module.example_state(2)
+        paths = [f"sensors/s/{name}" for name in module.plan.sensors[0].constants]
+        paths = [path for path in paths if module.constants[path].is_floating_point() and module.constants[path].ndim == 0]
+        values = [module.constants[path].clone().requires_grad_() for path in paths]
+
+        def readings(*changed: Tensor) -> Tensor:
+            module.reset()
+            for path, value in zip(paths, changed, strict=True):
+                module.constants._buffers[path] = value
+            return module(state)["s"]
+
+        if self.is_differentiable and paths:
+            assert torch.autograd.gradcheck(readings, values, eps=1e-7, atol=1e-4, rtol=1e-4)
+        total = readings(*values).sum()
+        if total.requires_grad:
+            for gradient in torch.autograd.grad(total, values, allow_unused=True):
+                assert gradient is None or torch.isfinite(gradient).all()
+
     def test_reset_of_one_environment(self, scene: Path) -> None:
         """Reset starts one environment anew, by index and by mask, and leaves the others untouched."""
         module, _ = self.build(self.document(scene), torch.float64)

@@ -253,3 +253,19 @@ def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(tmp_path, alpha):
     exponents = np.diff(np.log(forces)) / np.diff(np.log(depths))
     np.testing.assert_allclose(exponents, alpha + 1, atol=0.02)
     assert (np.abs(exponents - 1.5) > 0.4).all()  # no power of the depth is that of a half-space: 1.5 would take α of a half
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.2])
+@pytest.mark.parametrize("depth", [0.0, 1e-12, -1e-3, -1.0])
+def test_gradients_are_finite_at_first_touch_and_far_away(tmp_path, exponent, depth):
+    """At d = 0 the law has a vertical tangent for α < 1: its derivative there counts as 0, so that training goes on."""
+    touch = module(tmp_path, [(0, 0, 0)], BOX, kind="kinematic_taxel", depth_exponent=exponent)
+    scene = state(touch, pos=[0, 0, 0.03 - depth], linvel=[0.1, 0, -0.2])
+    names = [name for name in touch.inputs.fields if name.startswith("body_")]
+    for name in names:
+        getattr(scene, name).requires_grad_()
+    constant = touch.constants["sensors/s/depth_exponent"].requires_grad_()
+    readings = touch(scene)["s"]
+    assert torch.isfinite(readings).all()
+    for gradient in torch.autograd.grad(readings.sum(), [*(getattr(scene, name) for name in names), constant]):
+        assert torch.isfinite(gradient).all()

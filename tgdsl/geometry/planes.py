@@ -120,3 +120,9 @@ def safe_sqrt(squared: Tensor) -> Tensor:
     """Return the square root of a squared length [m²], with derivative 0 rather than infinite where it vanishes."""
     is_null = squared <= TINY
     return torch.where(is_null, 0.0, torch.sqrt(torch.where(is_null, 1.0, squared)))
+
+
+def power(depth: Tensor, exponent: Tensor) -> Tensor:
+    """Return d^α of depths d ≥ 0; where d = 0 its derivatives are 0 rather than infinite, even for α < 1."""
+    is_none = depth <= 0
+    return torch.where(is_none, torch.zeros_like(depth), torch.where(is_none, 1.0, depth) ** exponent)

@@ -156,7 +156,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
     assert felt.normal is not None
-    stiffness = felt.depth ** constants["depth_exponent"]
+    stiffness = planes.power(felt.depth, constants["depth_exponent"])
     pressed = constants["normal_stiffness"] * stiffness
     force = planes.scale(pressed, felt.normal)
     if felt.velocity is not None:

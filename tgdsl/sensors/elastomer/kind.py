@@ -107,7 +107,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
 def _gaussian(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants) -> Vec:
     strength = constants["dilation_strength"]
     in_plane = planes.vec(operators.apply(constants, "spread", [strength * depth]))
-    (bulge,) = operators.apply(constants, "bulge", [strength * _power(depth, constants["depth_exponent"])])
+    (bulge,) = operators.apply(constants, "bulge", [strength * planes.power(depth, constants["depth_exponent"])])
     found = planes.add(in_plane, planes.scale(bulge, normal))
     if shear is None:
         return found
@@ -124,12 +124,6 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
     stiffness = torch.where(depth > 0, constants["shear_stiffness"], 0.0)
     traction = planes.sub(planes.scale(stiffness, shear), planes.scale(pressure, normal))
     return planes.vec(operators.apply(constants, "traction", traction))
-
-
-def _power(depth: Tensor, exponent: Tensor) -> Tensor:
-    """Return h^α, whose derivative is 0 rather than infinite where h = 0, even for α < 1."""
-    is_none = depth <= 0
-    return torch.where(is_none, 0.0, torch.where(is_none, 1.0, depth) ** exponent)
 
 
 ELASTOMER = Kind(ElastomerSpec, lower, forward, reference)
