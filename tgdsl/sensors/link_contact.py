@@ -50,14 +50,15 @@ def reference(
 
 
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
-    """The net force alone is wanted: no slots."""
+    """The net force alone is wanted: no slots, and no probe reaches anywhere."""
     channels: list[Channel] = []
     if "contact" in spec.outputs:
         channels.append(Channel("contact", "1"))
     if "force" in spec.outputs:
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
     constants = {"threshold": scalar(spec.threshold)}
-    return Lowered(tuple(channels), rows="body", constants=constants, needs=frozenset({"contacts"}))
+    nowhere = np.full(layout.num_taxels, -np.inf)
+    return Lowered(tuple(channels), constants, rows="body", needs=frozenset({"contacts"}), radius=nowhere)
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
