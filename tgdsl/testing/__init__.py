@@ -1,0 +1,35 @@
+"""The conformance suite: what every sensor kind must do, for its own tests and for those of plug-in authors to inherit.
+
+    class TestMyKind(KindConformance):
+        kind = MY_KIND
+        parameters = {"stiffness": 100.0}
+
+gives a kind all the tests below for its float64 `reference`. Its author adds the closed-form cases.
+"""
+
+from tgdsl.testing.conformance import (
+    FAR_TOLERANCE,
+    FLOAT32_TOLERANCE,
+    FLOAT64_TOLERANCE,
+    SCENE,
+    KindConformance,
+    conformance_document,
+    conformance_points,
+)
+from tgdsl.testing.reference import ReferenceModule, assert_agrees, full_scale_error
+from tgdsl.testing.states import moved, only
+
+__all__ = [
+    "FAR_TOLERANCE",
+    "FLOAT32_TOLERANCE",
+    "FLOAT64_TOLERANCE",
+    "SCENE",
+    "KindConformance",
+    "ReferenceModule",
+    "assert_agrees",
+    "conformance_document",
+    "conformance_points",
+    "full_scale_error",
+    "moved",
+    "only",
+]
