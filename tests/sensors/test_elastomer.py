@@ -22,6 +22,7 @@ class TestElastomer(KindConformance):
 class TestElastomerAsInThePaper(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
 class TestHalfSpace(KindConformance):

@@ -39,6 +39,7 @@ class TestForceTaxel(KindConformance):
 class TestForceTaxelWithPressure(KindConformance):
     kind = FORCE_TAXEL
     parameters = {"outputs": ["pressure", "force"], "footprint": 0.02, "moment_iterations": 2, "slots": 2}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
     float64_tolerance = 1e-11
 
 

@@ -15,6 +15,7 @@ class TestKinematicTaxel(KindConformance):
 class TestKinematicTaxelAsInThePaper(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"model": "paper", "outputs": ["force"]}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
 class TestKinematicTaxelWithAllOptions(KindConformance):
@@ -25,6 +26,7 @@ class TestKinematicTaxelWithAllOptions(KindConformance):
 class TestKinematicTaxelInTheCone(KindConformance):
     kind = KINEMATIC_TAXEL
     parameters = {"friction_cone": 0.2}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
 BOX = '<geom type="box" size=".02 .02 .02"/>'

@@ -32,6 +32,7 @@ class TestLinkContact(KindConformance):
 
 class TestLinkContactBit(TestLinkContact):
     parameters = {"outputs": ["contact"], "threshold": 2.5}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
     test_something_is_felt = KindConformance.test_something_is_felt
 

@@ -34,6 +34,7 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
 class TestProximityAsInThePaper(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": COARSE, "model": "paper", "outputs": ["force"], "reference_area": 0.01}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
     gates = ()
 
 
