@@ -68,7 +68,7 @@ class Resolved:
         try:
             return cut(surface, region) if region else surface
         except SampleError as error:
-            raise LowerError(f'link "{link}": {error.what}', hint=error.hint) from error
+            raise LowerError(error.what, hint=error.hint) from error
 
 
 def resolve(loaded: Loaded) -> Resolved:

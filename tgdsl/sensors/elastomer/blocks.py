@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.errors import LowerError
 from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
@@ -57,14 +58,24 @@ def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> di
         LowerError: If a convolution is asked for where it cannot be, or the pad's edge cannot be clamped.
     """
     constants = {}
-    wish = Wish(spec.operator, spec.tolerance)
     for i, link in enumerate(layout.links):
-        part = skin(layout, i)
-        pad = None if spec.boundary is None else surface_of(link.name, spec.boundary.pad)
-        for name, response in responses(spec, part, pad).items():
-            is_alike = not (name == "spread" and pad is not None)
-            folded = fold(response, PLANES[name], part, wish, is_alike)
-            constants |= {f"{name}/{i}/{key}": value for key, value in folded.items()}
+        try:
+            constants |= _fold_link(spec, layout, i, surface_of)
+        except LowerError as error:
+            field = error.field or "boundary"  # what a surface says knows no field
+            raise LowerError(f'link "{link.name}": {error.what}', field, error.hint) from error
+    return constants
+
+
+def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
+    """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
+    part = skin(layout, link)
+    pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
+    wish, constants = Wish(spec.operator, spec.tolerance), {}
+    for name, response in responses(spec, part, pad).items():
+        is_alike = not (name == "spread" and pad is not None)
+        folded = fold(response, PLANES[name], part, wish, is_alike)
+        constants |= {f"{name}/{link}/{key}": value for key, value in folded.items()}
     return constants
 
 

@@ -5,6 +5,8 @@ Shapes: `taxel` taxels of the sensor; `source` active taxels of one link.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -48,11 +50,14 @@ def reference(
     return found, after
 
 
-class _Sources:
+class _Sources(NamedTuple):
     """The sources of one link: positions [m], normals, areas [m²], depths [m], tangential displacements [m]."""
 
-    def __init__(self, pos: Array, normal: Array, area: Array, depth: Array, shear: Array):
-        self.pos, self.normal, self.area, self.depth, self.shear = pos, normal, area, depth, shear
+    pos: Array
+    normal: Array
+    area: Array
+    depth: Array
+    shear: Array
 
 
 def _tangential(vectors: Array, n: Array) -> Array:
