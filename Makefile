@@ -14,8 +14,9 @@ demo: $(READY)
 	@$(BIN)/tgdsl compile examples/xhand1_palm.yaml -o out/xhand1_palm.safetensors
 	@$(BIN)/tgdsl run out/xhand1_palm.safetensors --out out
 
+# One process per core, each with one thread of its own: most of the time goes into compiling kernels.
 test: $(READY)
-	@$(BIN)/python -m pytest
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 lint: $(READY)
 	@$(BIN)/ruff check .
