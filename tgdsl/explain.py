@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from tgdsl.memory import Memory
 from tgdsl.module import TactileModule
 from tgdsl.plan import PlannedObject, PlannedPoints, PlannedSensor
 
@@ -51,12 +52,8 @@ def operations_per_env(touch: TactileModule) -> int:
     counts = []
     for num_envs in (2, 4):
         state = touch.example_state(num_envs)
-        memory = {
-            f"{s.name}:{name}": torch.full((num_envs, *memory.shape), memory.rest, dtype=touch.dtype, device=touch.device)
-            for s in touch.plan.sensors
-            for name, memory in s.state.items()
-        }
-        tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
+        memory = Memory(touch.plan.sensors).tensors(num_envs, state.dt, touch.dtype, touch.device)
+        tensors = {name: torch.as_tensor(getattr(state, name)) for name in touch.inputs.fields}
         with torch.no_grad(), _OperationCounter() as counter:
             touch.core(tensors, memory)
         counts.append(counter.elements)
@@ -198,9 +195,9 @@ def _inputs(touch: TactileModule) -> list[str]:
 
 def _costs(touch: TactileModule) -> list[str]:
     size = torch.finfo(touch.dtype).bits // 8
-    outputs = sum(taxels * channels for taxels, channels in {output.name: output.shape for output in touch.outputs}.values())
-    memory = sum(math.prod(m.shape) for s in touch.plan.sensors for m in s.state.values())
+    outputs = sum(math.prod(output.shape) for output in touch.outputs)
     state = touch.example_state(1)
+    memory = sum(math.prod(m.shape) for s in touch.plan.sensors for m in s.state.values())
     read = sum(getattr(state, n).numel() * 8 for n in touch.inputs.fields if n != "dt")
     constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())
     return [

@@ -1,11 +1,13 @@
 """The compiled sensor: tensors in, tensors out.
 
 Shapes: `env` environments, `body` bodies of `inputs.bodies`, `pair` pairs of `inputs.pairs`, `slot` contacts per pair, `object`
-felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `feature` numbers of an observation.
+felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `feature` numbers of an observation, `call` calls that a
+ring remembers.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import warnings
@@ -26,9 +28,14 @@ from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.points import with_points
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, measure, relate
+from tgdsl.history import History
+from tgdsl.memory import Memory, store
 from tgdsl.moment_sources import moment_sources
 from tgdsl.plan import Inputs, Plan
+from tgdsl.reading import read
 from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.stages import Now
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
 
@@ -37,13 +44,13 @@ from tgdsl.taxels import image_indices, taxel_table
 class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
-    Rows are the sensor's taxels (`rows` is "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
     """
 
     name: str
     sensor: str
     kind: str
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     rows: str
     bodies: tuple[str, ...]
     channels: tuple[str, ...]
@@ -53,9 +60,10 @@ class Output:
 class TactileModule(nn.Module):
     """All sensors of a document, for any number of environments at once.
 
-    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel). `observe` makes the
-    observations of them. A module whose sensors carry state (see `num_envs`) takes the batch size of its first call, or of
-    the state dict that it loads, and keeps it; one without state takes any.
+    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel, channel)
+    where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state (see
+    `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it; one without state
+    takes any. Noise is drawn from the seed 0, or from that given to `seed`.
     """
 
     def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):
@@ -80,8 +88,17 @@ class TactileModule(nn.Module):
         self._felt_objects = FeltObjects(plan)
         unused = ("layout/", *self._felt_objects.kept)
         self.constants = Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
-        self.memory = nn.Module()
-        self._compiled_core: Callable[..., Any] | None = None
+        self.memory = Memory(plan.sensors)
+        self.histories = nn.ModuleDict(
+            {
+                reading.name: History(sensor.history)
+                for sensor in plan.sensors
+                for reading in sensor.readings
+                if sensor.history is not None and reading.name in (sensor.name, f"{sensor.name}/clean")
+            }
+        )
+        self._compiled: Callable[..., Any] | None = None
+        self._dt: tuple[float, Tensor] | None = None
 
     @property
     def inputs(self) -> Inputs:
@@ -94,9 +111,9 @@ class TactileModule(nn.Module):
         return tuple(
             Output(
                 reading.name,
-                sensor.name,
+                sensor.sensor,
                 sensor.kind,
-                (reading.num_rows, len(reading.channels)),
+                (*([reading.steps] if reading.steps else []), reading.num_rows, len(reading.channels)),
                 reading.rows,
                 self.plan.layout_of(sensor).bodies,
                 reading.channels,
@@ -109,7 +126,7 @@ class TactileModule(nn.Module):
     @property
     def taxels(self) -> dict[str, Any]:
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
-        return {sensor.name: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors}
+        return {sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors}
 
     @property
     def dtype(self) -> torch.dtype:
@@ -124,14 +141,14 @@ class TactileModule(nn.Module):
     @property
     def has_state(self) -> bool:
         """Whether any sensor carries something from one call to the next."""
-        return any(sensor.state for sensor in self.plan.sensors)
+        return self.memory.is_wanted or len(self.histories) > 0
 
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call, or if there is no state."""
-        return next((buffer.shape[0] for buffer in self.memory.buffers()), None)
+        return next((len(buffer) for buffer in self.histories.buffers()), self.memory.num_envs)
 
-    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env row channel"]]:
+    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
         """Read all sensors.
 
         Args:
@@ -144,12 +161,19 @@ class TactileModule(nn.Module):
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
         """
         tensors = state.checked(self.inputs, self.device)
+        if state.dt is not None and "dt" in self.inputs.fields:
+            tensors["dt"] = self._dt_tensor(state.dt)
         num_envs = tensors["body_pos"].shape[0]
-        memory = self._memory_for(num_envs)
-        readings, updated = (self._compiled_core or self.core)(tensors, memory)
-        with torch.no_grad():
-            for name, value in updated.items():
-                memory[name].copy_(value)
+        if self.num_envs not in (None, num_envs):
+            raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        readings = (self._compiled or self.advance)(tensors, memory)
+        return readings | {name: history.push(readings[name]) for name, history in self.histories.items()}  # type: ignore[operator]
+
+    def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings of `core`, and put the new state in the place of the old one."""
+        readings, updated = self.core(tensors, memory)
+        store(memory, updated)
         return readings
 
     def core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -157,24 +181,25 @@ class TactileModule(nn.Module):
 
         Args:
             tensors: The fields of `SceneState` that `inputs` names.
-            memory: State by `sensor:name`, each (env, …).
+            memory: State by `sensor:name`, each (env, …), and the clock's.
 
         Returns:
-            Readings by name, and the new state.
+            Readings by name, and the new state; of a ring, (env, call, …), what is new: (env, …).
         """
         pairs = self._pairs(tensors)
+        nows, knobs = self._circumstances(tensors, memory)
         measured = sorted({o for query in self.plan.queries for o in query.objects})
         objects = {o: self._felt_objects.felt(self.plan.objects[o], self.constants, tensors) for o in measured}
-        answers = [self._query(i, pairs, objects, tensors) for i in range(len(self.plan.queries))]
+        answers = [self._query(i, pairs, objects, tensors, nows, knobs) for i in range(len(self.plan.queries))]
         readings: dict[str, Tensor] = {}
-        updated: dict[str, Tensor] = {}
+        updated = self.memory.clock.after(memory)
         for sensor in self.plan.sensors:
             felt, probes = answers[sensor.query][sensor.answer]
             own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
-            constants = self.constants.under(f"sensors/{sensor.name}", sensor.constants)
-            result, new = self._kinds[sensor.name].forward(felt, probes, constants, own)
-            stacked = {r.channels: torch.stack([result[name] for name in r.channels], dim=1) for r in sensor.readings}
-            readings |= {r.name: stacked[r.channels].transpose(1, 2) for r in sensor.readings}
+            constants = self.constants.under(sensor.folder, sensor.constants)
+            kind = self._kinds[sensor.name]
+            found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name))
+            readings |= found
             updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         return readings, updated
 
@@ -187,7 +212,9 @@ class TactileModule(nn.Module):
             features = nothing
             if term.reading is not None:
                 constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-                features = observations.observe(term.type, readings[term.reading], term.channels, constants)
+                reading = readings[term.reading]
+                steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
+                features = torch.cat([observations.observe(term.type, step, term.channels, constants) for step in steps], dim=1)
             groups.setdefault(term.group, []).append(features)
         return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
@@ -197,7 +224,7 @@ class TactileModule(nn.Module):
         """Return a reading of taxels as one image per link, and where its pixels are taxels, for convolutions.
 
         Cells of a link's grid that missed its surface, and inactive probes, are 0 in the image and False in the mask. Links
-        without a grid are left out.
+        without a grid are left out. Of stacked calls it is the last one.
 
         Args:
             name: The reading.
@@ -209,7 +236,8 @@ class TactileModule(nn.Module):
         owner = {r.name: sensor for sensor in self.plan.sensors for r in sensor.readings if r.rows == "taxel"}
         if name not in owner:
             raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
-        by_channel = readings[name].transpose(1, 2)
+        reading = readings[name][:, -1] if readings[name].ndim == 4 else readings[name]
+        by_channel = reading.transpose(1, 2)
         images, masks = {}, {}
         for link, index in image_indices(self.plan.layout_of(owner[name])).items():
             place = torch.from_numpy(index).to(by_channel.device)
@@ -218,20 +246,39 @@ class TactileModule(nn.Module):
         return images, masks
 
     def reset(self, env_ids: Tensor | Sequence[int] | None = None) -> None:
-        """Bring the state of some environments (default: all) back to rest; the others are left untouched.
+        """Begin a new episode in some environments (default: all); the others are left untouched.
+
+        State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
+        per episode are drawn anew.
 
         Args:
             env_ids: Indices, or a boolean mask over environments.
         """
-        for sensor in self.plan.sensors:
-            for name, memory in sensor.state.items():
-                buffer = self.memory._buffers.get(f"{sensor.name}:{name}")
-                if buffer is not None:
-                    with torch.no_grad():
-                        buffer[slice(None) if env_ids is None else torch.as_tensor(env_ids, device=buffer.device)] = memory.rest
+        with torch.no_grad():
+            chosen = slice(None) if env_ids is None else torch.as_tensor(env_ids, device=self.device)
+            self.memory.reset(chosen)
+            for history in self.histories.values():
+                history.reset(chosen)  # type: ignore[operator]
+
+    def seed(self, seed: int, first_env: int | None = None) -> TactileModule:
+        """Choose the random numbers of noise; steps and episodes are counted from 0 again.
+
+        They depend on the seed, the sensor's name, the environment's number and the step, and on nothing else: not on other
+        sensors or environments, the batch size, the device or the process.
+
+        Args:
+            seed: Any integer.
+            first_env: Number of this module's first environment among those of all processes; default: where torch runs
+                distributed, the process's rank times the number of its environments, else 0.
+
+        Returns:
+            The module.
+        """
+        self.memory.clock.seed_with(seed, first_env)
+        return self
 
     def compile(self, **options: Any) -> TactileModule:
-        """Compile the core with `torch.compile` into fused kernels, in place; the first call then takes longer.
+        """Compile `advance` with `torch.compile` into fused kernels, in place; the first call then takes longer.
 
         Args:
             **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`: one graph for every batch ≥ 2.
@@ -242,7 +289,7 @@ class TactileModule(nn.Module):
         if self.device.type == "cpu" and not _has_cpp_compiler():
             warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
             return self
-        self._compiled_core = torch.compile(self.core, **{"fullgraph": True, "dynamic": True, **options})
+        self._compiled = torch.compile(self.advance, **{"fullgraph": True, "dynamic": True, **options})
         return self
 
     def example_state(
@@ -280,8 +327,29 @@ class TactileModule(nn.Module):
             gate,
         )
 
+    def _circumstances(
+        self, tensors: dict[str, Tensor], memory: dict[str, Tensor]
+    ) -> tuple[dict[str, Now], dict[str, dict[str, Tensor]]]:
+        """Return by sensor when it is read, where that matters, and the values of its noise."""
+        nows: dict[str, Now] = {}
+        knobs: dict[str, dict[str, Tensor]] = {}
+        for sensor in self.plan.sensors:
+            if sensor.is_timed:
+                phase = memory.get(f"{sensor.name}:sample/phase")
+                nows[sensor.name] = self.memory.clock.now(sensor, memory, tensors.get("dt"), phase)
+            names = () if sensor.noise is None else sensor.noise.constants
+            constants = self.constants.under(f"sensors/{sensor.name}/noise", names)
+            knobs[sensor.name] = stages.knob_values(constants, nows.get(sensor.name))
+        return nows, knobs
+
     def _query(
-        self, i: int, pairs: Pairs, objects: Mapping[int, FeltObject], tensors: dict[str, Tensor]
+        self,
+        i: int,
+        pairs: Pairs,
+        objects: Mapping[int, FeltObject],
+        tensors: dict[str, Tensor],
+        nows: Mapping[str, Now],
+        knobs: Mapping[str, dict[str, Tensor]],
     ) -> list[tuple[Felt, Probes]]:
         """Return the answers to a query, and its probes."""
         query = self.plan.queries[i]
@@ -291,11 +359,16 @@ class TactileModule(nn.Module):
         answers = []
         for a, answer in enumerate(query.answers):
             own = pairs if answer.is_gated else pairs._replace(gate=None)
-            reach = self.constants[f"queries/{i}/{a}/reach"]
+            reach, shift = self.constants[f"queries/{i}/{a}/reach"], None
+            if answer.radius_noise:
+                half_width, now = knobs[answer.radius_noise]["radius_noise"], nows[answer.radius_noise]
+                shift = stages.radius_shift(half_width, now, probes.pos[0])
+                reach = stages.shifted(reach[:, None], shift)
             found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
             felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)
             if answer.moments is not None:
-                sources = moment_sources(self.plan, self.constants, f"queries/{i}/{a}/moments", answer.moments, tensors)
+                path = f"queries/{i}/{a}/moments"
+                sources = moment_sources(self.plan, self.constants, path, answer.moments, tensors, shift)
                 felt = with_moments(felt, own, probes, sources)
             if answer.points is not None:
                 path = f"queries/{i}/{a}/points"
@@ -307,27 +380,18 @@ class TactileModule(nn.Module):
     def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:
         return contacts(tensors, self.constants[f"queries/{i}/bodies"], self.constants[f"queries/{i}/{a}/contacts"], self.dtype)
 
-    def _memory_for(self, num_envs: int) -> dict[str, Tensor]:
-        """Return the state buffers, allocated once, as ordinary tensors even under `torch.inference_mode`."""
-        if self.has_state and self.num_envs is None:
-            with torch.inference_mode(False):
-                for sensor in self.plan.sensors:
-                    for name, memory in sensor.state.items():
-                        buffer = torch.full((num_envs, *memory.shape), memory.rest, dtype=self.dtype, device=self.device)
-                        self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
-        if self.has_state and self.num_envs != num_envs:
-            raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
-        return dict(self.memory.named_buffers())
+    def _dt_tensor(self, dt: float) -> Tensor:
+        """Return dt as a tensor that is written only when it changes.
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Make room for the state that is loaded: before the first call there is none."""
-        for sensor in self.plan.sensors:
-            for name in sensor.state:
-                value = state_dict.get(f"{prefix}memory.{sensor.name}:{name}")
-                if isinstance(value, Tensor):
-                    buffer = torch.zeros_like(value, dtype=self.dtype, device=self.device)
-                    self.memory.register_buffer(f"{sensor.name}:{name}", buffer)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        Raises:
+            StateError: If it is no time.
+        """
+        if not 0 < dt < math.inf:
+            raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
+        if self._dt is None or self._dt[0] != dt or self._dt[1].device != self.device or self._dt[1].dtype != self.dtype:
+            with torch.inference_mode(False):
+                self._dt = dt, torch.tensor(dt, dtype=self.dtype, device=self.device)
+        return self._dt[1]
 
 
 def _has_cpp_compiler() -> bool:

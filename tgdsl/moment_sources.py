@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from tgdsl.buffers import Constants
@@ -15,7 +16,12 @@ from tgdsl.plan import Plan, PlannedMoments
 
 
 def moment_sources(
-    plan: Plan, constants: Constants, path: str, planned: PlannedMoments, tensors: Mapping[str, Tensor]
+    plan: Plan,
+    constants: Constants,
+    path: str,
+    planned: PlannedMoments,
+    tensors: Mapping[str, Tensor],
+    shift: Tensor | None = None,
 ) -> list[MomentSource]:
     """Return the objects whose moments an answer has.
 
@@ -25,6 +31,7 @@ def moment_sources(
         path: Of the answer's moments among them.
         planned: Which moments.
         tensors: The state.
+        shift: Disturbance of the probes' radii (env, taxel) [m].
     """
     found = []
     for k, o in enumerate(planned.objects):
@@ -42,7 +49,8 @@ def moment_sources(
                 first_pair=target.first_pair,
                 num_pairs=target.num_pairs,
                 pair=pair,
-                radius=reach,
+                radius=reach if shift is None else torch.where(reach > 0, torch.clamp(reach + shift, min=0), 0.0),
+                shift=None if shift is None else torch.maximum(shift, -reach),
                 surface=_surface(constants, table, planned.backend, variant, radius_id, len(radii)),
                 planes=tuple(Plane(rot(own.unbind()), vec(at.unbind())) for own, at in zip(rotations, places, strict=True)),
                 area=(area if variant is None else area[variant])[:, None],

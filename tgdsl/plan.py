@@ -27,6 +27,7 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `links/…` | (link, …) | the geoms of links that points may meet, as those of an object: a variant is a link |
 | `queries/<i>/<answer>/points/<object>/{pair,link}` | (link,) | who meets it, see `geometry.points` |
 | `sensors/<name>/<constant>` | | what the kind's `lower` folded |
+| `sensors/<name>/noise/<knob>` | ([end,] channel, row) | values of its noise, see `sensors.noise.lower` |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
 """
 
@@ -45,7 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 4
+FORMAT = 5
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -171,13 +172,17 @@ class PlannedSkin:
 
 @dataclass(frozen=True)
 class PlannedAnswer:
-    """What some sensors feel of a query: which of its objects, whether they are gated, and what is wanted of them."""
+    """What some sensors feel of a query: which of its objects, whether they are gated, and what is wanted of them.
+
+    The probes' radii are disturbed by the noise of the sensor named in `radius_noise`, if any.
+    """
 
     objects: tuple[int, ...]
     is_gated: bool
     needs: tuple[str, ...]
     moments: PlannedMoments | None = None
     points: PlannedPoints | None = None
+    radius_noise: str = ""
 
 
 @dataclass(frozen=True)
@@ -191,34 +196,94 @@ class PlannedQuery:
 
 @dataclass(frozen=True)
 class PlannedReading:
-    """One entry of a module's readings: its name, what it has rows of (taxels or bodies), name and unit of each channel."""
+    """One entry of a module's readings: its name, what it has rows of (taxels or bodies), name and unit of each channel.
+
+    `steps` calls are stacked in it, oldest first; 0: it is of one call and has no such dimension.
+    """
 
     name: str
     rows: Literal["taxel", "body"]
     num_rows: int
     channels: tuple[str, ...]
     units: tuple[str, ...]
+    steps: int = 0
 
 
 @dataclass(frozen=True)
 class PlannedMemory:
-    """What a sensor carries from one call to the next: its value at rest, and its shape after the leading `env`."""
+    """What a sensor carries from one call to the next: its value at rest, and its shape after the leading `env`.
+
+    With `past` it is a ring of what was so at each call of so many seconds before the present one, (env, call, *shape).
+    """
 
     rest: float
     shape: tuple[int, ...]
+    past: float = 0.0
+
+
+@dataclass(frozen=True)
+class PlannedNoise:
+    """The imperfections of a sensor.
+
+    Attributes:
+        terms: The stages there are, in their order, see `sensors.noise.stages`.
+        constants: Names of the values that they read.
+        streams: What random numbers are drawn for, see `sensors.noise.random`.
+    """
+
+    terms: tuple[str, ...]
+    constants: tuple[str, ...]
+    streams: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PlannedHistory:
+    """How many calls a reading holds or is made of, and how."""
+
+    length: int
+    reduce: Literal["stack", "last", "median", "mean"]
 
 
 @dataclass(frozen=True)
 class PlannedSensor:
-    """One sensor: its kind, its query and which answer of it, its readings and the state it carries."""
+    """One way to read a sensor: what is computed for it alone.
+
+    A sensor that is read both clean and measured is computed once where noise comes after its equation, else twice.
+
+    Attributes:
+        name: Its name, `touch`, or `touch/clean` where another one is the measured sensor.
+        sensor: The sensor's name in the document.
+        kind: Its kind.
+        query: Number of its query.
+        answer: Which of that one's answers.
+        folder: Where its constants are.
+        constants: Their names.
+        state: What it carries from one call to the next: the kind's own, `noise/…` and `sample/…`.
+        signal: Channels of the signal that noise and sampling act on.
+        readings: Its readings: first its own, measured if it has noise; then the clean one, if that is read too; then reports.
+        noise: Its imperfections.
+        period: Time between its samples [s]; 0: it takes one at every call.
+        history: What is read of the last calls.
+    """
 
     name: str
+    sensor: str
     kind: str
     query: int
     answer: int
+    folder: str
     constants: tuple[str, ...]
     state: Mapping[str, PlannedMemory]
+    signal: tuple[str, ...]
     readings: tuple[PlannedReading, ...]
+    noise: PlannedNoise | None = None
+    period: float = 0.0
+    history: PlannedHistory | None = None
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether it wants to know when a reading is made: for chance, for what its noise remembers, or for its own rate."""
+        return bool(self.noise and self.noise.streams) or any("/" in name for name in self.state)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ UNITS: dict[str, dict[str, float]] = {
     "force": {"N": 1.0, "mN": 1e-3},
     "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
+    "frequency": {"Hz": 1.0, "kHz": 1e3},
     "number": {},
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""

@@ -111,8 +111,11 @@ BEYOND_A_SCHEMA = {
     "unknown noise profile",
     "unknown resolution",
     "knob in line",
-    "knob of a built-in profile",
     "knob of an own profile",
+    "knob of some links",
+    "profiles in a circle",
+    "unknown profile to start from",
+    "range the wrong way round",
 }
 """Mistakes that only the loader finds: between keys, of names and files, and those of YAML itself."""
 

@@ -130,7 +130,7 @@ def test_overrides_replace_values(tmp_path):
     loaded = read(tmp_path, overrides=overrides)
     assert loaded.resolution == "high"
     assert loaded.spec.sensors["touch"].threshold == 2e-3
-    assert loaded.spec.noise["mine"].bias == 0.0
+    assert loaded.spec.noise["mine"].bias == {"*": (0.0, 0.0)}
 
 
 @pytest.mark.parametrize(

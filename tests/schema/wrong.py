@@ -2,7 +2,10 @@
 
 from documents import DOCUMENT
 
-NO_KNOBS = 'leave the knob at its neutral value, or use "clean"'
+KNOBS = (
+    "it has bias, dead_probability, dead_range, drift, gain, hysteresis, jitter, quantization, radius_noise, read_delay, "
+    "release_threshold, white_noise"
+)
 KEYS = "known keys: noise, objects, observations, resolution, robot, scene, sensors, tgdsl"
 
 
@@ -24,7 +27,7 @@ WRONG = {
     "unknown key named as the kind": (
         after("    contact: {links: 1}\n"),
         'hand.yaml:12:5: sensors.touch.contact: unknown key "contact"; known keys: '
-        "feels, gate, kind, links, noise, readout, release_threshold, threshold",
+        "feels, gate, history, kind, links, noise, rate, readout, release_threshold, threshold",
     ),
     "unknown kind": (
         instead("kind: contact", "kind: contakt"),
@@ -121,19 +124,56 @@ WRONG = {
         "hand.yaml:6:13: resolution: found 3, expected a string",
     ),
     "knob in line": (
-        after("    noise:\n      bias: 0\n      gain: [0.9, 1.1]\n      drift: 1\n"),
-        "hand.yaml:15:14: sensors.touch.noise.drift: this version of tgdsl cannot disturb readings yet, "
-        f"but drift, gain would; {NO_KNOBS}",
-    ),
-    "knob of a built-in profile": (
-        after("    noise: noisy\n"),
-        "hand.yaml:12:12: sensors.touch.noise: this version of tgdsl cannot disturb readings yet, "
-        f"but dead_probability would; {NO_KNOBS}",
+        after("    noise:\n      bias: 0\n      gain: [0.9, 1.1]\n      crosstalk: {strength: 0.1, sigma: 2 mm}\n"),
+        f'hand.yaml:15:18: sensors.touch.noise.crosstalk: "contact" has no knob "crosstalk"; {KNOBS}',
     ),
     "knob of an own profile": (
-        after("    noise: old\nnoise:\n  old: {read_delay: 2}\n"),
-        "hand.yaml:12:12: sensors.touch.noise: this version of tgdsl cannot disturb readings yet, "
-        f"but read_delay would; {NO_KNOBS}",
+        after("    noise: old\nnoise:\n  old: {crosstalk: {strength: 0.1, sigma: 2 mm}}\n"),
+        f'hand.yaml:12:12: sensors.touch.noise: "contact" has no knob "crosstalk" (in the profile old → clean); {KNOBS}',
+    ),
+    "knob of some links": (
+        after("    noise: {links: {index_tip: {crosstalk: {strength: 0.1, sigma: 2 mm}}}}\n"),
+        f'hand.yaml:12:44: sensors.touch.noise.links.index_tip.crosstalk: "contact" has no knob "crosstalk"; {KNOBS}',
+    ),
+    "profiles in a circle": (
+        after("    noise: {like: a}\nnoise:\n  a: {like: b}\n  b: {like: a}\n"),
+        "hand.yaml:15:13: noise.b.like: noise profiles lead in a circle; a → b → a",
+    ),
+    "unknown profile to start from": (
+        after("    noise: {like: nosy}\n"),
+        'hand.yaml:12:19: sensors.touch.noise.like: unknown noise profile "nosy"; did you mean "noisy"?',
+    ),
+    "range the wrong way round": (
+        after("    noise: {white_noise: [2e-4, 1e-4]}\n"),
+        "hand.yaml:12:26: sensors.touch.noise.white_noise: [0.0002, 0.0001] is not ordered, expected [low, high]",
+    ),
+    "range of three": (
+        after("    noise: {bias: [1, 2, 3]}\n"),
+        "hand.yaml:12:19: sensors.touch.noise.bias: found a list of 3, expected a number or [low, high]",
+    ),
+    "share above one": (
+        after("    noise: {dead_probability: [0, 1.5]}\n"),
+        "hand.yaml:12:31: sensors.touch.noise.dead_probability: 1.5 is out of range, expected at most 1",
+    ),
+    "time constant of nothing": (
+        after("    noise: {hysteresis: {strength: 0.5, time_constant: 0}}\n"),
+        "hand.yaml:12:56: sensors.touch.noise.hysteresis.time_constant: 0 is out of range, expected more than 0",
+    ),
+    "unit of an amplitude's part": (
+        after("    noise: {white_noise: {depth: 1 mm}}\n"),
+        'hand.yaml:12:26: sensors.touch.noise.white_noise: depth: "1 mm" is not a quantity, expected a number',
+    ),
+    "rate of nothing": (
+        after("    rate: 0\n"),
+        "hand.yaml:12:11: sensors.touch.rate: 0 is out of range, expected more than 0",
+    ),
+    "history of nothing": (
+        after("    history: 0\n"),
+        "hand.yaml:12:14: sensors.touch.history: found 0: input should be greater than or equal to 1",
+    ),
+    "unknown reduction": (
+        after("    history: {length: 3, reduce: max}\n"),
+        "hand.yaml:12:34: sensors.touch.history.reduce: found \"max\", expected 'stack', 'last', 'median' or 'mean'",
     ),
     "layout file that does not exist": (
         instead("layout.yaml", "lay.yaml"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Literal
 
@@ -10,37 +11,71 @@ import numpy as np
 from tgdsl import observations
 from tgdsl.compiler import passes
 from tgdsl.compiler.felt import settle
+from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.moment_tables import moment_tables
 from tgdsl.compiler.passes import Draft, DraftQuery, DraftSensor
 from tgdsl.compiler.point_tables import cloud, own_geoms, planned_skin
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import BakeError, LowerError, did_you_mean
 from tgdsl.layout import Link
-from tgdsl.plan import Origin, Plan, PlannedMemory, PlannedObservation, PlannedReading, PlannedSensor, SceneFile
+from tgdsl.plan import (
+    Origin,
+    Plan,
+    PlannedHistory,
+    PlannedMemory,
+    PlannedNoise,
+    PlannedObservation,
+    PlannedReading,
+    PlannedSensor,
+    SceneFile,
+)
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel
+from tgdsl.sensors.noise.lower import LoweredNoise
 
 
 def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...]) -> Draft:
     """Lower every sensor of a document; nothing is shared or dropped yet."""
     by_name = {kind.name: kind for kind in kinds}
-    sensors = []
+    sensors: list[DraftSensor] = []
     for name, spec in loaded.spec.sensors.items():
-        kind = by_name[spec.kind]  # type: ignore[attr-defined]
-        taxels = resolved.layout.taxels_of(resolved.links[name])
         try:
-            lowered = kind.lower(spec, resolved.layout.take(taxels), resolved.surface_of)
+            sensors += _ways(loaded, resolved, name, by_name[spec.kind])  # type: ignore[attr-defined]
         except LowerError as error:
             path: Path = ("sensors", name, *([error.field] if error.field else []))
             loaded.problems.append(loaded.problem(path, error.what, error.hint))
-            continue
-        readings = (name, f"{name}/clean") if spec.readout == "both" else (name,)
-        sensors.append(DraftSensor(name, kind.name, taxels, spec.feels, spec.is_gated, lowered, readings))
     loaded.raise_problems()
     return Draft(resolved.layout, sensors, dict(resolved.objects), resolved.scene, list(resolved.unused))
+
+
+def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[DraftSensor]:
+    """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
+    spec = loaded.spec.sensors[name]
+    taxels = resolved.layout.taxels_of(resolved.links[name])
+    layout = resolved.layout.take(taxels)
+    clean = kind.lower(spec, layout, resolved.surface_of)
+    if spec.readout == "clean":
+        return [DraftSensor(name, kind.name, spec, taxels, clean, f"sensors/{name}", (name,), None)]
+    knobs = knobs_of(loaded, resolved, name, layout, kind)
+    loaded.raise_problems()
+    noisy = measured_spec(spec, knobs)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
+    noise = imperfections(name, spec, kind, knobs, lowered, layout)
+    both = spec.readout == "both"
+    if noise is not None and noise.radius > 0 and clean.moments is not None:
+        request = dataclasses.replace(clean.moments, radius_noise=noise.radius)
+        lowered = clean = dataclasses.replace(clean, moments=request)
+    apart = noise is not None and (noise.radius > 0 or kind.decide is not None or kind.gains_depth)
+    readings = (name, f"{name}/clean") if both and not apart else (name,)
+    ways = [DraftSensor(name, kind.name, spec, taxels, lowered, f"sensors/{name}", readings, noise)]
+    if both and apart:
+        folder = f"sensors/{name}" if lowered is clean else f"sensors/{name}/clean"
+        without = dataclasses.replace(clean, reports={})
+        ways.append(DraftSensor(f"{name}/clean", kind.name, spec, taxels, without, folder, (f"{name}/clean",), None))
+    return ways
 
 
 def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin) -> Plan:
@@ -51,7 +86,8 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
             should.
     """
     work = draft(loaded, resolved, kinds)
-    for sensor, target in passes.prune(work):
+    for name, target in passes.prune(work):
+        sensor = name.removesuffix("/clean")
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
@@ -102,7 +138,7 @@ def _settle_moments(loaded: Loaded, work: Draft) -> None:
         request = sensor.lowered.moments
         if request is None:
             continue
-        path: Path = ("sensors", sensor.name)
+        path: Path = ("sensors", sensor.sensor)
         for i, name in enumerate(sensor.feels):
             users = [s for s in work.sensors if s.lowered.moments == request and name in s.feels]
             radii = sorted({float(r) for s in users for r in passes.reach_of(work, s) if r > 0})
@@ -159,21 +195,53 @@ def _sensor(
 ) -> PlannedSensor:
     lowered, num_taxels = part.lowered, len(part.taxels)
     for name, value in lowered.constants.items():
-        arrays[f"sensors/{part.name}/{name}"] = value
+        arrays[f"{part.folder}/{name}"] = value
     rows = {"taxel": num_taxels, "body": len(work.layout.take(part.taxels).bodies)}
+    history = part.spec.history
+    steps = history.length if history is not None and history.reduce == "stack" else 0
 
-    def reading(name: str, kind: Literal["taxel", "body"], channels: tuple[Channel, ...]) -> PlannedReading:
-        return PlannedReading(name, kind, rows[kind], tuple(c.name for c in channels), tuple(c.unit for c in channels))
+    def reading(name: str, kind: Literal["taxel", "body"], channels: tuple[Channel, ...], steps: int) -> PlannedReading:
+        return PlannedReading(name, kind, rows[kind], tuple(c.name for c in channels), tuple(c.unit for c in channels), steps)
 
-    readings = [reading(name, lowered.rows, lowered.channels) for name in part.readings]
-    reports = [reading(f"{part.name}/{key}", "body", channels) for key, channels in lowered.reports.items()]
+    readings = [reading(name, lowered.rows, lowered.channels, steps) for name in part.readings]
+    reports = [reading(f"{part.sensor}/{key}", "body", channels, 0) for key, channels in lowered.reports.items()]
     points = queries[place[0]].planned.answers[place[1]].points
     num_points = 0 if points is None else points.num_points * sum(map(len, points.links))
     shapes = {None: (num_taxels,), "points": (num_points,)}
     memory = {
         n: PlannedMemory(m.rest, m.shape if isinstance(m.shape, tuple) else shapes[m.shape]) for n, m in lowered.state.items()
     }
-    return PlannedSensor(part.name, part.kind, *place, tuple(sorted(lowered.constants)), memory, (*readings, *reports))
+    signal = lowered.signal or lowered.channels
+    names, shape = [channel.name for channel in signal], (rows[lowered.rows],)
+    if part.noise is not None:
+        for name, value in part.noise.constants.items():
+            arrays[f"sensors/{part.name}/noise/{name}"] = value
+        for term in part.noise.memory:
+            past = part.noise.past if term == "ring" else 0.0
+            memory |= {f"noise/{term}/{name}": PlannedMemory(0.0, shape, past) for name in names}
+    if part.spec.rate is not None:
+        memory["sample/phase"] = PlannedMemory(0.0, ())
+        held = ["measured", "clean"][: len(readings)]
+        memory |= {f"sample/{which}/{name}": PlannedMemory(0.0, shape) for which in held for name in names}
+    return PlannedSensor(
+        name=part.name,
+        sensor=part.sensor,
+        kind=part.kind,
+        query=place[0],
+        answer=place[1],
+        folder=part.folder,
+        constants=tuple(sorted(lowered.constants)),
+        state=memory,
+        signal=tuple(names),
+        readings=(*readings, *reports),
+        noise=None if part.noise is None else _noise(part.noise),
+        period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
+        history=None if history is None else PlannedHistory(history.length, history.reduce),
+    )
+
+
+def _noise(noise: LoweredNoise) -> PlannedNoise:
+    return PlannedNoise(noise.terms, tuple(sorted(noise.constants)), noise.streams)
 
 
 def _observations(
@@ -203,7 +271,7 @@ def _observations(
             for name, value in constants.items():
                 arrays[f"observations/{group}/{i}/{name}"] = value
             channels = tuple(reading.channels.index(channel) for channel in wanted)
-            count = observations.num_features(spec.type, reading.num_rows, len(layout.links))
+            count = max(reading.steps, 1) * observations.num_features(spec.type, reading.num_rows, len(layout.links))
             terms.append(PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count))
     return tuple(terms)
 

@@ -61,7 +61,7 @@ def moment_tables(felt: FeltBody, request: MomentsRequest, radii: Sequence[float
             tables, accuracy = _fields(solid, request, radii)
             arrays |= tables
         elif any(solid):
-            arrays |= _clouds(solid, request, radii[-1])
+            arrays |= _clouds(solid, request, radii[-1] + request.radius_noise)
     except BakeError as error:
         raise LowerError(f'body "{felt.body}": {error}') from error
     return MomentTables(tuple(radii), area, arrays, tuple(accuracy))
@@ -79,7 +79,8 @@ def _fields(
     baked, left = [], request.max_bytes
     for geoms in variants:
         for radius in radii:
-            baked.append(bake_field(geoms, radius, request.tolerance, request.max_bytes))
+            with_slope = request.radius_noise > 0
+            baked.append(bake_field(geoms, radius, request.tolerance, request.max_bytes, with_slope))
             left -= baked[-1].values.nbytes
     if left < 0:
         needed = request.max_bytes - left

@@ -19,20 +19,53 @@ from tgdsl.compiler.point_tables import Skin, pack_points, skin_rows
 from tgdsl.compiler.robot import Model
 from tgdsl.layout import Layout
 from tgdsl.plan import SLOT_FIELDS, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
-from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest
+from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest, ProbeSpec
+from tgdsl.sensors.noise.lower import LoweredNoise
 
 
 @dataclass(frozen=True, eq=False)
 class DraftSensor:
-    """A lowered sensor: its taxels (rows of the layout), what it feels and how that is gated, its readings' names."""
+    """One way to read a sensor, lowered.
+
+    Attributes:
+        name: Its name, see `plan.PlannedSensor`.
+        kind: Its kind.
+        spec: The sensor's spec.
+        taxels: Its taxels, rows of the layout.
+        lowered: What its kind says of it.
+        folder: Where its constants are.
+        readings: Names of its readings, reports left out.
+        noise: Its imperfections.
+    """
 
     name: str
     kind: str
+    spec: ProbeSpec
     taxels: np.ndarray
-    feels: tuple[str, ...]
-    is_gated: bool
     lowered: Lowered
+    folder: str
     readings: tuple[str, ...]
+    noise: LoweredNoise | None
+
+    @property
+    def sensor(self) -> str:
+        """The sensor's name in the document."""
+        return self.name.removesuffix("/clean")
+
+    @property
+    def feels(self) -> tuple[str, ...]:
+        """What it feels."""
+        return self.spec.feels
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether an object is felt only in contact."""
+        return self.spec.is_gated
+
+    @property
+    def radius_noise(self) -> float:
+        """Largest disturbance of a radius [m]."""
+        return 0.0 if self.noise is None else self.noise.radius
 
 
 @dataclass(eq=False)
@@ -81,6 +114,7 @@ class DraftAnswer:
         radius: How far from each taxel [m]; −∞ for inactive ones.
         request: How moments are found, if they are.
         points: Which points of objects are wanted, if any.
+        radius_noise: The sensor whose noise disturbs the radii, if any.
         needs: What else they need.
     """
 
@@ -89,6 +123,7 @@ class DraftAnswer:
     radius: np.ndarray
     request: MomentsRequest | None = None
     points: PointsRequest | None = None
+    radius_noise: str = ""
     needs: set[str] = field(default_factory=set)
 
 
@@ -123,7 +158,7 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
             wanted |= pairs - apart
             never |= apart
             if apart == pairs:
-                hopeless.append((sensor.name, target))
+                hopeless.append((sensor.sensor, target))
     for pair in sorted(never - wanted, key=_order):
         work.dropped.append((f"pair {pair.link} – {pair.object}", "they can never be in contact"))
     work.pairs = sorted(wanted, key=_order)
@@ -142,7 +177,7 @@ def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
     answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
         probes, radius = sensor.taxels.tobytes(), reach_of(work, sensor)
-        wanted = sensor.lowered.moments, sensor.lowered.points
+        wanted = sensor.lowered.moments, sensor.lowered.points, sensor.name if sensor.radius_noise > 0 else ""
         query = queries.setdefault(probes, DraftQuery(sensor.taxels))
         key = probes, sensor.feels, sensor.is_gated, radius.tobytes(), *wanted
         if key not in answers:
@@ -162,7 +197,7 @@ def reach_of(work: Draft, sensor: DraftSensor) -> np.ndarray:
 def margin(work: Draft, name: str) -> float | None:
     """Return the largest distance from an object's surface that any sensor asks for [m]; None if no sensor measures it."""
     users = [s for s in work.sensors if name in s.feels and _is_measuring(reach_of(work, s), s.lowered.needs)]
-    return max((max(float(reach_of(work, s).max()), s.lowered.range) for s in users), default=None)
+    return max((max(float(reach_of(work, s).max()), s.lowered.range) + s.radius_noise for s in users), default=None)
 
 
 def _is_measuring(radius: np.ndarray, needs: Collection[str]) -> bool:
@@ -217,6 +252,7 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
     fields += ["contact_netforce"] if "contacts" in needs else []
     fields += ["variant"] if any(target.num_variants > 1 for target in varied) else []
     fields += ["object_size"] if any(target.is_sized for target in varied) else []
+    fields += ["dt"] if any(_is_timed(sensor) for sensor in work.sensors) else []
     inputs = Inputs(
         fields=tuple(fields),
         bodies=tuple(bodies),
@@ -227,6 +263,12 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
         num_variants=tuple(target.num_variants for target in varied),
     )
     return objects, inputs
+
+
+def _is_timed(sensor: DraftSensor) -> bool:
+    """Return whether a sensor wants to know how much time has passed."""
+    terms = () if sensor.noise is None else sensor.noise.terms
+    return sensor.spec.rate is not None or "hysteresis" in terms or "delay" in terms
 
 
 def _object(work: Draft, name: str) -> PlannedObject:
@@ -277,5 +319,6 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
             path, layout = f"queries/{i}/{a}/points", work.layout.take(query.taxels)
             points = pack_points(answer.points, reachable, layout, work.pairs, allowed, names, list(work.skins), path, arrays)
         chosen_ids = tuple(felt.index(name) for name in chosen)
-        answers.append(PlannedAnswer(chosen_ids, answer.is_gated, tuple(sorted(answer.needs)), moments, points))
+        needs = tuple(sorted(answer.needs))
+        answers.append(PlannedAnswer(chosen_ids, answer.is_gated, needs, moments, points, answer.radius_noise))
     query.planned = PlannedQuery(tuple(names.index(name) for name in felt), len(bodies), tuple(answers))

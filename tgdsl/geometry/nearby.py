@@ -33,7 +33,9 @@ class MomentSource(NamedTuple):
         first_pair: Index of its first pair.
         num_pairs: Number of its pairs.
         pair: Index of each probe's pair among them.
-        radius: Sensing radius of each probe towards it [m]; 0 where the probe is inactive or is on the object itself.
+        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on the
+            object itself.
+        shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
         surface: Its outer surface but for planes; None if there is no more to it.
         planes: Its planes.
         area: Area of its outer surface, planes left out [m²].
@@ -43,7 +45,8 @@ class MomentSource(NamedTuple):
     first_pair: int
     num_pairs: int
     pair: Int[Tensor, " taxel"]
-    radius: Float[Tensor, " taxel"]
+    radius: Float[Tensor, "*env taxel"]
+    shift: Float[Tensor, "env taxel"] | None
     surface: MomentField | PointCloud | None
     planes: tuple[Plane, ...]
     area: Float[Tensor, "case 1"]
@@ -69,7 +72,7 @@ def _moments(point: Vec, source: MomentSource) -> Moments:
     """Return the moments of an object at points in its frame."""
     parts = []
     if isinstance(source.surface, MomentField):
-        near = field_moments(point, source.surface)
+        near = field_moments(point, source.surface, source.shift)
         # The field knows no radius: an inactive probe asks one that is not its own.
         is_active = source.radius > 0
         none = torch.zeros_like(near.mass)

@@ -253,7 +253,7 @@ def feel(
     pairs: Pairs,
     probes: Probes,
     near: Sequence[Near],
-    reach: Float[Tensor, "object taxel"],
+    reach: Float[Tensor, "object *env taxel"],
     needs: Collection[str],
     contacts: Contacts | None = None,
 ) -> Felt:

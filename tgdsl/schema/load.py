@@ -115,7 +115,7 @@ def load(
         raise SpecError(problems)
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
     loaded.layout = _layout(loaded)
-    problems += _name_problems(loaded)
+    problems += _name_problems(loaded, kinds)
     return loaded
 
 
@@ -187,8 +187,8 @@ def _shown(path: FilePath, loaded: Loaded, wanted: str | None) -> str:
     return str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
 
 
-def _name_problems(loaded: Loaded) -> list[Problem]:
-    """Return references within the document that lead nowhere, and what it asks for that cannot be had yet."""
+def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
+    """Return references within the document that lead nowhere, and knobs that a kind does not have."""
     spec, source = loaded.spec, loaded.source
     problems: list[Problem] = []
 
@@ -197,15 +197,15 @@ def _name_problems(loaded: Loaded) -> list[Problem]:
         found = source.value.get(key, {})
         return list(found) if isinstance(found, dict) else None
 
-    objects, profiles, sensors = names("objects"), names("noise"), names("sensors") or []
-
+    objects, sensors = names("objects"), names("sensors") or []
+    by_name = {kind.name: kind for kind in kinds}
     for name, sensor in spec.sensors.items():
         path: Path = ("sensors", name)
         for i, target in enumerate(sensor.feels):
             if objects is not None and target not in objects:
                 hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
-        problems += _noise_problems(loaded, path, sensor.noise, getattr(sensor, "kind", ""), profiles)
+        problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
     for group in names("observations") or []:
         terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
@@ -224,18 +224,44 @@ def _name_problems(loaded: Loaded) -> list[Problem]:
     return problems
 
 
-def _noise_problems(loaded: Loaded, path: Path, noise: str | NoiseSpec, kind: str, profiles: list[str] | None) -> list[Problem]:
-    """Return the knobs that are turned: the grammar has them, but no sensor obeys them yet, so none may pass unnoticed."""
-    path = (*path, "noise")
-    if isinstance(noise, str) and noise not in loaded.spec.noise:
-        if profiles is None or noise in profiles:
-            return []  # the profile itself, or all of them, have a mistake, which is reported there
-        if noise not in PROFILES:
-            hint = did_you_mean(noise, [*profiles, *PROFILES], "noise profiles")
-            return [loaded.source.problem(path, f'unknown noise profile "{noise}"', hint)]
-    knobs = resolve_noise(noise, kind, loaded.spec.noise).active_knobs()
-    if not knobs:
-        return []
-    what = f"this version of tgdsl cannot disturb readings yet, but {', '.join(knobs)} would"
-    knob_path = (*path, knobs[0]) if isinstance(noise, NoiseSpec) else path
-    return [loaded.source.problem(knob_path, what, 'leave the knob at its neutral value, or use "clean"')]
+def _noise_problems(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kind | None) -> list[Problem]:
+    """Return what is wrong with a sensor's noise: profiles that do not exist, and knobs that its kind does not have."""
+    path: Path = ("sensors", name, "noise")
+    chain, problem = _profiles(loaded, path, noise)
+    if problem is not None:
+        return [problem]
+    if chain is None or kind is None:
+        return []  # the profile itself, or all of them, have a mistake, which is reported there
+    problems = []
+    own = noise if isinstance(noise, NoiseSpec) else None
+    base, links = resolve_noise(noise, kind.name, loaded.spec.noise)
+    for pattern, knobs in [("", base), *links]:
+        for knob in (knob for knob in knobs.active() if knob not in kind.knobs):
+            what = f'"{kind.name}" has no knob "{knob}"'
+            hint = f"it has {', '.join(sorted(kind.knobs))}"
+            place = (*path, "links", pattern, knob) if pattern else (*path, knob)
+            is_own = own is not None and (pattern in own.links if pattern else knob in own.model_fields_set)
+            where = "" if is_own else f" (in the profile {' → '.join(chain)})"
+            problems.append(loaded.source.problem(place if is_own else path, what + where, hint))
+    return problems
+
+
+def _profiles(loaded: Loaded, path: Path, noise: str | NoiseSpec) -> tuple[list[str] | None, Problem | None]:
+    """Return the profiles that a sensor's noise leads to, one after the other; None if one of them has a mistake of its own."""
+    found = loaded.source.value.get("noise", {})
+    written = list(found) if isinstance(found, dict) else None
+    chain: list[str] = []
+    place, name = path, noise if isinstance(noise, str) else noise.like
+    place = path if isinstance(noise, str) else (*path, "like")
+    while True:
+        if name in chain:
+            return None, loaded.source.problem(place, "noise profiles lead in a circle", " → ".join([*chain, name]))
+        chain.append(name)
+        if name not in loaded.spec.noise:
+            if name in PROFILES and (written is None or name not in written):
+                return chain, None
+            if written is None or name in written:
+                return None, None
+            hint = did_you_mean(name, [*written, *PROFILES], "noise profiles")
+            return None, loaded.source.problem(place, f'unknown noise profile "{name}"', hint)
+        place, name = ("noise", name, "like"), loaded.spec.noise[name].like

@@ -14,16 +14,32 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, Tag
+from pydantic import BeforeValidator, Field, StrictInt, WithJsonSchema
 from torch import Tensor
 
-from tgdsl.fields import TEXT_OR_OTHER, Selector, SpecModel, Text
+from tgdsl.fields import Frequency, Selector, SpecModel
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout
 from tgdsl.regions import RegionPart
-from tgdsl.sensors.noise import NoiseSpec
+from tgdsl.sensors.noise import BASE, NoiseField
+
+
+class HistorySpec(SpecModel):
+    """What is read of the last calls."""
+
+    length: Annotated[StrictInt, Field(ge=1)]
+    """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
+    reduce: Literal["stack", "last", "median", "mean"] = "stack"
+    """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
+
+
+History = Annotated[
+    HistorySpec,
+    BeforeValidator(lambda found: {"length": found} if isinstance(found, int) else found),
+    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 1}, HistorySpec.model_json_schema()]}),
+]
 
 
 class SensorSpec(SpecModel):
@@ -31,10 +47,14 @@ class SensorSpec(SpecModel):
 
     links: Selector
     """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
-    noise: Annotated[Text | Annotated[NoiseSpec, Tag("other")], TEXT_OR_OTHER] = "clean"
+    noise: NoiseField = "clean"
     """A noise profile's name, or the knobs in line."""
     readout: Literal["clean", "measured", "both"] = "measured"
     """`measured` with the imperfections of `noise`, `clean` without, or `both`: `<name>` and `<name>/clean`."""
+    rate: Frequency | None = None
+    """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
+    history: History | None = None
+    """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
 
 
 class ProbeSpec(SensorSpec):
@@ -93,6 +113,7 @@ class MomentsRequest:
         tolerance: Root mean square error of a field as a fraction of full scale.
         max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
         with_area: Whether the area of the felt objects is wanted, so that there must be one.
+        radius_noise: By how much radii may differ from the probes' own [m]; set by the compiler.
     """
 
     backend: Literal["field", "points"]
@@ -100,6 +121,7 @@ class MomentsRequest:
     tolerance: float
     max_bytes: int
     with_area: bool
+    radius_noise: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -132,6 +154,7 @@ class Lowered:
         slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
         moments: How moments are found, if `needs` has "moments".
         points: Which points, if `needs` has "points".
+        signal: What `forward` returns, if the kind decides: what noise acts on.
     """
 
     channels: tuple[Channel, ...]
@@ -145,6 +168,7 @@ class Lowered:
     slots: int = 0
     moments: MomentsRequest | None = None
     points: PointsRequest | None = None
+    signal: tuple[Channel, ...] | None = None
 
 
 SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
@@ -164,12 +188,21 @@ class Kind:
         forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel) or, of what has
             a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old.
         reference: `(spec, layout, touch, state) → (reading (row, channel), new state)` for one environment, in NumPy.
+        decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
+            `forward` returns is then the signal, which noise disturbs first.
+        knobs: Names of the noise knobs that it has.
+        gains_depth: Whether a taxel's gain is of the depth that `forward` gets rather than of the reading.
+        idle_knobs: Those of its knobs that change nothing in what it reads.
     """
 
     spec: type[ProbeSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
     forward: Callable[[Felt, Probes, Constants, State], tuple[Mapping[str, Tensor], State]]
     reference: Callable[[Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "row channel"], dict[str, np.ndarray]]]
+    decide: Callable[[Mapping[str, Tensor], Constants, State], tuple[Mapping[str, Tensor], State]] | None = None
+    knobs: frozenset[str] = BASE
+    gains_depth: bool = False
+    idle_knobs: frozenset[str] = frozenset()
 
     @property
     def name(self) -> str:

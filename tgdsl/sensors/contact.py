@@ -10,6 +10,7 @@ Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: n
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -33,6 +34,7 @@ from tgdsl.sensors.base import (
     SurfaceOf,
     scalar,
 )
+from tgdsl.sensors.noise import TAXEL
 
 
 class ContactSpec(ContactProbeSpec):
@@ -73,23 +75,26 @@ def reference(
 def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The bit is state only where the two thresholds differ."""
     constants = {"threshold": scalar(spec.threshold)}
+    channels, signal = (Channel("contact", "1"),), (Channel("depth", "m"),)
     if spec.release == spec.threshold:
-        return Lowered(channels=(Channel("contact", "1"),), constants=constants)
-    return Lowered(
-        channels=(Channel("contact", "1"),),
-        constants={**constants, "release_threshold": scalar(spec.release)},
-        state={"bit": Memory()},
-    )
+        return Lowered(channels, constants, signal=signal)
+    constants["release_threshold"] = scalar(spec.release)
+    return Lowered(channels, constants, state={"bit": Memory()}, signal=signal)
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the depth plane [m], which is what noise acts on."""
+    return {"depth": felt.depth}, {}
+
+
+def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the bit plane, 0 or 1 in the module's dtype."""
-    threshold = constants["threshold"]
+    depth, threshold = signal["depth"], constants["threshold"]
     if "bit" in state:
         threshold = torch.where(state["bit"] > 0.5, constants["release_threshold"], threshold)
-    bit = (felt.depth > threshold).to(felt.depth.dtype)
-    bit = torch.where(felt.depth.isnan(), felt.depth, bit)  # a broken pose must not look like no contact
+    bit = (depth > threshold).to(depth.dtype)
+    bit = torch.where(depth.isnan(), depth, bit)  # a broken pose must not look like no contact
     return {"contact": bit}, ({"bit": bit} if "bit" in state else {})
 
 
-CONTACT = Kind(ContactSpec, lower, forward, reference)
+CONTACT = Kind(ContactSpec, lower, forward, reference, decide, TAXEL | {"release_threshold"})

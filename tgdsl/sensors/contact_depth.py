@@ -24,6 +24,7 @@ from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
+from tgdsl.sensors.noise import TAXEL
 
 
 class ContactDepthSpec(ContactProbeSpec):
@@ -50,4 +51,4 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return {"depth": felt.depth}, {}
 
 
-CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference)
+CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference, knobs=TAXEL)

@@ -40,6 +40,7 @@ from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
 from tgdsl.sensors import footprint
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
+from tgdsl.sensors.noise import FORCE
 
 SPACINGS = 3.0
 """Default radius of a footprint, in spacings of the taxels: the middle of a square of four is within half of it."""
@@ -158,4 +159,4 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return readings, {}
 
 
-FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference)
+FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE)

@@ -43,6 +43,7 @@ from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
+from tgdsl.sensors.noise import FORCE
 
 NO_FORCE = 1e-9
 """Normal force of a body's taxels [N] up to which there is nothing to balance."""
@@ -197,4 +198,4 @@ def _balance(pressed: Tensor, felt: Felt, constants: Constants) -> Tensor:
     return torch.where(is_pressed, wanted / torch.where(is_pressed, total, 1.0), 0.0)[:, constants["body"]]
 
 
-KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference)
+KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference, knobs=FORCE)

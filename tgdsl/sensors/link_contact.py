@@ -12,6 +12,7 @@ Source: MuJoCo's contact sensor with the reduction `netforce` (XML reference, se
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -58,17 +59,22 @@ def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lower
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
     constants = {"threshold": scalar(spec.threshold)}
     nowhere = np.full(layout.num_taxels, -np.inf)
-    return Lowered(tuple(channels), constants, rows="body", needs=frozenset({"contacts"}), radius=nowhere)
+    needs, force = frozenset({"contacts"}), tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
+    return Lowered(tuple(channels), constants, rows="body", needs=needs, radius=nowhere, signal=force)
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the bit [1] and the force planes [N], by body."""
+    """Return the force planes [N], by body, which are what noise acts on."""
     assert felt.contacts is not None
-    net = felt.contacts.net
-    readings = {f"force_{axis}": plane for axis, plane in zip("xyz", net, strict=True)}
-    size = planes.safe_sqrt(planes.dot(net, net))
-    readings["contact"] = torch.where(size.isnan(), size, (size > constants["threshold"]).to(size.dtype))
-    return readings, {}
+    return {f"force_{axis}": plane for axis, plane in zip("xyz", felt.contacts.net, strict=True)}, {}
 
 
-LINK_CONTACT = Kind(LinkContactSpec, lower, forward, reference)
+def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the bit [1] and the force planes [N], by body."""
+    force = (signal["force_x"], signal["force_y"], signal["force_z"])
+    size = planes.safe_sqrt(planes.dot(force, force))
+    bit = torch.where(size.isnan(), size, (size > constants["threshold"]).to(size.dtype))
+    return {**signal, "contact": bit}, {}
+
+
+LINK_CONTACT = Kind(LinkContactSpec, lower, forward, reference, decide)

@@ -46,6 +46,7 @@ from tgdsl.sensors.base import (
     SurfaceOf,
     scalar,
 )
+from tgdsl.sensors.noise import FORCE
 
 
 class ProximitySpec(ProbeSpec):
@@ -155,4 +156,4 @@ def _slip(felt: Felt, name: str, probes: Probes, is_absolute: Tensor) -> Vec:
     return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
 
 
-PROXIMITY = Kind(ProximitySpec, lower, forward, reference)
+PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE)

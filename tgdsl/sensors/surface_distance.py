@@ -28,6 +28,7 @@ from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
 from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
+from tgdsl.sensors.noise import PROBE
 
 
 class SurfaceDistanceSpec(ProbeSpec):
@@ -75,4 +76,4 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return readings, {}
 
 
-SURFACE_DISTANCE = Kind(SurfaceDistanceSpec, lower, forward, reference)
+SURFACE_DISTANCE = Kind(SurfaceDistanceSpec, lower, forward, reference, knobs=PROBE, idle_knobs=frozenset({"radius_noise"}))

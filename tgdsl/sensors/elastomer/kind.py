@@ -48,6 +48,7 @@ from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.point_anchors import Markers
 from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
+from tgdsl.sensors.noise import TAXEL
 
 CHANNELS = tuple(Channel(f"displacement_{axis}", "m") for axis in "xyz")
 
@@ -126,4 +127,4 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
     return planes.vec(operators.apply(constants, "traction", traction))
 
 
-ELASTOMER = Kind(ElastomerSpec, lower, forward, reference)
+ELASTOMER = Kind(ElastomerSpec, lower, forward, reference, knobs=TAXEL, gains_depth=True)

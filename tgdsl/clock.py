@@ -1,0 +1,116 @@
+"""When a reading is made, and with which random numbers: what a module counts where its sensors are imperfect or have rates.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tgdsl.plan import PlannedSensor
+from tgdsl.sensors.noise.random import sensor_key, streams
+from tgdsl.sensors.noise.stages import Now
+
+COUNTS = ("step", "episode", "age")
+
+
+class Clock(nn.Module):
+    """Counts calls and episodes. It holds nothing until `start`, nor if no sensor asks for it.
+
+    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes), `step` (calls so
+    far), `episode` (resets of each environment, (env,)), `age` (calls since the last one, (env,)).
+    """
+
+    def __init__(self, sensors: Sequence[PlannedSensor]):
+        """Note which sensors want to know."""
+        super().__init__()
+        self._sensors = [sensor for sensor in sensors if sensor.is_timed]
+        self._seed, self._first_env = 0, None
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any sensor wants to know."""
+        return bool(self._sensors)
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments; None before the start."""
+        return len(self._buffers["age"]) if "age" in self._buffers else None  # type: ignore[arg-type]
+
+    def start(self, num_envs: int, device: torch.device) -> None:
+        """Begin to count."""
+        first = _rank() * num_envs if self._first_env is None else self._first_env
+        values = {"seed": self._seed, "first_env": first, "step": 0}
+        for name, value in values.items():
+            self.register_buffer(name, torch.tensor(value, dtype=torch.int64, device=device))
+        for name in ("episode", "age"):
+            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=device))
+        self._set_keys()
+
+    def seed_with(self, seed: int, first_env: int | None) -> None:
+        """Choose other random numbers, from the next call on; environments are counted from `first_env`."""
+        self._seed, self._first_env = seed, first_env
+        if self.num_envs is not None:
+            num_envs, device = self.num_envs, self._buffers["age"].device  # type: ignore[union-attr]
+            self.start(num_envs, device)
+
+    def reset(self, env_ids: Any) -> None:
+        """Begin a new episode in some environments."""
+        if self.num_envs is not None:
+            self._buffers["episode"][env_ids] += 1  # type: ignore[index]
+            self._buffers["age"][env_ids] = 0  # type: ignore[index]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what `now` and `after` want, by name."""
+        return {f"clock/{name}": buffer for name, buffer in self._buffers.items() if buffer is not None}
+
+    def now(self, sensor: PlannedSensor, clock: Mapping[str, Tensor], dt: Tensor | None, phase: Tensor | None) -> Now:
+        """Return when a sensor is read.
+
+        Args:
+            sensor: The sensor.
+            clock: What `tensors` returned.
+            dt: Time since the last call [s].
+            phase: Time since the sensor's last sample was due, (env,) [s]; None if it takes one at every call.
+        """
+        age, drawn = clock["clock/age"][:, None], {}
+        if sensor.noise is not None and sensor.noise.streams:
+            env = torch.arange(len(age), device=age.device) + clock["clock/first_env"]
+            key = clock[f"clock/key {sensor.sensor}"]
+            drawn = streams(key, env, clock["clock/step"], clock["clock/episode"], sensor.noise.streams)
+        if phase is None or dt is None:
+            return Now(dt, clock["clock/step"], age, None, drawn)
+        is_due = (phase[:, None] + 1.5 * dt >= sensor.period) | (age == 0)
+        return Now(dt, clock["clock/step"], age, is_due, drawn)
+
+    @staticmethod
+    def after(clock: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the counts after a call."""
+        return {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+
+    def _set_keys(self) -> None:
+        seed, device = int(self._buffers["seed"]), self._buffers["seed"].device  # type: ignore[arg-type, union-attr]
+        for sensor in self._sensors:
+            words = torch.tensor(sensor_key(seed, sensor.sensor), dtype=torch.int32, device=device)
+            self.register_buffer(f"key {sensor.sensor}", words, persistent=False)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        """Make room for the counts that are loaded, and go on with their seed."""
+        age = state_dict.get(f"{prefix}age")
+        if self.is_wanted and isinstance(age, Tensor):
+            device = self._buffers["age"].device if "age" in self._buffers else torch.device("cpu")  # type: ignore[union-attr]
+            self.start(len(age), device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+        if self.num_envs is not None:
+            self._seed, self._first_env = int(self._buffers["seed"]), int(self._buffers["first_env"])  # type: ignore[arg-type]
+            self._set_keys()
+
+
+def _rank() -> int:
+    """Return the number of this process among those of a distributed run; 0 if there is none."""
+    distributed = torch.distributed
+    return distributed.get_rank() if distributed.is_available() and distributed.is_initialized() else 0

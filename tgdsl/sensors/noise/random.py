@@ -1,0 +1,117 @@
+"""Random numbers by counting: each is a hash of what it is for, so it depends on nothing else.
+
+    word(k, i) = mix(i ⊕ k₀) ⊕ k₁                                  i-th 32-bit word of a stream (k₀, k₁)
+    k_h = mix(mix(mix(environment ⊕ s_h) ⊕ counter) ⊕ c_h),   h = 0, 1
+
+with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h what is left of the counter beyond 32
+bits, mixed, and the purpose. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all processes, and the counter is the step for what is drawn at each
+reading, the episode for what is drawn at reset. So no sensor, environment, batch size, device or process changes the numbers
+of another, and nothing has to be stored or drawn in order.
+
+Uniform numbers have 23 bits, the same in float32 and float64. Normal ones come in pairs, each of one word (Box and Muller 1958):
+20 bits for the radius, so that none is beyond √(2 ln 2²¹) = 5.40, and 12 for the angle.
+
+Products are formed in int64 and cut to 32 bits: that of two int32 may overflow, which C++ does not define, and compilers make
+use of that.
+
+Source of the constants of `mix`: the search for bijections of little bias that C. Wellons began ("Hash Prospector", 2018 on).
+
+Shapes: `env` environments, `taxel` taxels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
+"""What numbers are for: the first three are drawn at each step, the others at each reset."""
+
+PER_STEP = frozenset({READING, RADIUS, JITTER})
+FACTORS = (0x21F0AAAD, 0x735A2D97)
+SHIFTS = (16, 15, 15)
+PURPOSES = tuple(0x3C6EF372 + 0x1B873593 * i % 2**30 for i in range(12))
+"""A constant for each purpose and half of a key."""
+
+
+class Stream(NamedTuple):
+    """A stream of 32-bit words for each environment: its two keys, int32 (env, 1)."""
+
+    first: Tensor
+    second: Tensor
+
+
+def sensor_key(seed: int, sensor: str) -> tuple[int, int]:
+    """Return the two int32 words that all streams of a sensor start from."""
+    digest = hashlib.sha256(f"{seed}\0{sensor}".encode()).digest()
+    return tuple(np.frombuffer(digest[:8], dtype="<i4").tolist())
+
+
+def streams(
+    key: Int[Tensor, 2],
+    env: Int[Tensor, " env"],
+    step: Int[Tensor, ""],
+    episode: Int[Tensor, " env"],
+    purposes: tuple[int, ...],
+) -> Mapping[int, Stream]:
+    """Return a sensor's streams for these purposes.
+
+    Args:
+        key: The sensor's key, int32.
+        env: Numbers of the environments, int64, counted over all processes.
+        step: Number of this reading, int64.
+        episode: How often each environment was reset, int64.
+        purposes: What numbers are wanted for.
+    """
+    words: list[Tensor] = []
+    for purpose in purposes:
+        counter = step.expand_as(env) if purpose in PER_STEP else episode
+        for half, own in enumerate(key.unbind()):
+            word = mix(mix(env.to(torch.int32) ^ own) ^ counter.to(torch.int32))
+            words.append(mix(word ^ mix((counter >> 32).to(torch.int32)) ^ PURPOSES[2 * purpose + half]))
+    # Stacked, they are stored once per environment; a compiler that fuses would else form them anew for every taxel.
+    stored = torch.stack(words, dim=1)[..., None].unbind(1)
+    return {purpose: Stream(stored[2 * i], stored[2 * i + 1]) for i, purpose in enumerate(purposes)}
+
+
+def words(stream: Stream, index: Int[Tensor, "*taxel"]) -> Int[Tensor, "env taxel"]:
+    """Return the words of these numbers, int32."""
+    return mix(index ^ stream.first) ^ stream.second
+
+
+def uniform(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> Tensor:
+    """Return numbers between 0 and 1, neither included: (k + 1/2) 2⁻²³."""
+    return ((word >> 9) & 0x7FFFFF).to(dtype) * 2.0**-23 + 2.0**-24
+
+
+def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Return two independent normal numbers of mean 0 and variance 1.
+
+    The angle is one of 2¹² at equal steps: ten bits for |b| < π/4, and two for the quadrant, which exchange sine and cosine and
+    turn the cosine's sign. Both are their Taylor series there, to 3e-7.
+    """
+    share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
+    radius = torch.sqrt(-2.0 * torch.log(share))
+    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (math.pi / 2048)
+    square = angle * angle
+    sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
+    cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30 * (1 - square / 56)))
+    along = radius * cosine * (1 - (word & 2)).to(dtype)
+    across = radius * sine
+    is_turned = (word & 1) == 1
+    return torch.where(is_turned, across, along), torch.where(is_turned, along, across)
+
+
+def mix(word: Int[Tensor, "*row"]) -> Int[Tensor, "*row"]:
+    """Return a bijection of 32-bit words, int32."""
+    for shift, factor in zip(SHIFTS, (*FACTORS, None), strict=True):
+        word = word ^ ((word >> shift) & ((1 << (32 - shift)) - 1))  # int32 shifts drag the sign along
+        word = word if factor is None else (word.to(torch.int64) * factor).to(torch.int32)
+    return word
