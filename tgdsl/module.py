@@ -1,8 +1,7 @@
 """The compiled sensor: tensors in, tensors out.
 
 Shapes: `env` environments, `body` bodies of `inputs.bodies`, `pair` pairs of `inputs.pairs`, `slot` contacts per pair, `object`
-felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `feature` numbers of an observation, `call` calls that a
-ring remembers.
+felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` calls, `feature` numbers of an observation.
 """
 
 from __future__ import annotations
@@ -44,7 +43,8 @@ from tgdsl.taxels import image_indices, taxel_table
 class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
-    The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
+    "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
     """
 
     name: str
@@ -60,10 +60,10 @@ class Output:
 class TactileModule(nn.Module):
     """All sensors of a document, for any number of environments at once.
 
-    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel, channel)
-    where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state (see
-    `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it; one without state
-    takes any. Noise is drawn from the seed 0, or from that given to `seed`.
+    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel,
+    channel) where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state
+    (see `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it; one without
+    state takes any. Noise is drawn from the seed 0, or from that given to `seed`.
     """
 
     def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):

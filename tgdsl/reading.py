@@ -55,10 +55,9 @@ def read(
     if terms:
         past = {key: [memory[f"noise/{key}/{name}"] for name in names] for key in _keys(memory, "noise/")}
         signal, noted = stages.disturb(signal, terms, knobs, past, now)
-    new = {
-        **new,
-        **{f"noise/{key}/{n}": plane for key, planes in noted.items() for n, plane in zip(names, planes, strict=True)},
-    }
+    new = dict(new)
+    for key, planes in noted.items():
+        new |= {f"noise/{key}/{name}": plane for name, plane in zip(names, planes, strict=True)}
     own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
     readings: Tensors = {}
     for reading, which, planes in zip(own, ("measured", "clean"), (signal, clean), strict=False):

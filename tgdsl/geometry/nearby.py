@@ -33,8 +33,8 @@ class MomentSource(NamedTuple):
         first_pair: Index of its first pair.
         num_pairs: Number of its pairs.
         pair: Index of each probe's pair among them.
-        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on the
-            object itself.
+        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
+            the object itself.
         shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
         surface: Its outer surface but for planes; None if there is no more to it.
         planes: Its planes.

@@ -3,13 +3,13 @@
     word(k, i) = mix(i ⊕ k₀) ⊕ k₁                                  i-th 32-bit word of a stream (k₀, k₁)
     k_h = mix(mix(mix(environment ⊕ s_h) ⊕ counter) ⊕ c_h),   h = 0, 1
 
-with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h what is left of the counter beyond 32
-bits, mixed, and the purpose. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all processes, and the counter is the step for what is drawn at each
-reading, the episode for what is drawn at reset. So no sensor, environment, batch size, device or process changes the numbers
-of another, and nothing has to be stored or drawn in order.
+with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h the purpose with what the counter
+has beyond 32 bits. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all processes,
+and the counter is the step for what is drawn at each reading, the episode for what is drawn at reset. So no sensor,
+environment, batch size, device or process changes the numbers of another, and nothing has to be stored or drawn in order.
 
-Uniform numbers have 23 bits, the same in float32 and float64. Normal ones come in pairs, each of one word (Box and Muller 1958):
-20 bits for the radius, so that none is beyond √(2 ln 2²¹) = 5.40, and 12 for the angle.
+Uniform numbers have 23 bits, the same in float32 and float64. Normal ones come in pairs, each of one word (Box and Muller
+1958): 20 bits for the radius, so that none is beyond √(2 ln 2²¹) = 5.40, and 12 for the angle.
 
 Products are formed in int64 and cut to 32 bits: that of two int32 may overflow, which C++ does not define, and compilers make
 use of that.
@@ -55,7 +55,7 @@ def sensor_key(seed: int, sensor: str) -> tuple[int, int]:
 
 
 def streams(
-    key: Int[Tensor, 2],
+    key: Int[Tensor, " half"],
     env: Int[Tensor, " env"],
     step: Int[Tensor, ""],
     episode: Int[Tensor, " env"],

@@ -207,8 +207,8 @@ PROFILES: dict[str, dict[str, Knobs]] = {
     },
 }
 """Built-in profiles: knobs by sensor kind, none for a kind not named. `noisy` is the paper's noisy condition (Chung et al.,
-*Tactile Genesis*, appendix, table of sensor imperfection parameters); `force_taxel`, which the paper has not, takes the values of
-its forces, but for the radius noise, which would not change what it reads much."""
+*Tactile Genesis*, appendix, table of sensor imperfection parameters). `force_taxel`, which the paper has not, takes the values
+of its forces, but for the radius noise: its sum is the solver's at any radius."""
 
 
 def resolve_noise(

@@ -12,11 +12,11 @@
 for each channel alone; d = 0 and ξ = 0 at reset, and what was before it counts as equal to the first signal after it. The
 hysteresis is a Maxwell branch, exact for signals that are linear between calls, and the delay reads such a signal too, so both
 are the same at any step. Crosstalk mixes the taxels of one link: K_ij = exp(−|x_i − x_j|²/2σ²) where their normals are within
-90°, else 0; columns of W add up to 1, so the sum over a link is what it was, at edges and corners too. Where σ is a
-range G mixes the kernels of its ends, with a share that is drawn uniformly. Gradients pass the quantiser as if it were not there.
+90°, else 0; columns of W add up to 1, so the sum over a link is what it was, at edges and corners too. Where σ is a range, G
+mixes the kernels of its ends with a share that is drawn uniformly. Gradients pass the quantiser as if it were not there.
 
-Where a kind makes bits of its signal (`contact`, `link_contact`), all this is done to the signal, before the threshold. A sensor
-with a rate of its own holds y between its samples: n, d and J are drawn once per sample.
+Where a kind makes bits of its signal (`contact`, `link_contact`), all this is done to the signal, before the threshold. A
+sensor with a rate of its own holds y between its samples: n, d and J are drawn once per sample.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Sensor Noise Model". Departures: hysteresis is exact for ramps, where the
 paper's ξ ← e^(−r) ξ + x_t − x_(t−1) depends on the step; crosstalk works on any layout and keeps the sum, where a blur that is
