@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from tgdsl.plan import PlannedSensor
+from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import sensor_key, streams
-from tgdsl.sensors.noise.stages import Now
 
 COUNTS = ("step", "episode", "age")
 

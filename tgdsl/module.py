@@ -34,7 +34,7 @@ from tgdsl.plan import Inputs, Plan
 from tgdsl.reading import read
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.stages import Now
+from tgdsl.sensors.noise.instant import Now
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
 

@@ -15,7 +15,7 @@ from tgdsl.geometry.query import Felt, Probes
 from tgdsl.plan import PlannedSensor
 from tgdsl.sensors import Kind
 from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.stages import Now, Planes
+from tgdsl.sensors.noise.instant import Now, Planes
 
 Tensors = dict[str, Tensor]
 

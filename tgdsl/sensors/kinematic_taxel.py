@@ -17,8 +17,7 @@ Options, all off by default, in this order:
 
 with f_c the solver's forces on the body at its contacts c with the sensor's objects and m_c their normals: the taxels then
 press with what the solver presses with. Where Σ_j f_n,j is not positive there is nothing to scale: the body's taxels read
-zero, and the solver's force is not carried. Of contacts beyond `slots` nothing is known. `force_taxel` distributes whole
-forces instead.
+zero, and the solver's force is not carried. Of contacts beyond `slots` nothing is known. `force_taxel` shares out forces.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 

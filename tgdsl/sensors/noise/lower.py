@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from tgdsl.errors import LowerError, did_you_mean
 from tgdsl.layout import Layout
 from tgdsl.sensors.noise import random
+from tgdsl.sensors.noise.filters import KERNEL
 from tgdsl.sensors.noise.spec import ALL, ZERO, Amplitude, Crosstalk, Hysteresis, Knobs
-from tgdsl.sensors.noise.stages import KERNEL, is_drawn
+from tgdsl.sensors.noise.stages import is_drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +67,10 @@ def lower_noise(
         del constants["jitter"]
     if "dead" in terms and (values["dead_low"] == values["dead_high"]).all():
         del constants["dead_high"]
-    if "crosstalk" in terms:
-        constants |= _kernels(values, layout if by_taxel else None)
+    if "crosstalk" in terms and by_taxel:
+        constants |= _kernels(values, layout)
+        if constants["crosstalk_strength"].ndim == 2 and "crosstalk_mixture" not in constants:
+            del constants["crosstalk_strength"]  # it is part of the kernels
     memory = tuple(name for term, names in _REMEMBERS.items() if term in terms for name in names)
     past = float((values["delay"][1] + values["jitter"][1]).max())
     return LoweredNoise(terms, constants, memory, past, float(values["radius_noise"].max()), _streams(terms, constants))
@@ -171,17 +174,22 @@ def _compact(value: Float[np.ndarray, "end channel row"]) -> np.ndarray:
     return value[0] if (value[0] == value[1]).all() else value
 
 
-def _kernels(values: Mapping[str, np.ndarray], layout: Layout | None) -> dict[str, np.ndarray]:
-    """Return each link's kernel; where σ is a range that of its lower end, what the upper one adds, and the share of that."""
-    assert layout is not None
+def _kernels(values: Mapping[str, np.ndarray], layout: Layout) -> dict[str, np.ndarray]:
+    """Return each link's operator W; G alone where χ or σ is a range: of the lower end, and what the upper one adds."""
     found: dict[str, np.ndarray] = {}
-    low, high = values["crosstalk_sigma"][:, 0]
-    is_ranged = bool((low != high).any())
+    strength, (low, high) = values["crosstalk_strength"][:, 0], values["crosstalk_sigma"][:, 0]
+    is_wider = bool((low != high).any())
     for i in range(len(layout.links)):
         own = np.flatnonzero(layout.link_id == i)
         kernel, wider = (crosstalk_kernel(layout.take(own), sigma[own]) for sigma in (low, high))
-        found[f"{KERNEL}{i:04d}"] = np.stack([kernel, wider - kernel] if is_ranged else [kernel])
-    if is_ranged:
+        if is_wider:
+            kernels = [kernel, wider - kernel]
+        elif (strength[0] != strength[1]).any():
+            kernels = [kernel]
+        else:
+            kernels = [np.diag(1 - strength[0, own]) + strength[0, own] * kernel]
+        found[f"{KERNEL}{i:04d}"] = np.stack(kernels)
+    if is_wider:
         found["crosstalk_mixture"] = np.array([0.0, 1.0])[:, None, None]
     return found
 

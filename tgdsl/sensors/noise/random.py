@@ -3,9 +3,9 @@
     word(k, i) = mix(i ⊕ k₀) ⊕ k₁                                  i-th 32-bit word of a stream (k₀, k₁)
     k_h = mix(mix(mix(environment ⊕ s_h) ⊕ counter) ⊕ c_h),   h = 0, 1
 
-with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h the purpose with what the counter
-has beyond 32 bits. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all processes,
-and the counter is the step for what is drawn at each reading, the episode for what is drawn at reset. So no sensor,
+with mix a bijection of 32-bit words by shifts and products, (s₀, s₁) the sensor's key, and c_h the purpose with what the
+counter has beyond 32 bits. The sensor's key comes from the seed and the sensor's name alone, the environment counts over all
+processes, and the counter is the step for what is drawn at each reading, the episode for what is drawn at reset. So no sensor,
 environment, batch size, device or process changes the numbers of another, and nothing has to be stored or drawn in order.
 
 Uniform numbers have 23 bits, the same in float32 and float64. Normal ones come in pairs, each of one word (Box and Muller
@@ -101,8 +101,8 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     radius = torch.sqrt(-2.0 * torch.log(share))
     angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (math.pi / 2048)
     square = angle * angle
-    sine = angle * (1 - square / 6 * (1 - square / 20 * (1 - square / 42)))
-    cosine = 1 - square / 2 * (1 - square / 12 * (1 - square / 30 * (1 - square / 56)))
+    sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square / 5040)))
+    cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square / 40320)))
     along = radius * cosine * (1 - (word & 2)).to(dtype)
     across = radius * sine
     is_turned = (word & 1) == 1
