@@ -23,6 +23,9 @@ class Clock(nn.Module):
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes), `step` (calls so
     far), `episode` (resets of each environment, (env,)), `age` (calls since the last one, (env,)).
+
+    Attributes:
+        home: Device of counts that are loaded before the start.
     """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
@@ -30,6 +33,7 @@ class Clock(nn.Module):
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.is_timed]
         self._seed, self._first_env = 0, None
+        self.home = torch.device("cpu")
 
     @property
     def is_wanted(self) -> bool:
@@ -58,11 +62,11 @@ class Clock(nn.Module):
             num_envs, device = self.num_envs, self._buffers["age"].device  # type: ignore[union-attr]
             self.start(num_envs, device)
 
-    def reset(self, env_ids: Any) -> None:
-        """Begin a new episode in some environments."""
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask."""
         if self.num_envs is not None:
-            self._buffers["episode"][env_ids] += 1  # type: ignore[index]
-            self._buffers["age"][env_ids] = 0  # type: ignore[index]
+            self._buffers["episode"] += chosen  # type: ignore[operator]
+            self._buffers["age"].masked_fill_(chosen, 0)  # type: ignore[union-attr]
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what `now` and `after` want, by name."""
@@ -102,8 +106,7 @@ class Clock(nn.Module):
         """Make room for the counts that are loaded, and go on with their seed."""
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
-            device = self._buffers["age"].device if "age" in self._buffers else torch.device("cpu")  # type: ignore[union-attr]
-            self.start(len(age), device)
+            self.start(len(age), self.home)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         if self.num_envs is not None:
             self._seed, self._first_env = int(self._buffers["seed"]), int(self._buffers["first_env"])  # type: ignore[arg-type]

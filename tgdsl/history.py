@@ -19,7 +19,11 @@ from tgdsl.plan import PlannedHistory
 class History(nn.Module):
     """The last readings of one kind, for all environments.
 
-    Buffers: `ring` (env, 2 length, channel, row); `place`, where in its first half the next reading goes; `is_new` (env,).
+    Buffers: `ring` (env, 2 length, channel, row), and `is_new` (env,), which have no reading since their reset. The extra state
+    is where in the ring's first half the next reading goes.
+
+    Attributes:
+        home: Device of readings that are loaded before the first call.
     """
 
     def __init__(self, planned: PlannedHistory):
@@ -27,6 +31,7 @@ class History(nn.Module):
         super().__init__()
         self._length, self._reduce, self._place = planned.length, planned.reduce, 0
         self._any_new = True
+        self.home = torch.device("cpu")
 
     def push(self, reading: Float[Tensor, "env row channel"]) -> Tensor:
         """Note a reading, and return what is read of the last ones.
@@ -43,8 +48,9 @@ class History(nn.Module):
             ring[:, self._place + self._length] = by_channel
             if self._any_new:  # before there are enough, the first one stands for the missing
                 is_new = self._buffers["is_new"]
-                ring[is_new] = by_channel[is_new][:, None]
-                self._buffers["is_new"].zero_()  # type: ignore[union-attr]
+                assert is_new is not None
+                ring.copy_(torch.where(is_new[:, None, None, None], by_channel[:, None], ring))
+                is_new.zero_()
                 self._any_new = False
         self._place = (self._place + 1) % self._length
         last = ring[:, self._place : self._place + self._length]
@@ -53,10 +59,10 @@ class History(nn.Module):
         reduced = last.mean(dim=1) if self._reduce == "mean" else _median(last)
         return reduced.transpose(1, 2)
 
-    def reset(self, env_ids: Any) -> None:
-        """Forget what some environments read."""
+    def reset(self, chosen: Tensor) -> None:
+        """Forget what the environments of a mask read."""
         if "is_new" in self._buffers:
-            self._buffers["is_new"][env_ids] = True  # type: ignore[index]
+            self._buffers["is_new"] |= chosen  # type: ignore[operator]
             self._any_new = True
 
     def _ring_for(self, reading: Float[Tensor, "env channel row"]) -> Tensor:
@@ -80,7 +86,7 @@ class History(nn.Module):
         for name in ("ring", "is_new"):
             value = state_dict.get(prefix + name)
             if isinstance(value, Tensor):
-                self.register_buffer(name, torch.zeros_like(value))
+                self.register_buffer(name, torch.zeros_like(value, device=self.home))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

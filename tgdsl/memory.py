@@ -18,13 +18,18 @@ from tgdsl.plan import PlannedMemory, PlannedSensor
 
 
 class Memory(nn.Module):
-    """Buffers `sensor:name`, (env, …) or (env, call, …); none before the first call, nor if no sensor carries anything."""
+    """Buffers `sensor:name`, (env, …) or (env, call, …); none before the first call, nor if no sensor carries anything.
+
+    Attributes:
+        home: Device of state that is loaded before the first call.
+    """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
         """Note what sensors carry."""
         super().__init__()
         self._planned = {f"{s.name}:{name}": (s, name, part) for s in sensors for name, part in s.state.items()}
         self.clock = Clock(sensors)
+        self.home = torch.device("cpu")
 
     @property
     def is_wanted(self) -> bool:
@@ -66,11 +71,13 @@ class Memory(nn.Module):
                 raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
         return held | self.clock.tensors()
 
-    def reset(self, chosen: Any) -> None:
-        """Begin a new episode in some environments; what noise remembers starts anew by its age."""
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask; what noise remembers starts anew by its age."""
         for path, (_, name, planned) in self._planned.items():
             if path in self._buffers and "/" not in name:
-                self._buffers[path][chosen] = planned.rest  # type: ignore[index]
+                buffer = self._buffers[path]
+                assert buffer is not None
+                buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
         self.clock.reset(chosen)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
@@ -78,7 +85,7 @@ class Memory(nn.Module):
         for path in self._planned:
             value = state_dict.get(prefix + path)
             if isinstance(value, Tensor):
-                self.register_buffer(path, torch.zeros_like(value))
+                self.register_buffer(path, torch.zeros_like(value, device=self.home))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

@@ -99,6 +99,7 @@ class TactileModule(nn.Module):
         )
         self._compiled: Callable[..., Any] | None = None
         self._dt: tuple[float, Tensor] | None = None
+        self._warned: set[str] = set()
 
     @property
     def inputs(self) -> Inputs:
@@ -254,8 +255,13 @@ class TactileModule(nn.Module):
         Args:
             env_ids: Indices, or a boolean mask over environments.
         """
+        if self.num_envs is None:
+            return  # nothing is held yet, and the first call begins an episode
         with torch.no_grad():
-            chosen = slice(None) if env_ids is None else torch.as_tensor(env_ids, device=self.device)
+            chosen = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+            if env_ids is not None:
+                chosen = torch.zeros_like(chosen)
+                chosen[torch.as_tensor(env_ids, device=self.device)] = True
             self.memory.reset(chosen)
             for history in self.histories.values():
                 history.reset(chosen)  # type: ignore[operator]
@@ -388,10 +394,26 @@ class TactileModule(nn.Module):
         """
         if not 0 < dt < math.inf:
             raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
+        if self._dt is None or self._dt[0] != dt:
+            self._look_at_rates(dt)
         if self._dt is None or self._dt[0] != dt or self._dt[1].device != self.device or self._dt[1].dtype != self.dtype:
             with torch.inference_mode(False):
                 self._dt = dt, torch.tensor(dt, dtype=self.dtype, device=self.device)
         return self._dt[1]
+
+    def _look_at_rates(self, dt: float) -> None:
+        """Warn of sensors that would take samples more often than they are called, the first time."""
+        for sensor in self.plan.sensors:
+            if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:
+                self._warned.add(sensor.sensor)
+                what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
+                warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        """Have state that is loaded before the first call where the module is."""
+        for part in (self.memory, self.memory.clock, *self.histories.values()):
+            part.home = self.device  # type: ignore[assignment]
+        super()._load_from_state_dict(*args, **kwargs)
 
 
 def _has_cpp_compiler() -> bool:
