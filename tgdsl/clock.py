@@ -22,10 +22,11 @@ class Clock(nn.Module):
     """Counts calls and episodes. It holds nothing until `start`, nor if no sensor asks for it.
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes), `step` (calls so
-    far), `episode` (resets of each environment, (env,)), `age` (calls since the last one, (env,)).
+    far), `episode` (resets of each environment, (env,)), `age` (calls since the last one, (env,)); and `ages` (call,), how long
+    before the last call each one was [s], itself first.
 
     Attributes:
-        home: Device of counts that are loaded before the start.
+        home: Has device and dtype of counts that are loaded before the start.
     """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
@@ -33,7 +34,7 @@ class Clock(nn.Module):
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.is_timed]
         self._seed, self._first_env = 0, None
-        self.home = torch.device("cpu")
+        self.home = torch.empty(0)
 
     @property
     def is_wanted(self) -> bool:
@@ -45,22 +46,31 @@ class Clock(nn.Module):
         """Number of environments; None before the start."""
         return len(self._buffers["age"]) if "age" in self._buffers else None  # type: ignore[arg-type]
 
-    def start(self, num_envs: int, device: torch.device) -> None:
-        """Begin to count."""
+    def start(self, num_envs: int, calls: int, like: Tensor) -> None:
+        """Begin to count.
+
+        Args:
+            num_envs: Number of environments.
+            calls: How many calls before the present one some ring remembers.
+            like: Has the module's device and dtype.
+        """
         first = _rank() * num_envs if self._first_env is None else self._first_env
-        values = {"seed": self._seed, "first_env": first, "step": 0}
-        for name, value in values.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.int64, device=device))
+        for name, value in {"seed": self._seed, "first_env": first, "step": 0}.items():
+            self.register_buffer(name, torch.tensor(value, dtype=torch.int64, device=like.device))
         for name in ("episode", "age"):
-            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=device))
+            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=like.device))
+        if calls:
+            self.register_buffer("ages", torch.zeros(calls, dtype=like.dtype, device=like.device))
         self._set_keys()
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
         """Choose other random numbers, from the next call on; environments are counted from `first_env`."""
         self._seed, self._first_env = seed, first_env
         if self.num_envs is not None:
-            num_envs, device = self.num_envs, self._buffers["age"].device  # type: ignore[union-attr]
-            self.start(num_envs, device)
+            ages = self._buffers.get("ages")
+            like = self._buffers["age"] if ages is None else ages
+            assert like is not None
+            self.start(self.num_envs, 0 if ages is None else len(ages), like)
 
     def reset(self, chosen: Tensor) -> None:
         """Begin a new episode in the environments of a mask."""
@@ -82,19 +92,24 @@ class Clock(nn.Module):
             phase: Time since the sensor's last sample was due, (env,) [s]; None if it takes one at every call.
         """
         age, drawn = clock["clock/age"][:, None], {}
+        ages = clock["clock/ages"] + dt if "clock/ages" in clock and dt is not None else None
         if sensor.noise is not None and sensor.noise.streams:
             env = torch.arange(len(age), device=age.device) + clock["clock/first_env"]
             key = clock[f"clock/key {sensor.sensor}"]
             drawn = streams(key, env, clock["clock/step"], clock["clock/episode"], sensor.noise.streams)
         if phase is None or dt is None:
-            return Now(dt, clock["clock/step"], age, None, drawn)
+            return Now(dt, clock["clock/step"], age, ages, None, drawn)
         is_due = (phase[:, None] + 1.5 * dt >= sensor.period) | (age == 0)
-        return Now(dt, clock["clock/step"], age, is_due, drawn)
+        return Now(dt, clock["clock/step"], age, ages, is_due, drawn)
 
     @staticmethod
-    def after(clock: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:
         """Return the counts after a call."""
-        return {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        if "clock/ages" in clock and dt is not None:
+            ages = clock["clock/ages"]
+            counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:1]), ages[:-1] + dt])
+        return counts
 
     def _set_keys(self) -> None:
         seed, device = int(self._buffers["seed"]), self._buffers["seed"].device  # type: ignore[arg-type, union-attr]
@@ -106,7 +121,8 @@ class Clock(nn.Module):
         """Make room for the counts that are loaded, and go on with their seed."""
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
-            self.start(len(age), self.home)
+            ages = state_dict.get(f"{prefix}ages")
+            self.start(len(age), len(ages) if isinstance(ages, Tensor) else 0, self.home)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         if self.num_envs is not None:
             self._seed, self._first_env = int(self._buffers["seed"]), int(self._buffers["first_env"])  # type: ignore[arg-type]

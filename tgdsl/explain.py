@@ -6,12 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Shaped
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.memory import Memory
 from tgdsl.module import TactileModule
 from tgdsl.plan import PlannedObject, PlannedPoints, PlannedSensor
+from tgdsl.sensors.noise.lower import quantity
 
 
 class _OperationCounter(TorchDispatchMode):
@@ -114,13 +117,106 @@ def _links(touch: TactileModule) -> list[str]:
 
 def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
     taxels = touch.plan.queries[sensor.query].num_taxels
-    size = torch.finfo(touch.dtype).bits // 8 * sum(math.prod(memory.shape) for memory in sensor.state.values())
-    memory = f"remembers {', '.join(sensor.state)} ({size} bytes per environment)" if sensor.state else "no state"
-    lines = [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {memory}"]
+    lines = [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))
         lines.append(f"  {reading.name}: {channels} of each {reading.rows}")
+    lines += [f"  noise: {line}" for line in _noise(touch, sensor)]
+    if sensor.period > 0:
+        lines.append(f"  rate: {1 / sensor.period:g} Hz")
+    if sensor.history is not None:
+        lines.append(f"  history: {sensor.history.reduce} of {sensor.history.length} calls")
     return lines
+
+
+def _remembers(touch: TactileModule, sensor: PlannedSensor) -> str:
+    """Return what a sensor carries from one call to the next, and its size; the clock, which all share, is not in it."""
+    fixed, ring = _sizes(touch, sensor)
+    own = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
+    if _rings(sensor):
+        own.append("history")
+    if not own:
+        return "remembers the clock alone" if sensor.is_timed else "no state"
+    reading = sensor.readings[0]
+    size = f"({fixed} bytes per environment), {fixed / reading.num_rows:.3g} per {reading.rows}"
+    if ring:
+        past = max(memory.past for memory in sensor.state.values())
+        size += f", and for each call of the last {past:g} s {ring} bytes, {ring / reading.num_rows:.3g} per {reading.rows}"
+    return f"remembers {', '.join(dict.fromkeys(own))} {size}"
+
+
+def _sizes(touch: TactileModule, sensor: PlannedSensor) -> tuple[int, int]:
+    """Return what a sensor remembers of each environment, and of each call of its delay beside [bytes]."""
+    size = torch.finfo(touch.dtype).bits // 8
+    fixed = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if not memory.past)
+    ring = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if memory.past)
+    return fixed + sum(count * size + 1 for count in _rings(sensor)), ring
+
+
+def _rings(sensor: PlannedSensor) -> list[int]:
+    """Return how many numbers the history of each reading holds, see `history.History`."""
+    history = sensor.history
+    if history is None or history.reduce == "last":
+        return []
+    own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
+    return [2 * history.length * reading.num_rows * len(reading.channels) for reading in own]
+
+
+_OF_READING = "unit of the reading"
+_KNOBS: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "radius_noise": (("radius_noise", "", " m"),),
+    "gain": (("gain_low", "from ", ""), ("gain_high", "to ", "")),
+    "hysteresis": (("hysteresis_strength", "strength ", ""), ("hysteresis_time", "time constant ", " s")),
+    "crosstalk": (("crosstalk_strength", "strength ", ""),),
+    "delay": (("delay", "", " s"), ("jitter", "jitter ", " s")),
+    "bias": (("bias", "", _OF_READING),),
+    "white_noise": (("white_noise", "", _OF_READING),),
+    "drift": (("drift", "", _OF_READING),),
+    "quantization": (("quantization", "", _OF_READING),),
+    "dead": (
+        ("dead_probability", "probability ", ""),
+        ("dead_low", "stuck from ", _OF_READING),
+        ("dead_high", "to ", _OF_READING),
+    ),
+    "release_threshold": (("release_threshold", "", " m"),),
+}
+"""Of each stage its constants, what they are called, and their unit."""
+
+
+def _noise(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
+    """Return the stages of a sensor's noise, in their order, with the values of their knobs."""
+    if sensor.noise is None:
+        return []
+    lines = []
+    for term in sensor.noise.terms:
+        parts = []
+        for name, label, unit in (part for part in _KNOBS[term] if part[0] in sensor.noise.constants):
+            value = touch.plan.arrays[f"sensors/{sensor.name}/noise/{name}"]
+            if name == "dead_low" and "dead_high" not in sensor.noise.constants:
+                label = "stuck at "
+            shown = _amplitudes(sensor, value) if unit == _OF_READING else _value(value[..., 0, :]) + unit
+            parts.append(label + shown)
+        lines.append(f"{term} {', '.join(parts)}")
+    return lines
+
+
+def _amplitudes(sensor: PlannedSensor, value: Shaped[np.ndarray, "*end channel row"]) -> str:
+    """Return a knob's value for each quantity of a sensor's signal."""
+    units = {name: f" {unit}" for r in sensor.readings for name, unit in zip(r.channels, r.units, strict=True)}
+    shown: dict[str, str] = {}
+    for c, channel in enumerate(sensor.signal):
+        own = value[..., c if value.shape[-2] > 1 else 0, :]
+        shown.setdefault(quantity(channel), f"{quantity(channel)} {_value(own)}{units.get(channel, '')}")
+    return ", ".join(shown.values())
+
+
+def _value(value: Shaped[np.ndarray, "*end row"]) -> str:
+    """Return a number; `[low, high]` if each environment draws its own; `least–most` where rows differ."""
+    ends = [
+        f"{end.min():g}" if end.min() == end.max() else f"{end.min():g}–{end.max():g}"
+        for end in np.reshape(value, (-1, value.shape[-1]))
+    ]
+    return ends[0] if len(ends) == 1 else f"[{', '.join(ends)}]"
 
 
 def _grids(touch: TactileModule) -> list[str]:
@@ -193,18 +289,25 @@ def _inputs(touch: TactileModule) -> list[str]:
     return [*lines, ""]
 
 
+_CLOCK_BYTES = 16
+"""What the clock holds of each environment: two int64, see `clock.Clock`."""
+
+
 def _costs(touch: TactileModule) -> list[str]:
     size = torch.finfo(touch.dtype).bits // 8
     outputs = sum(math.prod(output.shape) for output in touch.outputs)
     state = touch.example_state(1)
-    memory = sum(math.prod(m.shape) for s in touch.plan.sensors for m in s.state.values())
+    sizes = [_sizes(touch, sensor) for sensor in touch.plan.sensors]
+    fixed = sum(own for own, _ in sizes) + (_CLOCK_BYTES if touch.memory.clock.is_wanted else 0)
+    ring = sum(own for _, own in sizes)
+    beside = f", and {ring} for each call of the delays" if ring else ""
     read = sum(getattr(state, n).numel() * 8 for n in touch.inputs.fields if n != "dt")
     constants = sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers())
     return [
         "cost per environment",
         f"  reads        {read:>10} bytes (float64 state)",
         f"  writes       {size * outputs:>10} bytes of readings",
-        f"  remembers    {size * memory:>10} bytes",
+        f"  remembers    {fixed:>10} bytes{beside}",
         f"  computes     {operations_per_env(touch):>10} elementary operations",
         f"constants      {constants:>12} bytes, once",
     ]

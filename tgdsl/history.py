@@ -23,7 +23,7 @@ class History(nn.Module):
     is where in the ring's first half the next reading goes.
 
     Attributes:
-        home: Device of readings that are loaded before the first call.
+        home: Has the device of readings that are loaded before the first call.
     """
 
     def __init__(self, planned: PlannedHistory):
@@ -31,7 +31,7 @@ class History(nn.Module):
         super().__init__()
         self._length, self._reduce, self._place = planned.length, planned.reduce, 0
         self._any_new = True
-        self.home = torch.device("cpu")
+        self.home = torch.empty(0)
 
     def push(self, reading: Float[Tensor, "env row channel"]) -> Tensor:
         """Note a reading, and return what is read of the last ones.
@@ -86,8 +86,13 @@ class History(nn.Module):
         for name in ("ring", "is_new"):
             value = state_dict.get(prefix + name)
             if isinstance(value, Tensor):
-                self.register_buffer(name, torch.zeros_like(value, device=self.home))
+                self.register_buffer(name, torch.zeros_like(value, device=self.home.device))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def last_step(reading: Float[Tensor, "env *step row channel"]) -> Float[Tensor, "env row channel"]:
+    """Return the last one of stacked calls, or a reading that is of one call."""
+    return reading[:, -1] if reading.ndim == 4 else reading
 
 
 def _median(readings: Float[Tensor, "env step channel row"]) -> Float[Tensor, "env channel row"]:

@@ -21,7 +21,7 @@ class Memory(nn.Module):
     """Buffers `sensor:name`, (env, …) or (env, call, …); none before the first call, nor if no sensor carries anything.
 
     Attributes:
-        home: Device of state that is loaded before the first call.
+        home: Has the device of state that is loaded before the first call.
     """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
@@ -29,7 +29,7 @@ class Memory(nn.Module):
         super().__init__()
         self._planned = {f"{s.name}:{name}": (s, name, part) for s in sensors for name, part in s.state.items()}
         self.clock = Clock(sensors)
-        self.home = torch.device("cpu")
+        self.home = torch.empty(0)
 
     @property
     def is_wanted(self) -> bool:
@@ -60,7 +60,8 @@ class Memory(nn.Module):
                     shape = (num_envs, *_calls(planned, dt), *planned.shape)
                     self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
                 if self.clock.is_wanted:
-                    self.clock.start(num_envs, device)
+                    calls = max((*_calls(part, dt), 0)[0] for _, _, part in self._planned.values()) if self._planned else 0
+                    self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
         if self.is_wanted and self.num_envs != num_envs:
             raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
         held: dict[str, Tensor] = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
@@ -85,7 +86,7 @@ class Memory(nn.Module):
         for path in self._planned:
             value = state_dict.get(prefix + path)
             if isinstance(value, Tensor):
-                self.register_buffer(path, torch.zeros_like(value, device=self.home))
+                self.register_buffer(path, torch.zeros_like(value, device=self.home.device))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 

@@ -27,7 +27,7 @@ from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.points import with_points
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, measure, relate
-from tgdsl.history import History
+from tgdsl.history import History, last_step
 from tgdsl.memory import Memory, store
 from tgdsl.moment_sources import moment_sources
 from tgdsl.plan import Inputs, Plan
@@ -193,7 +193,7 @@ class TactileModule(nn.Module):
         objects = {o: self._felt_objects.felt(self.plan.objects[o], self.constants, tensors) for o in measured}
         answers = [self._query(i, pairs, objects, tensors, nows, knobs) for i in range(len(self.plan.queries))]
         readings: dict[str, Tensor] = {}
-        updated = self.memory.clock.after(memory)
+        updated = self.memory.clock.after(memory, tensors.get("dt"))
         for sensor in self.plan.sensors:
             felt, probes = answers[sensor.query][sensor.answer]
             own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
@@ -237,8 +237,7 @@ class TactileModule(nn.Module):
         owner = {r.name: sensor for sensor in self.plan.sensors for r in sensor.readings if r.rows == "taxel"}
         if name not in owner:
             raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
-        reading = readings[name][:, -1] if readings[name].ndim == 4 else readings[name]
-        by_channel = reading.transpose(1, 2)
+        by_channel = last_step(readings[name]).transpose(1, 2)
         images, masks = {}, {}
         for link, index in image_indices(self.plan.layout_of(owner[name])).items():
             place = torch.from_numpy(index).to(by_channel.device)
@@ -411,8 +410,9 @@ class TactileModule(nn.Module):
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Have state that is loaded before the first call where the module is."""
+        home = torch.empty(0, dtype=self.dtype, device=self.device)
         for part in (self.memory, self.memory.clock, *self.histories.values()):
-            part.home = self.device  # type: ignore[assignment]
+            part.home = home  # type: ignore[assignment]
         super()._load_from_state_dict(*args, **kwargs)
 
 

@@ -92,5 +92,5 @@ def _phase(phase: Float[Tensor, " env"], period: float, now: Now) -> Float[Tenso
     """Return the time since a sample was due [s]: from −dt/2 on, as samples are taken at the call that is nearest."""
     assert now.dt is not None
     since = phase + now.dt
-    whole = torch.floor((since + 0.5 * now.dt) / period)
+    whole = torch.floor((since + 0.5 * now.dt) / period).clamp(min=0)
     return torch.where(now.age[:, 0] == 0, 0.0, since - whole * period)

@@ -77,7 +77,9 @@ def _extent(felt: FeltGeom) -> float:
     return float(np.ptp(felt.surface.vertices, axis=0).max() if felt.surface is not None else 2 * felt.geom.size.max())
 
 
-def sample_cloud(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int = 64 * 2**20) -> Cloud:
+def sample_cloud(
+    geoms: Sequence[FeltGeom], radius: float, count: int, budget: int = 64 * 2**20, radius_noise: float = 0.0
+) -> Cloud:
     """Return points drawn alike from all of an object's outer surface (the paper's backend), always the same ones.
 
     Kept in the user's cache folder. The cubes of the lattice are as small as the budget allows, half the radius at least: the
@@ -88,13 +90,14 @@ def sample_cloud(geoms: Sequence[FeltGeom], radius: float, count: int, budget: i
         radius: Largest sensing radius [m].
         count: Number of points.
         budget: Largest size of the lists [bytes].
+        radius_noise: By how much probes may reach farther [m]; the points are the same with and without.
 
     Raises:
         BakeError: Nothing to sample, or no lists within the budget.
     """
     return cache.cached(
-        moments_key(geoms, b"cloud", radius, count, budget),
-        lambda: _sample(geoms, radius, count, budget),
+        moments_key(geoms, b"cloud", radius, count, budget, radius_noise),
+        lambda: _sample(geoms, radius, count, budget, radius_noise),
         lambda cloud: {field.name: np.asarray(getattr(cloud, field.name)) for field in dataclasses.fields(cloud)},
         _unpacked_cloud,
     )
@@ -108,22 +111,22 @@ def _unpacked_cloud(found: Mapping[str, np.ndarray]) -> Cloud:
     return Cloud(points, float(found["weight"]), lists, (x, y, z), found["origin"], float(found["cell"]))
 
 
-def _sample(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int) -> Cloud:
+def _sample(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int, radius_noise: float) -> Cloud:
     pieces = outer_surface(geoms, radius / 4)
     if not len(pieces.area):
         raise BakeError("there is no surface to sample: planes are exact")
     points = pieces.random(count, seed=0)
-    needed = 0
+    needed, reach = 0, radius + radius_noise
     for share in (0.5, 1.0, 2.0):
         cell = share * radius
-        low, high = points.pos.min(axis=0) - radius, points.pos.max(axis=0) + radius
+        low, high = points.pos.min(axis=0) - reach, points.pos.max(axis=0) + reach
         x, y, z = (int(num) for num in np.ceil((high - low) / cell))
-        lists = _lists(points.pos, low, (x, y, z), cell, radius + SLACK, budget)
+        lists = _lists(points.pos, low, (x, y, z), cell, reach + SLACK, budget)
         if isinstance(lists, np.ndarray):
             return Cloud(points.pos, float(points.area[0]), lists, (x, y, z), low, cell)
         needed = lists
     raise BakeError(
-        f"lists of {count} points within {1e3 * radius:g} mm need {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is"
+        f"lists of {count} points within {1e3 * reach:g} mm need {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is"
         f" {budget / 2**20:.3g} MiB ({budget} bytes); raise the budget, or take fewer points or a field"
     )
 

@@ -61,7 +61,7 @@ def moment_tables(felt: FeltBody, request: MomentsRequest, radii: Sequence[float
             tables, accuracy = _fields(solid, request, radii)
             arrays |= tables
         elif any(solid):
-            arrays |= _clouds(solid, request, radii[-1] + request.radius_noise)
+            arrays |= _clouds(solid, request, radii[-1])
     except BakeError as error:
         raise LowerError(f'body "{felt.body}": {error}') from error
     return MomentTables(tuple(radii), area, arrays, tuple(accuracy))
@@ -103,7 +103,8 @@ def _fields(
 
 def _clouds(variants: Sequence[tuple[FeltGeom, ...]], request: MomentsRequest, radius: float) -> dict[str, np.ndarray]:
     """Return the points of all variants and their lists; the last row is out of reach of everything."""
-    clouds = [sample_cloud(geoms, radius, request.num_points, request.max_bytes // len(variants)) for geoms in variants]
+    budget, noise = request.max_bytes // len(variants), request.radius_noise
+    clouds = [sample_cloud(geoms, radius, request.num_points, budget, noise) for geoms in variants]
     slots, none = max(cloud.lists.shape[1] for cloud in clouds), sum(len(cloud.points) for cloud in clouds)
     lists, before = [], 0
     for cloud in clouds:

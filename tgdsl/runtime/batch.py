@@ -5,7 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -116,30 +116,32 @@ class BatchSimulation:
             SimulationError: If the controls are not finite or do not fit, an environment diverges, or MuJoCo reports one as
                 failed. The other environments have then made their step.
         """
-        if control is not None:
-            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control, dtype=np.float64)
-            if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
-                raise SimulationError(
-                    f"control has shape {values.shape}, expected ({self.num_envs}, {self.model.nu}) or ({self.model.nu},)"
-                )
-            if not np.isfinite(values).all():
-                raise SimulationError(f"control is not finite in environments {_bad_rows(values)}")
-            self.batch.ctrl[...] = values
-        self.batch.warning[...] = 0
-        self._run(lambda: self.batch.step(nstep=self.substeps))
-        diverged = np.flatnonzero(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1))
-        if len(diverged):
-            which = listed([str(env) for env in diverged])
-            raise SimulationError(f"environments {which} diverged, and MuJoCo has started them anew; reset them to go on")
+        self._set_control(control)
+        self._advance(self.substeps)
+
+    def substates(self, control: Tensor | Array | None = None) -> Iterator[SceneState]:
+        """Advance all environments by one control step, and hand out the state after each of its physics steps.
+
+        For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
+        simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps.
+
+        Args:
+            control: Actuator controls, as for `step`; they are set when the first state is asked for.
+
+        Yields:
+            What `state` returns after each physics step; its `dt` is that of one physics step.
+
+        Raises:
+            SimulationError: As `step` does, at the physics step where it happens.
+        """
+        self._set_control(control)
+        for _ in range(self.substeps):
+            self._advance(1)
+            yield self._state(float(self.model.opt.timestep))
 
     def state(self) -> SceneState:
-        """Return what the module wants, of one instant, in float64 on the module's device."""
-        values: dict[str, Any] = {}
-        for name, reader in self._readers.items():
-            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
-        if "dt" in self._touch.inputs.fields:
-            values["dt"] = self.control_step
-        return SceneState(**values)
+        """Return what the module wants, of one instant, in float64 on the module's device; `dt` is that of a control step."""
+        return self._state(self.control_step)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start some environments anew (default: all), in the simulator and in the module.
@@ -178,6 +180,34 @@ class BatchSimulation:
         models = self._objects.models()
         self._run(lambda: self.batch.set_models(models))
         self.reset(ids)
+
+    def _set_control(self, control: Tensor | Array | None) -> None:
+        if control is None:
+            return
+        values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control, dtype=np.float64)
+        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
+            raise SimulationError(
+                f"control has shape {values.shape}, expected ({self.num_envs}, {self.model.nu}) or ({self.model.nu},)"
+            )
+        if not np.isfinite(values).all():
+            raise SimulationError(f"control is not finite in environments {_bad_rows(values)}")
+        self.batch.ctrl[...] = values
+
+    def _advance(self, num_steps: int) -> None:
+        self.batch.warning[...] = 0
+        self._run(lambda: self.batch.step(nstep=num_steps))
+        diverged = np.flatnonzero(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1))
+        if len(diverged):
+            which = listed([str(env) for env in diverged])
+            raise SimulationError(f"environments {which} diverged, and MuJoCo has started them anew; reset them to go on")
+
+    def _state(self, dt: float) -> SceneState:
+        values: dict[str, Any] = {}
+        for name, reader in self._readers.items():
+            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
+        if "dt" in self._touch.inputs.fields:
+            values["dt"] = dt
+        return SceneState(**values)
 
     def _indices(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
         """Return environments as indices, from indices or a mask.

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from tgdsl.history import last_step
 from tgdsl.module import Output, TactileModule
 from tgdsl.runtime.batch import BatchSimulation
 
@@ -88,7 +89,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         touch: The module.
         sim: The scene, at the instant of the reading.
         output: Which reading; its magnitude is the norm over the channels that share the first one's unit.
-        values: The reading of all environments.
+        values: The reading of all environments; of stacked calls the last one is shown.
         env: Which environment.
     """
     table = touch.taxels[output.sensor]
@@ -101,7 +102,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         pos, normal, size = (np.array([part[own].mean(axis=0) for own in member]) for part in (pos, normal, 3 * size))
         bodies = np.array(output.bodies)
     same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
-    read = values[env].detach().cpu().double().numpy()[:, same]
+    read = last_step(values)[env].detach().cpu().double().numpy()[:, same]
     value = np.linalg.norm(read, axis=1)
     is_vector = len(same) == 3 and output.channels[0].endswith("_x")
     stem = output.channels[0].removesuffix("_x")

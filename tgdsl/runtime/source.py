@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -26,8 +26,15 @@ class Source(Protocol):
         """Advance all environments by one control step."""
         ...
 
+    def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
+        """Advance all environments by one control step, and yield the state after each of its physics steps.
+
+        The `dt` of these states is that of a physics step. What has no physics steps yields one state, of the control step.
+        """
+        ...
+
     def state(self) -> SceneState:
-        """Return what the module wants, all of it from one instant."""
+        """Return what the module wants, all of it from one instant; its `dt` is that of a control step."""
         ...
 
     def reset(self, env_ids: EnvIds | None = None) -> None:

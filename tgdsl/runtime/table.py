@@ -10,6 +10,7 @@ from typing import TextIO
 import numpy as np
 from torch import Tensor
 
+from tgdsl.history import last_step
 from tgdsl.module import Output, TactileModule
 
 
@@ -40,7 +41,7 @@ def _cell(touch: TactileModule, output: Output, readings: Mapping[str, Tensor], 
     own = taxels["link"] == link
     if not own.any():
         return "–"
-    values = readings[output.name][env].detach().cpu().double().numpy()
+    values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
     values = values[[output.bodies.index(taxels["body"][own][0])]] if output.rows == "body" else values[own]
     if output.channels == ("contact",):
         return f"{int(values.sum())}/{len(values)}"

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.instant import Now, Planes, of, row_index
+from tgdsl.sensors.noise.instant import Now, Planes, of
 
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel to, taxel from): `kernel/0000` and so on, in the order of the taxels."""
@@ -55,22 +55,24 @@ def crosstalk(planes: Planes, values: Mapping[str, Tensor]) -> Planes:
 
 def delayed(planes: Planes, values: Mapping[str, Tensor], ring: Planes, now: Now) -> Planes:
     """Return the signal as it was, linear between calls; before the first call it counts as constant."""
-    assert now.dt is not None
-    late = values["delay"]
+    assert now.ages is not None
+    late = values["delay"][:, 0]
     if "jitter" in values:
-        share = random.uniform(random.words(now.streams[random.JITTER], row_index(0, 1)), late.dtype)
-        late = late + values["jitter"] * share[:, None]
+        index = torch.zeros_like(now.streams[random.JITTER].first[:1, 0])
+        late = late + values["jitter"][:, 0] * random.uniform(random.words(now.streams[random.JITTER], index), late.dtype)
     length = ring[0].shape[1]
-    calls = torch.minimum((late / now.dt)[:, 0], torch.clamp(now.age, max=length).to(late.dtype))
-    whole = calls.floor().clamp(max=length - 1)
+    ages = now.ages[:length]
+    newer = torch.minimum((ages <= late[..., None]).sum(dim=-1), torch.clamp(now.age, max=length))
+    is_oldest = newer >= torch.clamp(now.age, max=length)
+    start = torch.where(newer > 0, ages[(newer - 1).clamp(min=0)], 0.0)
+    rest = (late - start) / (ages[newer.clamp(max=length - 1)] - start)
     # Stacked, they are stored once per environment, see `random.streams`.
-    whole, rest = torch.stack([whole, calls - whole]).unbind()
-    newer = whole.to(torch.int64)
+    rest, is_now = torch.stack([torch.where(is_oldest, 0.0, rest), (newer == 0).to(rest.dtype)]).unbind()
     slots = torch.stack([(now.step - newer) % length, (now.step - newer - 1) % length]).unbind()
     result = []
     for plane, past in zip(planes, ring, strict=True):
         after, before = (_entry(past, slot) for slot in slots)
-        after = torch.where(newer == 0, plane, after)
+        after = torch.where(is_now > 0, plane, after)
         result.append(torch.where(rest > 0, after + rest * (before - after), after))
     return result
 

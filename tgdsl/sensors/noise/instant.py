@@ -25,6 +25,7 @@ class Now(NamedTuple):
         dt: Time since the last call [s].
         step: Number of this call.
         age: Calls since each environment's reset, (env, 1); 0 at the first one.
+        ages: Time since each of the calls before this one, the last one first [s]; None if no sensor wants to know.
         is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
         streams: The sensor's random numbers, by purpose.
     """
@@ -32,6 +33,7 @@ class Now(NamedTuple):
     dt: Tensor | None
     step: Tensor
     age: Tensor
+    ages: Tensor | None
     is_sample: Tensor | None
     streams: Mapping[int, Stream]
 
@@ -41,11 +43,9 @@ def of(values: Tensor, c: int) -> Tensor:
     return values[:, c if values.shape[1] > 1 else 0]
 
 
-def row_index(row: int, like: Tensor | int) -> Tensor:
+def row_index(row: int, like: Tensor) -> Tensor:
     """Return the numbers of a row's random words: as many as there are taxels."""
-    count = like if isinstance(like, int) else like.shape[-1]
-    device = None if isinstance(like, int) else like.device
-    return torch.arange(count, dtype=torch.int32, device=device) + row * count
+    return torch.arange(like.shape[-1], dtype=torch.int32, device=like.device) + row * like.shape[-1]
 
 
 def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:

@@ -1,0 +1,297 @@
+"""Imperfect sensors: what each term of the noise costs, and what a press, a hold, a release and a slide look like through it.
+
+    python benchmarks/noise.py cost [--device cuda] [--num-envs 1024] [--repeats 30] [--eager]
+    python benchmarks/noise.py plot [--out docs/images]
+
+`cost` times `kinematic_taxel` (force and torque) with each term alone, with `noisy` and with everything, on the XHand1 (199
+taxels) and on a pad of 10 × 20, against the same document without a `noise` key. All modules of a scene are called in turn,
+so that a drifting machine disturbs all alike; on a GPU the calls are replayed CUDA graphs. "clean, again" is a second module
+of the first one's document: how far its ratio is from 1 is how far any other may be off. Bytes are what a module remembers
+after a call, per taxel and environment.
+
+`plot` moves a cube by a script, no simulator: onto a pad, held there, off, on again, along it, and off.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+from elastomer import captured
+from module import PAD, median_ms
+
+import tgdsl
+from tgdsl.module import TactileModule
+from tgdsl.state import SceneState
+
+CROSSTALK = {"strength": 0.3, "sigma": 3e-3}
+TERMS: dict[str, dict[str, Any]] = {
+    "clean, again": {},
+    "`noise: clean`": {"noise": "clean"},
+    "radius noise": {"noise": {"radius_noise": 3e-4}},
+    "gain": {"noise": {"gain": [0.85, 1.15]}},
+    "hysteresis": {"noise": {"hysteresis": {"strength": 0.5, "time_constant": 0.05}}},
+    "crosstalk": {"noise": {"crosstalk": CROSSTALK}},
+    "delay, 1 call": {"noise": {"read_delay": 0.01}},
+    "delay, up to 3 calls": {"noise": {"read_delay": 0.01, "jitter": 0.02}},
+    "bias": {"noise": {"bias": 0.01}},
+    "white noise": {"noise": {"white_noise": 5e-3}},
+    "white noise, a range": {"noise": {"white_noise": [2e-3, 8e-3]}},
+    "drift": {"noise": {"drift": 1e-4}},
+    "quantization": {"noise": {"quantization": 1e-2}},
+    "dead taxels": {"noise": {"dead_probability": 0.05, "dead_range": [0.0, 1.0]}},
+    "`noise: noisy`": {"noise": "noisy"},
+    "everything": {
+        "noise": {
+            "like": "noisy",
+            "crosstalk": CROSSTALK,
+            "read_delay": 0.01,
+            "jitter": 0.02,
+            "bias": [-0.01, 0.01],
+            "dead_range": [0.0, 1.0],
+        }
+    },
+    "`rate: 50 Hz`": {"rate": "50 Hz"},
+    "`history: 5`": {"history": 5},
+}
+"""What is timed beside a document that says nothing of noise or time; a call is 10 ms after the last one."""
+NUM_TAXELS = {"xhand1": 199, "pad": 200}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Time and bytes of every term."""
+
+    device: str = "cpu"
+    """Where."""
+    num_envs: int = 1024
+    """Environments."""
+    repeats: int = 30
+    """Timed calls of each module."""
+    scenes: tuple[str, ...] = ("xhand1", "pad")
+    """Which scenes: xhand1, pad."""
+    terms: tuple[str, ...] = field(default_factory=lambda: tuple(TERMS))
+    """Which rows; default: all."""
+    eager: bool = False
+    """Whether to leave the modules uncompiled."""
+
+    def run(self) -> None:
+        """Measure and print one table."""
+        torch._dynamo.config.recompile_limit = 256  # all modules share the code of one method
+        where = torch.cuda.get_device_name() if self.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+        how = "eager" if self.eager else "compiled"
+        print(f"torch {torch.__version__}, {where}, {self.num_envs} environments, float32, {how}, medians of {self.repeats}\n")
+        columns = {scene: self._scene(scene) for scene in self.scenes}
+        print(f"| | {' | '.join(f'{scene}: time | bytes' for scene in columns)} |\n|{'---|' * (1 + 2 * len(columns))}")
+        for name in ("clean", *self.terms):
+            cells = [f"{rows[name][0] / rows['clean'][0]:.2f} | {rows[name][1]:.1f}" for rows in columns.values()]
+            print(f"| {name} | {' | '.join(cells)} |")
+        for scene, rows in columns.items():
+            print(f"\n{scene}: clean takes {1e3 * rows['clean'][0]:.0f} µs", end="")
+
+    def _scene(self, scene: str) -> dict[str, tuple[float, float]]:
+        """Return time [ms] and bytes per taxel and environment of each module of a scene."""
+        torch.compiler.reset()
+        calls, sizes = {}, {}
+        with TemporaryDirectory() as folder:
+            for name, fields in {"clean": {}, **{name: TERMS[name] for name in self.terms}}.items():
+                touch = kinematic(scene, Path(folder), self.device, fields)
+                if not self.eager:
+                    touch.compile()
+                state = touch.example_state(self.num_envs, dtype=torch.float32)
+                with torch.no_grad():
+                    touch(state)  # compiles it, and makes what it remembers
+                    calls[name] = captured(lambda touch=touch, state=state: touch(state), self.device)
+                held = [*touch.memory.buffers(), *touch.histories.buffers()]
+                size = sum(buffer.numel() * buffer.element_size() for buffer in held if buffer.ndim)
+                sizes[name] = size / self.num_envs / NUM_TAXELS[scene]
+        times = median_ms(calls, self.repeats, self.device)
+        return {name: (times[name], sizes[name]) for name in calls}
+
+
+def kinematic(scene: str, folder: Path, device: str, fields: dict[str, Any]) -> TactileModule:
+    """Return `kinematic_taxel` on the XHand1 or on a pad under a cube; `fields` are the sensor's further ones."""
+    if scene == "xhand1":
+        sensor = {"kind": "kinematic_taxel", "links": "hand", "feels": ["cube"], **fields}
+        example = Path(__file__).parent.parent / "examples" / "xhand1_palm.yaml"
+        changes = {"sensors": json.dumps({"touch": sensor}), "observations": "{}"}
+        return tgdsl.compile(example, overrides=changes, device=device)
+    grid = {"method": "grid", "rows": 10, "columns": 20, "direction": [0, 0, -1], "radius": 0.004}
+    document = pad_document(folder, PAD, grid, {"touch": {"kind": "kinematic_taxel", **fields}}, "cube")
+    return tgdsl.compile(document, device=device)
+
+
+def pad_document(folder: Path, scene: str, placed: dict[str, Any], sensors: dict[str, Any], item: str) -> dict[str, Any]:
+    """Return a document of sensors on the body `pad` that feel one object."""
+    model = folder / "scene.xml"
+    model.write_text(scene)
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(model), "layout": {"resolutions": {"r": {"pad": placed}}}},
+        "objects": {item: {"body": item}},
+        "sensors": {name: {"links": "pad", "feels": [item], **sensor} for name, sensor in sensors.items()},
+    }
+
+
+# The plot ------------------------------------------------------------------------------------------------------------------
+
+STEP = 5e-3
+"""Time between two readings of the plot [s]."""
+WAY = (
+    (0.0, 5.0, 0.0),
+    (0.1, 5.0, 0.0),
+    (0.3, -0.5, 0.0),
+    (0.7, -0.5, 0.0),
+    (0.9, 5.0, 0.0),
+    (1.1, 5.0, 0.0),
+    (1.3, -0.5, 0.0),
+    (1.4, -0.5, 0.0),
+    (1.9, -0.5, 5.0),
+    (2.0, -0.5, 5.0),
+    (2.2, 5.0, 5.0),
+    (2.4, 5.0, 5.0),
+)
+"""When [s], how high the cube's lower face is over the pad [mm] and how far along it [mm]; evenly in between."""
+PHASES = (("press", 0.2), ("hold", 0.5), ("release", 0.8), ("press again", 1.2), ("slide", 1.65), ("release", 2.1))
+SHOWN = 27
+"""The taxel that is shown: one near the pad's middle."""
+COLOURS = {"clean": "#b9bec7", "measured": "#2a62b0"}
+PLOT_PAD = """
+<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".016 .016 .005" pos="0 0 -.005"/></body>
+  <body name="cube"><freejoint/><geom type="box" size=".012 .012 .012"/></body>
+</worldbody></mujoco>
+"""
+POINT_PAD = """
+<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".016 .016 .005" pos="0 0 -.005"/></body>
+  <body name="ball"><freejoint/><geom type="sphere" size=".004"/></body>
+</worldbody></mujoco>
+"""
+GRID = {"method": "grid", "rows": 8, "columns": 8, "direction": [0, 0, -1], "radius": 4e-3}
+SKIN = {
+    "kernel": "bonded_layer",
+    "thickness": 2e-3,
+    "standoff": 5e-4,
+    "youngs_modulus": 2e5,
+    "poissons_ratio": 0.45,
+    "normal_stiffness": 1e8,
+    "friction": 0.4,
+}
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Clean against measured for press, hold, release and slide."""
+
+    out: Path = Path("docs/images")
+    """Folder for noise_press.png."""
+    seed: int = 0
+    """Seed of the noise."""
+
+    def run(self) -> None:
+        """Read the script and draw."""
+        sensors: dict[str, dict[str, Any]] = {
+            "depth": {"kind": "contact_depth", "gate": "geometric"},
+            "contact": {"kind": "contact", "gate": "geometric", "threshold": "0.5 mm"},
+            "touch": {"kind": "kinematic_taxel", "gate": "geometric", "outputs": ["force"]},
+            "skin": {"kind": "elastomer", "gate": "geometric", **SKIN},
+            "near": {"kind": "proximity", "outputs": ["force"], "tolerance": 0.02},
+        }
+        sensors = {name: {**fields, "noise": "noisy", "readout": "both"} for name, fields in sensors.items()}
+        with TemporaryDirectory() as folder:
+            touch = tgdsl.compile(pad_document(Path(folder), PLOT_PAD, GRID, sensors, "cube")).seed(self.seed)
+            point = point_load(Path(folder))
+        when, place, speed = script()
+        found: dict[str, list[np.ndarray]] = {output.name: [] for output in touch.outputs}
+        with torch.no_grad():
+            for i in range(len(when)):
+                readings = touch(state_at(touch, "cube", place[i], speed[i]))
+                for name, kept in found.items():
+                    kept.append(readings[name][0].numpy())
+        figure = draw(when, {name: np.stack(kept) for name, kept in found.items()}, point)
+        path = self.out / "noise_press.png"
+        figure.savefig(path, dpi=110)
+        print(path)
+
+
+def script() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return time [s], where the cube is (step, 3) [m], and how fast it moves (step, 3) [m/s]."""
+    corner, height, along = np.array(WAY).T
+    when = np.arange(0, corner[-1], STEP)
+    place = 1e-3 * np.stack([np.interp(when, corner, along), 0 * when, np.interp(when, corner, height) + 12], axis=1)
+    return when, place, np.gradient(place, STEP, axis=0)
+
+
+def state_at(touch: TactileModule, item: str, place: np.ndarray, speed: np.ndarray) -> SceneState:
+    """Return a scene with the pad at rest at the origin and the item at a place [m], with a speed [m/s]."""
+    bodies = touch.inputs.bodies
+    pos, linvel = torch.zeros(2, 1, len(bodies), 3, dtype=torch.float64)
+    pos[0, bodies.index(item)], linvel[0, bodies.index(item)] = torch.from_numpy(place), torch.from_numpy(speed)
+    quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, len(bodies), 4)
+    return SceneState(body_pos=pos, body_quat=quat, body_linvel=linvel, body_angvel=torch.zeros_like(pos), dt=STEP)
+
+
+def point_load(folder: Path) -> dict[str, np.ndarray]:
+    """Return what a ball over the corner taxel presses with, clean and after crosstalk: (row, column) [N]."""
+    noise = {"crosstalk": {"strength": 0.5, "sigma": 4e-3}}
+    sensor = {"kind": "kinematic_taxel", "gate": "geometric", "outputs": ["force"], "noise": noise, "readout": "both"}
+    small = {**GRID, "radius": 1e-3}
+    touch = tgdsl.compile(pad_document(folder, POINT_PAD, small, {"s": sensor}, "ball"), dtype=torch.float64)
+    readings = touch(state_at(touch, "ball", touch.taxels["s"]["pos"][0] + [0, 0, 4e-3], np.zeros(3)))
+    images = {which: touch.images(name, readings)[0]["pad"] for which, name in (("clean", "s/clean"), ("measured", "s"))}
+    return {which: -image[0, 2].numpy() for which, image in images.items()}
+
+
+def draw(when: np.ndarray, found: dict[str, np.ndarray], point: dict[str, np.ndarray]) -> Any:
+    """Return the figure: a panel for each sensor, and one for crosstalk."""
+    from matplotlib.figure import Figure
+
+    panels = {
+        "contact_depth": ("depth [mm]", "depth", lambda r: 1e3 * r[:, SHOWN, 0]),
+        "contact": ("taxels in contact", "contact", lambda r: r[:, :, 0].sum(axis=1)),
+        "kinematic_taxel, into the pad": ("force −z [N]", "touch", lambda r: -r[:, SHOWN, 2]),
+        "elastomer, along the slide": ("displacement x [mm]", "skin", lambda r: 1e3 * r[:, SHOWN, 0]),
+        "proximity, into the pad": ("force −z [N]", "near", lambda r: -r[:, SHOWN, 2]),
+    }
+    figure = Figure(figsize=(11, 9.2), layout="constrained")
+    grid = figure.add_gridspec(3, 4)
+    for i, (title, (unit, name, of)) in enumerate(panels.items()):
+        row, column = divmod(i, 2)
+        axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
+        axes.plot(when, of(found[f"{name}/clean"]), color=COLOURS["clean"], linewidth=4, label="clean")
+        axes.plot(when, of(found[name]), color=COLOURS["measured"], linewidth=1.1, label="measured, noise: noisy")
+        axes.set_title(title, loc="left", fontsize=12, fontweight="bold")
+        axes.set(xlabel="time [s]", ylabel=unit, xlim=(0, when[-1]))
+        axes.grid(alpha=0.25)
+        for phase, at in PHASES:
+            axes.text(at, 0.99, phase, ha="center", va="top", fontsize=8.5, color="#666", transform=axes.get_xaxis_transform())
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + 0.1 * (high - low))
+    most = point["clean"].max()
+    for column, (which, force) in enumerate(point.items()):
+        axes = figure.add_subplot(grid[2, 2 + column])
+        shown = axes.imshow(np.sqrt(force), cmap="Blues", vmin=0.0, vmax=np.sqrt(most))
+        name = {"clean": "clean", "measured": "crosstalk"}[which]
+        axes.set_title(f"{name}: Σ = {force.sum():.4f} N", loc="left", fontsize=11, fontweight="bold")
+        axes.set(xlabel="column", ylabel="row" if column == 0 else "")
+    ticks = np.array([0, 0.05, 0.2, 0.5, 1]) * most
+    bar = figure.colorbar(shown, ax=figure.axes[-2:], shrink=0.7, label="force −z [N]")
+    bar.set_ticks(list(np.sqrt(ticks)), labels=[f"{tick:.3f}" for tick in ticks])
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+Command = Annotated[Cost, tyro.conf.subcommand("cost")] | Annotated[Plot, tyro.conf.subcommand("plot")]
+
+if __name__ == "__main__":
+    start = time.perf_counter()
+    tyro.cli(Command).run()  # type: ignore[arg-type]
+    print(f"\n{time.perf_counter() - start:.0f} s")

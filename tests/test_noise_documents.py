@@ -1,0 +1,401 @@
+"""What a document says of noise, and what the plan then holds: profiles, knobs by kind, links, quantities, ranges."""
+
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.errors import SpecError
+from tgdsl.sensors import KINDS
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="a_tip"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="b_tip"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="palm"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="item"><freejoint/><geom type="sphere" size=".03"/></body>
+</worldbody></mujoco>
+"""
+LINKS = ("a_tip", "b_tip", "palm")
+DEFAULTS = {"proximity": {"backend": "points", "points": 100}}
+"""What keeps compiling fast."""
+
+
+def document(folder, kind: str, noise, profiles=None, observations=(), **sensor) -> dict:
+    """A document with one sensor, `s`, on two taxels of each of three links."""
+    (folder / "scene.xml").write_text(SCENE)
+    points = [{"pos": [0.005 * i, 0, 0.01], "normal": [0, 0, 1]} for i in range(2)]
+    layout = {name: {"method": "points", "points": points, "radius": "4 mm"} for name in LINKS}
+    own = {"kind": kind, "links": "*", "feels": ["item"], "noise": noise, **DEFAULTS.get(kind, {}), **sensor}
+    return {
+        "tgdsl": 1,
+        "robot": {
+            "model": str(folder / "scene.xml"),
+            "layout": {"groups": {"tips": ["*_tip"]}, "resolutions": {"r": layout}},
+        },
+        "objects": {"item": {"body": "item"}},
+        "sensors": {"s": own},
+        "noise": profiles or {},
+        "observations": {name: [{"type": name, "of": "s"}] for name in observations},
+    }
+
+
+def planned(folder, *arguments, **keys):
+    """Return the stages in the plan, and the values of their knobs."""
+    plan = compile_plan(document(folder, *arguments, **keys))
+    (sensor,) = plan.sensors
+    if sensor.noise is None:
+        return (), {}
+    return sensor.noise.terms, {name: plan.arrays[f"sensors/s/noise/{name}"] for name in sensor.noise.constants}
+
+
+def mistakes(folder, *arguments, **keys) -> list[str]:
+    with pytest.raises(SpecError) as caught:
+        compile_plan(document(folder, *arguments, **keys))
+    return [f"{problem.path}: {problem.what}" for problem in caught.value.problems]
+
+
+# the paper's tables
+
+TISSUE = {"gain_low": 0.85, "gain_high": 1.15, "hysteresis_strength": 0.5, "hysteresis_time": 0.05}
+DEAD = {"dead_probability": 0.05, "dead_low": 0.0}
+NOISY = {
+    ("contact", "bool"): {"release_threshold": 2e-4, **DEAD},
+    ("contact", "agg_bool"): {"release_threshold": 2e-4, **DEAD},
+    ("contact_depth", "depth"): {"white_noise": 2e-4, "quantization": 1e-4, "radius_noise": 3e-4, **DEAD, **TISSUE},
+    ("contact_depth", "agg_force"): {"white_noise": 2e-4, "quantization": 1e-4, "radius_noise": 3e-4, **DEAD, **TISSUE},
+    ("kinematic_taxel", "force"): {"white_noise": 5e-3, "drift": 1e-4, "quantization": 1e-2, "radius_noise": 3e-4, **DEAD, **TISSUE},
+    ("kinematic_taxel", "force_torque"): {"white_noise": 5e-3, "drift": 1e-4, "quantization": 1e-2, "radius_noise": 3e-4, **DEAD, **TISSUE},
+    ("proximity", "proximity"): {"white_noise": 1e-2, "drift": 1e-3, "quantization": 1e-2, "radius_noise": 6e-4, **DEAD, **TISSUE},
+    ("elastomer", "elastomer"): {"white_noise": 1e-4, "drift": 1e-5, "quantization": 1e-4, "radius_noise": 3e-4, **DEAD, **TISSUE},
+}  # fmt: skip
+"""The paper's table "Sensor imperfection parameters", by sensor kind and observation type; what is not named is off."""
+
+
+@pytest.mark.parametrize(("kind", "observation"), NOISY)
+def test_one_word_is_the_papers_noisy_condition(tmp_path, kind, observation):
+    """The plan holds the values of the table, the same for all channels, rows and environments, and no others."""
+    _, found = planned(tmp_path, kind, "noisy", observations=[observation])
+    assert {name: value.size for name, value in found.items()} == dict.fromkeys(NOISY[kind, observation], 1)
+    assert {name: value.item() for name, value in found.items()} == NOISY[kind, observation]
+
+
+BASE = {"read_delay", "jitter", "white_noise", "bias", "drift", "quantization"}
+KNOBS_OF = {
+    "surface_distance": BASE | {"radius_noise"},
+    "contact": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "release_threshold"},
+    "contact_depth": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis"},
+    "kinematic_taxel": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
+    "elastomer": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis"},
+    "proximity": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
+    "force_taxel": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
+    "link_contact": BASE,
+}
+"""The paper's table "Imperfection knobs available per sensor type", the Schmitt threshold that its values give to `bool`, and
+the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` with what every sensor has."""
+VALUES = {
+    "read_delay": 0.01,
+    "jitter": 0.01,
+    "white_noise": 1e-3,
+    "bias": 1e-3,
+    "drift": 1e-3,
+    "quantization": 1e-3,
+    "radius_noise": 1e-4,
+    "gain": [0.9, 1.1],
+    "dead_probability": 0.1,
+    "dead_range": [0, 1],
+    "hysteresis": {"strength": 0.5, "time_constant": 0.05},
+    "crosstalk": {"strength": 0.1, "sigma": 0.003},
+    "release_threshold": 1e-4,
+}
+IDLE = {("surface_distance", "radius_noise")}
+"""What the table gives a kind, and has no effect on what it reads: of that a warning says so."""
+
+
+def test_the_tables_of_this_test_are_complete():
+    assert set(KNOBS_OF) == {kind.name for kind in KINDS}
+    assert set().union(*KNOBS_OF.values()) == set(VALUES)
+
+
+TERMS = {"read_delay": "delay", "jitter": "delay", "dead_probability": "dead", "dead_range": "dead"}
+
+
+@pytest.mark.parametrize("kind", KNOBS_OF)
+def test_the_knobs_that_a_kind_has(tmp_path, kind):
+    """All of them are planned, and nothing else."""
+    noise = {knob: VALUES[knob] for knob in sorted(KNOBS_OF[kind]) if (kind, knob) not in IDLE}
+    terms, _ = planned(tmp_path, kind, noise)
+    assert set(terms) == {TERMS.get(knob, knob) for knob in noise}
+
+
+@pytest.mark.parametrize(("kind", "knob"), [(kind, knob) for kind in KNOBS_OF for knob in VALUES if knob not in KNOBS_OF[kind]])
+def test_a_knob_that_a_kind_has_not(tmp_path, kind, knob):
+    assert mistakes(tmp_path, kind, {knob: VALUES[knob]}) == [f'sensors.s.noise.{knob}: "{kind}" has no knob "{knob}"']
+
+
+@pytest.mark.parametrize(("kind", "knob"), IDLE)
+def test_a_knob_without_effect_warns(tmp_path, kind, knob):
+    with pytest.warns(UserWarning, match=f'^sensor "s": {knob} changes nothing in what {kind} reads$'):
+        assert planned(tmp_path, kind, {knob: VALUES[knob]}) == ((), {})
+
+
+@pytest.mark.parametrize("kind", ["surface_distance", "link_contact"])
+def test_a_profile_without_knobs_for_a_kind_warns(tmp_path, kind):
+    with pytest.warns(UserWarning, match=f'^sensor "s": the profile "noisy" has no knobs for {kind}, so it reads clean$'):
+        assert planned(tmp_path, kind, "noisy") == ((), {})
+
+
+@pytest.mark.parametrize("knob", ["crosstalk", "release_threshold"])
+def test_a_knob_that_a_kind_lacks_is_found_in_links_and_profiles(tmp_path, knob):
+    own = {knob: VALUES[knob]}
+    what = f'"contact_depth" has no knob "{knob}"'
+    assert mistakes(tmp_path, "contact_depth", {"links": {"palm": own}}) == [f"sensors.s.noise.links.palm.{knob}: {what}"]
+    assert mistakes(tmp_path, "contact_depth", "worn", {"worn": own}) == [
+        f"sensors.s.noise: {what} (in the profile worn → clean)"
+    ]
+    assert mistakes(tmp_path, "contact_depth", {"like": "old", "bias": 1}, {"worn": own, "old": {"like": "worn"}}) == [
+        f"sensors.s.noise: {what} (in the profile old → worn → clean)"
+    ]
+
+
+# links
+
+
+def rows(value) -> list[float]:
+    """Return a knob's value on the three links: two taxels each, in the order of the robot's bodies."""
+    each = np.broadcast_to(value, (1, 6))[0].reshape(3, 2)
+    assert (each[:, 0] == each[:, 1]).all()
+    return each[:, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    ("links", "expected"),
+    [
+        ({"palm": 2}, [1, 1, 2]),
+        ({"tips": 2}, [2, 2, 1]),
+        ({"?_tip": 2}, [2, 2, 1]),
+        ({"*": 2}, [2, 2, 2]),
+        ({"tips": 2, "a_tip": 3}, [3, 2, 1]),
+        ({"a_tip": 3, "tips": 2}, [2, 2, 1]),
+        ({"*": 2, "*_tip": 3, "b_tip": 0}, [3, 0, 2]),
+    ],
+)
+def test_links_apart(tmp_path, links, expected):
+    """By name, group and wildcard; of several that match, the later one counts."""
+    noise = {"white_noise": 1, "links": {pattern: {"white_noise": value} for pattern, value in links.items()}}
+    assert rows(planned(tmp_path, "contact_depth", noise)[1]["white_noise"]) == expected
+    profiles = {"own": noise}
+    assert rows(planned(tmp_path, "contact_depth", "own", profiles)[1]["white_noise"]) == expected
+    assert rows(planned(tmp_path, "contact_depth", {"like": "own"}, profiles)[1]["white_noise"]) == expected
+
+
+def test_links_keep_the_other_knobs_and_can_switch_one_off(tmp_path):
+    noise = {"like": "noisy", "links": {"palm": {"white_noise": 1, "hysteresis": None, "gain": [1, 1]}, "a_tip": {"bias": 2}}}
+    terms, found = planned(tmp_path, "contact_depth", noise)
+    assert terms == ("radius_noise", "gain", "hysteresis", "bias", "white_noise", "quantization", "dead")
+    assert rows(found["white_noise"]) == [2e-4, 2e-4, 1]
+    assert rows(found["hysteresis_strength"]) == [0.5, 0.5, 0]
+    assert rows(found["gain_low"]) == [0.85, 0.85, 1] and rows(found["gain_high"]) == [1.15, 1.15, 1]
+    assert rows(found["bias"]) == [2, 0, 0]
+    assert found["dead_probability"].item() == 0.05
+
+
+def test_links_of_a_sensor_that_reads_bodies(tmp_path):
+    noise = {"bias": 1, "links": {"b_tip": {"bias": 2}}}
+    (bias,) = planned(tmp_path, "link_contact", noise)[1].values()
+    np.testing.assert_array_equal(np.broadcast_to(bias, (1, 3)), [[1, 2, 1]])
+
+
+def test_links_of_a_profile_count_before_those_in_line(tmp_path):
+    noise = {"like": "own", "links": {"*_tip": {"bias": 3}}}
+    found = planned(tmp_path, "contact_depth", noise, {"own": {"links": {"a_tip": {"bias": 1}, "palm": {"bias": 2}}}})[1]
+    assert rows(found["bias"]) == [3, 3, 2]
+
+
+def test_unknown_links(tmp_path):
+    for noise, profiles, place in (
+        ({"links": {"a_tipp": {"bias": 1}}}, None, "sensors.s.noise.links.a_tipp: no link matches"),
+        ("own", {"own": {"links": {"a_tipp": {"bias": 1}}}}, 'sensors.s.noise: in the profile "own": no link matches'),
+    ):
+        (found,) = mistakes(tmp_path, "contact_depth", noise, profiles)
+        assert found.startswith(place) and '"a_tipp"' in found
+
+
+def test_links_that_a_sensor_is_not_on(tmp_path):
+    """In line that is a mistake; a profile may be shared by sensors on other links, and then says nothing of this one."""
+    links = {"links": {"palm": {"bias": 1}}}
+    (found,) = mistakes(tmp_path, "contact_depth", links, links=["tips"])
+    assert found.startswith("sensors.s.noise.links.palm: no link matches")
+
+
+def test_a_profile_with_links_that_a_sensor_is_not_on(tmp_path):
+    made = document(tmp_path, "contact_depth", "own", {"own": {"bias": 1, "links": {"palm": {"bias": 2}}}}, links="tips")
+    made["sensors"]["t"] = {**made["sensors"]["s"], "links": "palm"}
+    plan = compile_plan(made)
+    assert [plan.arrays[f"sensors/{name}/noise/bias"].tolist() for name in ("s", "t")] == [[[1.0]], [[2.0]]]
+
+
+# quantities
+
+
+def test_amplitudes_by_quantity(tmp_path):
+    noise = {
+        "white_noise": {"force": 5e-3, "torque": 1e-4},
+        "drift": {"torque": 1e-5},
+        "bias": {"force": [1, 2]},
+        "dead_probability": 0.1,
+        "dead_range": [{"force": -1}, {"force": 1, "torque": 0.1}],
+        "quantization": 1e-2,
+    }
+    found = planned(tmp_path, "kinematic_taxel", noise)[1]
+    np.testing.assert_array_equal(found["white_noise"], np.array([[5e-3] * 3 + [1e-4] * 3]).T)
+    np.testing.assert_array_equal(found["drift"], np.array([[0.0] * 3 + [1e-5] * 3]).T)
+    np.testing.assert_array_equal(found["bias"][..., 0], [[1, 1, 1, 0, 0, 0], [2, 2, 2, 0, 0, 0]])
+    np.testing.assert_array_equal(found["dead_low"], np.array([[-1.0] * 3 + [0.0] * 3]).T)
+    np.testing.assert_array_equal(found["dead_high"], np.array([[1.0] * 3 + [0.1] * 3]).T)
+    assert found["quantization"].tolist() == [[1e-2]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "quantities"),
+    [
+        ("contact", ["depth"]),
+        ("contact_depth", ["depth"]),
+        ("kinematic_taxel", ["force", "torque"]),
+        ("elastomer", ["displacement"]),
+        ("link_contact", ["force"]),
+        ("surface_distance", ["distance_item"]),
+        ("force_taxel", ["force"]),
+    ],
+)
+def test_the_quantities_of_each_kind(tmp_path, kind, quantities):
+    amplitudes = ("bias", "white_noise", "drift", "quantization")
+    found = planned(tmp_path, kind, {knob: dict.fromkeys(quantities, 0.5) for knob in amplitudes})[1]
+    assert {name: value.tolist() for name, value in found.items()} == {knob: [[0.5]] for knob in amplitudes}
+    (what,) = mistakes(tmp_path, kind, {"drift": {"temperature": 1}})
+    assert what == 'sensors.s.noise: "drift" names "temperature", which this sensor does not read'
+
+
+def test_a_quantity_that_outputs_leave_out(tmp_path):
+    (what,) = mistakes(tmp_path, "kinematic_taxel", {"bias": {"torque": 1}}, outputs=["force"])
+    assert what == 'sensors.s.noise: "bias" names "torque", which this sensor does not read'
+
+
+# profiles
+
+
+def test_profiles_upon_profiles(tmp_path):
+    profiles = {
+        "worn": {"like": "noisy", "bias": 1e-3, "gain": [0.5, 1]},
+        "old": {"like": "worn", "gain": [0.4, 1], "links": {"palm": {"bias": 2e-3}}},
+    }
+    _, found = planned(tmp_path, "contact_depth", {"like": "old", "hysteresis": None, "read_delay": "5 ms"}, profiles)
+    assert rows(found["bias"]) == [1e-3, 1e-3, 2e-3]
+    assert found["gain_low"].item() == 0.4 and found["gain_high"].item() == 1
+    assert found["delay"].item() == 5e-3 and "hysteresis_strength" not in found
+    rest = {name: NOISY["contact_depth", "depth"][name] for name in ("white_noise", "quantization", "radius_noise", *DEAD)}
+    assert {name: found[name].item() for name in rest} == rest
+
+
+def test_a_profile_upon_noisy_is_of_each_kind(tmp_path):
+    """`like: noisy` in a profile means what `noisy` means for the sensor that uses it."""
+    for kind, expected in (("contact_depth", 2e-4), ("elastomer", 1e-4), ("proximity", 1e-2)):
+        found = planned(tmp_path, kind, "mine", {"mine": {"like": "noisy", "bias": 1}})[1]
+        assert found["white_noise"].item() == expected and found["bias"].item() == 1
+
+
+def test_a_document_may_have_its_own_noisy(tmp_path):
+    assert planned(tmp_path, "contact_depth", "noisy", {"noisy": {"bias": 1}})[1] == {"bias": np.array([[1.0]])}
+    assert planned(tmp_path, "contact_depth", {"like": "noisy", "drift": 2}, {"noisy": {"bias": 1}})[0] == ("bias", "drift")
+
+
+# ranges
+
+
+RANGES = {
+    "radius_noise": ([1e-4, 2e-4], {"radius_noise": (1e-4, 2e-4)}),
+    "gain": ([[0.5, 0.6], [1.5, 1.7]], {"gain_low": (0.5, 0.6), "gain_high": (1.5, 1.7)}),
+    "hysteresis": (
+        {"strength": [0.2, 0.4], "time_constant": [0.02, 0.08]},
+        {"hysteresis_strength": (0.2, 0.4), "hysteresis_time": (0.02, 0.08)},
+    ),
+    "crosstalk": (
+        {"strength": [0.1, 0.2], "sigma": [0.003, 0.006]},
+        {"crosstalk_strength": (0.1, 0.2), "crosstalk_mixture": (0, 1)},
+    ),
+    "read_delay": ([0.01, 0.03], {"delay": (0.01, 0.03)}),
+    "jitter": ([0.0, 0.02], {"jitter": (0, 0.02), "delay": None}),
+    "bias": ([-1, 2], {"bias": (-1, 2)}),
+    "white_noise": ([1, 3], {"white_noise": (1, 3)}),
+    "drift": ([1, 3], {"drift": (1, 3)}),
+    "quantization": ([1, 3], {"quantization": (1, 3)}),
+    "dead_probability": ([0.1, 0.4], {"dead_probability": (0.1, 0.4), "dead_low": None}),
+    "dead_range": ([[-4, -3], [5, 7]], {"dead_low": (-4, -3), "dead_high": (5, 7), "dead_probability": None}),
+}
+"""A range of each knob, and the ends of what is drawn; None: a plain number that comes with it."""
+
+
+@pytest.mark.parametrize("knob", RANGES)
+def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
+    """What stages are given is inside the range, differs between environments, stays, and changes at reset where it should."""
+    value, expected = RANGES[knob]
+    noise = {knob: value, **({"dead_probability": 0.5} if knob == "dead_range" else {})}
+    touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", noise), dtype=torch.float64)
+    num_envs = 200
+
+    def drawn() -> dict[str, torch.Tensor]:
+        state = touch.example_state(num_envs)
+        memory = touch.memory.tensors(num_envs, state.dt, touch.dtype, touch.device)
+        dt = {} if state.dt is None else {"dt": torch.tensor(state.dt, dtype=torch.float64)}
+        values = touch._circumstances(dt, memory)[1]["s"]
+        touch(state)
+        return {name: values[name][:, 0, 0] for name in expected}
+
+    first, second = drawn(), drawn()
+    touch.reset([3, 7])
+    third = drawn()
+    others = [env for env in range(num_envs) if env not in (3, 7)]
+    for name, ends in expected.items():
+        assert torch.equal(first[name], second[name])
+        if ends is None:
+            assert len(first[name]) == 1
+            continue
+        low, high = ends
+        assert len(first[name].unique()) == num_envs
+        assert low <= first[name].min() < low + 0.1 * (high - low)  # P(no one of 200 there) = 7e-10
+        assert high >= first[name].max() > high - 0.1 * (high - low)
+        assert torch.equal(third[name][others], first[name][others])
+        assert (third[name][[3, 7]] != first[name][[3, 7]]).all()
+
+
+def test_a_range_of_the_release_threshold(tmp_path):
+    """Bits that are on go off below the environment's own threshold, somewhere in the range."""
+    noise = {"release_threshold": [1e-3, 3e-3]}
+    made = document(tmp_path, "contact", noise, threshold=3.5e-3, gate="geometric")
+    touch = tgdsl.compile(made, dtype=torch.float64)
+    state = touch.example_state(200)
+    state.body_pos, state.body_quat = torch.zeros(200, 4, 3, dtype=torch.float64), torch.zeros(200, 4, 4, dtype=torch.float64)
+    state.body_quat[..., 0] = 1
+    released = torch.zeros(200, dtype=torch.float64)
+    item, depths = touch.inputs.bodies.index("item"), np.linspace(3.75e-3, 0.5e-3, 66)
+    for depth in depths:  # of the taxel in the middle: 10 mm up, of radius 4 mm, under a ball of 30 mm
+        state.body_pos[:, item, 2] = 0.01 + 0.004 + 0.03 - depth
+        is_off = touch(state)["s"][:, 0, 0] == 0
+        released = torch.where(is_off & (released == 0), torch.tensor(depth, dtype=torch.float64), released)
+    step = depths[0] - depths[1]
+    assert 1e-3 - step <= released.min() < 1.2e-3 and 2.8e-3 < released.max() <= 3e-3
+    assert len(released.unique()) > 20
+
+
+def test_a_release_threshold_above_the_threshold(tmp_path):
+    (what,) = mistakes(tmp_path, "contact", {"release_threshold": [1e-4, 6e-4]}, threshold=5e-4)
+    assert what == "sensors.s.noise: release_threshold 0.0006 m is above the sensor's threshold 0.0005 m"
+
+
+def test_dead_readings_of_ranged_ends_lie_between_an_environments_own(tmp_path):
+    """z_j ~ U[low, high] with low and high drawn per environment: taxels of one environment differ, also for equal ranges."""
+    noise = {"dead_probability": 1, "dead_range": [[-1, 1], [-1, 1]]}
+    touch = tgdsl.compile(document(tmp_path, "contact_depth", noise), dtype=torch.float64)
+    stuck = touch(touch.example_state(50))["s"][..., 0]
+    assert all(len(row.unique()) == 6 for row in stuck)
