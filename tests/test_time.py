@@ -1,6 +1,7 @@
 """Time: the rate of a sensor, its history, its delay, and the time step that a scene gives."""
 
 import itertools
+import warnings
 from fractions import Fraction
 
 import numpy as np
@@ -115,7 +116,10 @@ def test_the_phase_does_not_drift(build, rate, dt, every):
 @pytest.mark.parametrize("rate", [200, 333, 1000, 1e5])
 def test_a_rate_above_that_of_the_calls_samples_at_every_call(build, rate):
     touch, depths = build(s={"rate": rate}), ramp(30)
-    np.testing.assert_allclose(run(touch, depths, [0.005] * 30), depths, atol=1e-12)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        np.testing.assert_allclose(run(touch, depths, [0.005] * 30), depths, atol=1e-12)
+    assert [f'"s" has a rate of {rate:g} Hz' in str(warning.message) for warning in caught] == [True] * (rate > 200)
 
 
 @pytest.mark.parametrize("rate", [37, 60, 120])

@@ -206,7 +206,8 @@ def _amplitudes(sensor: PlannedSensor, value: Shaped[np.ndarray, "*end channel r
     shown: dict[str, str] = {}
     for c, channel in enumerate(sensor.signal):
         own = value[..., c if value.shape[-2] > 1 else 0, :]
-        shown.setdefault(quantity(channel), f"{quantity(channel)} {_value(own)}{units.get(channel, '')}")
+        name = quantity(channel)
+        shown.setdefault(name, f"{name} {_value(own)}{units.get(channel, '')}")
     return ", ".join(shown.values())
 
 

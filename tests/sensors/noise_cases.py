@@ -70,6 +70,7 @@ class Noise:
             length = max(math.ceil(self.lowered.past / dt - 1e-6), 1)
             self.memory["ring"] = [torch.full((num_envs, length, count), math.nan, dtype=dtype) for _ in channels]
         self.env = torch.arange(num_envs) + first_env
+        self.ages = torch.zeros(length if "ring" in self.memory else 1, dtype=dtype)
         self.step = 0
         self.age, self.episode = torch.zeros((2, num_envs), dtype=torch.int64)
 
@@ -83,7 +84,7 @@ class Noise:
         if self.lowered.streams:
             key = torch.tensor(self.key, dtype=torch.int32)
             drawn = random.streams(key, self.env, step, self.episode, self.lowered.streams)
-        return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], is_sample, drawn)
+        return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], self.ages + dt, is_sample, drawn)
 
     def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""
@@ -98,6 +99,7 @@ class Noise:
             for held, plane in zip(self.memory[key], noted, strict=True):
                 place = held[:, self.step % held.shape[1]] if key == "ring" else held
                 place.copy_(plane)
+        self.ages = torch.cat([torch.zeros_like(self.ages[:1]), self.ages[:-1] + dt])
         self.step += 1
         self.age += 1
         return torch.stack(planes, dim=-1)

@@ -151,20 +151,20 @@ def _parameters(knobs: Knobs, channels: Sequence[str]) -> dict[str, Float[np.nda
     return found | {name: _by_channel(name, value, channels) for name, value in amplitudes.items()}
 
 
-def quantity(channel: str, channels: Sequence[str]) -> str:
-    """Return what a channel is a component of: `force` of `force_x`, if there are three, else its own name."""
-    name, axis = channel[:-2], channel[-2:]
-    return name if axis in ("_x", "_y", "_z") and {f"{name}_{a}" for a in "xyz"} <= set(channels) else channel
+def quantity(channel: str) -> str:
+    """Return what a channel is a component of: `force` of `force_x`, else its own name; a distance is named by its object."""
+    is_component = channel[-2:] in ("_x", "_y", "_z") and not channel.startswith("distance_")
+    return channel[:-2] if is_component else channel
 
 
 def _by_channel(name: str, amplitude: Amplitude, channels: Sequence[str]) -> Float[np.ndarray, "end channel"]:
-    known = list(dict.fromkeys(quantity(channel, channels) for channel in channels))
+    known = list(dict.fromkeys(quantity(channel) for channel in channels))
     for own in amplitude:
         if own != ALL and own not in known:
             knob = "dead_range" if name.startswith("dead_") else name
             what = f'"{knob}" names "{own}", which this sensor does not read'
             raise LowerError(what, field="noise", hint=did_you_mean(own, known, "quantities"))
-    return np.array([amplitude.get(quantity(channel, channels), amplitude.get(ALL, ZERO)) for channel in channels]).T
+    return np.array([amplitude.get(quantity(channel), amplitude.get(ALL, ZERO)) for channel in channels]).T
 
 
 def _compact(value: Float[np.ndarray, "end channel row"]) -> np.ndarray:
