@@ -217,12 +217,14 @@ def advanced(
     """One call of all environments, as a pure function of (env, row), of which a compiler makes one kernel."""
     signal, dt = signal.to(noise.dtype), dt.to(noise.dtype)
     streams = random.streams(torch.tensor(noise.key, dtype=torch.int32), noise.env, step, noise.episode, noise.lowered.streams)
-    now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], None, streams)
-    values, past = stages.knob_values(noise.constants, now), {key: [value] for key, value in memory.items()}
+    ages = memory["ages"] + dt
+    now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], ages, None, streams)
+    values, past = stages.knob_values(noise.constants, now), {key: [memory[key]] for key in noise.memory}
     found, new = stages.disturb([signal], noise.lowered.terms, values, past, now)
     place = (step % memory["ring"].shape[1])[None]
     ring = memory["ring"].index_copy(1, place, new["ring"][0][:, None])
-    return found[0].double(), {**{key: value[0] for key, value in new.items()}, "ring": ring}
+    ages = torch.cat([torch.zeros_like(ages[:1]), ages[:-1]])
+    return found[0].double(), {**{key: value[0] for key, value in new.items()}, "ring": ring, "ages": ages}
 
 
 @pytest.mark.slow
@@ -248,7 +250,7 @@ def test_a_million_steps_in_float32_stay_near_those_in_float64(monkeypatch):
 
     torch.compiler.reset()
     run = torch.compile(several, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1, "cpp.threads": 1})
-    memory = [{key: planes[0].nan_to_num() for key, planes in noise.memory.items()} for noise in pair]
+    memory = [{**{key: planes[0].nan_to_num() for key, planes in n.memory.items()}, "ages": n.ages} for n in pair]
     signals, dts = torch.from_numpy(press), torch.from_numpy(dt)
     error = largest = torch.zeros((), dtype=torch.float64)
     with torch.no_grad():

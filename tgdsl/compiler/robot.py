@@ -258,8 +258,9 @@ def _is_urdf(path: Path) -> bool:
     if path.suffix.lower() == ".urdf":
         return True
     try:
-        for _, element in ET.iterparse(path, events=("start",)):
-            return element.tag == "robot"
+        with path.open("rb") as file:  # what is left half read must not stay open
+            for _, element in ET.iterparse(file, events=("start",)):
+                return element.tag == "robot"
     except (ET.ParseError, OSError):
         return False
     return False

@@ -92,7 +92,6 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
         point: Points in the object's frame [m].
         field: The field.
         radius_shift: By how much the radius is larger than the field's [m], to first order; the field then has 8 channels.
-            S0 is cut at 0, which the first order crosses near the edge of the sensing ball.
     """
     base, rest = _cell_of(point, field.origin, field.cell, field.num, last=2)
     _, num_y, num_z = field.num
@@ -105,7 +104,6 @@ def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = 
         total = [part + weight * field.values[index, c] for c, part in enumerate(total)]
     if radius_shift is not None:
         total = [part + radius_shift * slope for part, slope in zip(total[:4], total[4:], strict=True)]
-        total[0] = torch.clamp(total[0], min=0)
     return Moments(total[0], (total[1], total[2], total[3]))
 
 

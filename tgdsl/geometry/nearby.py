@@ -73,6 +73,8 @@ def _moments(point: Vec, source: MomentSource) -> Moments:
     parts = []
     if isinstance(source.surface, MomentField):
         near = field_moments(point, source.surface, source.shift)
+        if source.shift is not None:  # to first order S0 becomes negative near the edge of the sensing ball
+            near = near._replace(mass=torch.clamp(near.mass, min=0))
         # The field knows no radius: an inactive probe asks one that is not its own.
         is_active = source.radius > 0
         none = torch.zeros_like(near.mass)
