@@ -375,8 +375,7 @@ def test_each_knob_remembers_its_own(build, knob):
     touch, plain = build(s={"noise": {knob: EVERY_KNOB[knob]}}), build(s={})
     is_disturbed = [not torch.equal(a["s"], b["s"]) for a, b in zip(read(touch, range(2)), read(plain, range(2)), strict=True)]
     assert is_disturbed == [knob not in FILTERS, True]
-    channels = [f"{vector}_{axis}" for vector in ("force", "torque") for axis in "xyz"]
-    expected = {f"memory.s:noise/{name}/{channel}" for name in names for channel in channels}
+    expected = {f"memory.s:noise/{name}" for name in names}
     ages = {"memory.clock.ages"} if "ring" in names else set()
     assert set(touch.state_dict()) == expected | ages | (CLOCK if is_timed else set())
     assert set(touch.inputs.fields) - set(plain.inputs.fields) == ({"dt"} if wants_dt else set())
@@ -608,3 +607,13 @@ def test_compiled_equals_eager(build, monkeypatch, num_envs):
         for name in expected:
             a, b = (reading[name].flatten(0, -3) for reading in (found, expected))
             assert full_scale_error(a, b.double().numpy()).max() < FLOAT32_TOLERANCE, name
+
+
+@pytest.mark.parametrize("nobody", [[], torch.tensor([], dtype=torch.int64), torch.zeros(4, dtype=torch.bool)])
+def test_reset_of_no_environment_changes_nothing(build, nobody):
+    touch, other = (build(s={"noise": EVERY_KNOB, "history": 2}) for _ in range(2))
+    for module in (touch, other):
+        module(module.example_state(4))
+    touch.reset(nobody)
+    state = touch.example_state(4, seed=1)
+    torch.testing.assert_close(touch(state)["s"], other(state)["s"], rtol=0, atol=0)

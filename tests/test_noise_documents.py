@@ -140,10 +140,11 @@ def test_a_knob_without_effect_warns(tmp_path, kind, knob):
         assert planned(tmp_path, kind, {knob: VALUES[knob]}) == ((), {})
 
 
+@pytest.mark.parametrize("noise", ["noisy", {"like": "noisy"}])
 @pytest.mark.parametrize("kind", ["surface_distance", "link_contact"])
-def test_a_profile_without_knobs_for_a_kind_warns(tmp_path, kind):
+def test_a_profile_without_knobs_for_a_kind_warns(tmp_path, kind, noise):
     with pytest.warns(UserWarning, match=f'^sensor "s": the profile "noisy" has no knobs for {kind}, so it reads clean$'):
-        assert planned(tmp_path, kind, "noisy") == ((), {})
+        assert planned(tmp_path, kind, noise) == ((), {})
 
 
 @pytest.mark.parametrize("knob", ["crosstalk", "release_threshold"])

@@ -15,8 +15,6 @@ from tgdsl.plan import PlannedSensor
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import sensor_key, streams
 
-COUNTS = ("step", "episode", "age")
-
 
 class Clock(nn.Module):
     """Counts calls and episodes. It holds nothing until `start`, nor if no sensor asks for it.

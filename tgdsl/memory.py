@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from tgdsl.clock import Clock
 from tgdsl.errors import StateError
 from tgdsl.plan import PlannedMemory, PlannedSensor
+from tgdsl.sensors.noise.instant import stored
 
 
 class Memory(nn.Module):
@@ -28,6 +29,7 @@ class Memory(nn.Module):
         """Note what sensors carry."""
         super().__init__()
         self._planned = {f"{s.name}:{name}": (s, name, part) for s in sensors for name, part in s.state.items()}
+        self._rings = {path: found for path, found in self._planned.items() if found[2].past > 0}
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
 
@@ -46,13 +48,13 @@ class Memory(nn.Module):
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
 
         Args:
-            num_envs: Number of environments.
+            num_envs: Number of environments: of those whose state is held, if there are any.
             dt: Time since the last call [s], if some sensor wants to know it.
             dtype: Dtype of what is remembered.
             device: Where.
 
         Raises:
-            StateError: If the state of another number of environments is held, or dt is so short that a ring is too short.
+            StateError: If dt is so short that a ring is too short.
         """
         if self.is_wanted and self.num_envs is None:
             with torch.inference_mode(False):
@@ -60,14 +62,11 @@ class Memory(nn.Module):
                     shape = (num_envs, *_calls(planned, dt), *planned.shape)
                     self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
                 if self.clock.is_wanted:
-                    calls = max((*_calls(part, dt), 0)[0] for _, _, part in self._planned.values()) if self._planned else 0
+                    calls = max((_calls(part, dt)[0] for _, _, part in self._rings.values()), default=0)
                     self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
-        if self.is_wanted and self.num_envs != num_envs:
-            raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
         held: dict[str, Tensor] = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
-        for path, (sensor, _, planned) in self._planned.items():
-            needed = _calls(planned, dt)
-            if needed and needed[0] > held[path].shape[1]:
+        for path, (sensor, _, planned) in self._rings.items():
+            if _calls(planned, dt)[0] > held[path].shape[1]:
                 what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor.sensor}" does not hold'
                 raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
         return held | self.clock.tensors()
@@ -95,7 +94,7 @@ def store(memory: dict[str, Tensor], updated: dict[str, Tensor]) -> None:
     with torch.no_grad():
         for name, value in updated.items():
             if value.ndim < memory[name].ndim:
-                place = (memory["clock/step"] % memory[name].shape[1])[None]
+                (place,) = stored((memory["clock/step"] % memory[name].shape[1])[None])
                 memory[name].index_copy_(1, place, value.detach()[:, None])
         for name, value in updated.items():
             if value.ndim == memory[name].ndim:

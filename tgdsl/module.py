@@ -205,12 +205,18 @@ class TactileModule(nn.Module):
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
-        """Return the observation groups, each the concatenation of its terms, every term flattened channel-major."""
+        """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
+
+        Raises:
+            ObservationError: If an observation is one that only the real hand has.
+        """
         num_envs = next(iter(readings.values())).shape[0]
         nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
         groups: dict[str, list[Tensor]] = {}
         for term in self.plan.observations:
             features = nothing
+            if term.type in observations.HAND_ONLY:
+                raise observations.hand_only_error(term.group, term.index, term.type)
             if term.reading is not None:
                 constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
                 reading = readings[term.reading]
@@ -259,8 +265,9 @@ class TactileModule(nn.Module):
         with torch.no_grad():
             chosen = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
             if env_ids is not None:
+                ids = torch.as_tensor(env_ids, device=self.device)
                 chosen = torch.zeros_like(chosen)
-                chosen[torch.as_tensor(env_ids, device=self.device)] = True
+                chosen[ids if ids.numel() else ids.long()] = True  # an empty list has no integers to tell its dtype by
             self.memory.reset(chosen)
             for history in self.histories.values():
                 history.reset(chosen)  # type: ignore[operator]

@@ -4,6 +4,8 @@ Each type takes one reading (env, row, channel) and gives features (env, feature
 links) of the first channel, then of the second. "Per link" means one value for each link that carries the sensor, in the order
 of the robot's bodies; `link_bool` and `link_force` have one for each body, for that is what the solver knows.
 
+`taxel_counts` and `taxel_saturated` are what an XHand1's own fingertips say, taxel by taxel: no simulation has them.
+
 Source of the types and their constants: Chung et al., *Tactile Genesis*, appendix, "Tactile Observation Types".
 
 Shapes: `env` environments, `taxel` taxels of the sensor, `link` links that carry it, `row` taxels or bodies.
@@ -19,6 +21,7 @@ from jaxtyping import Float
 from pydantic import Field, StrictInt
 from torch import Tensor
 
+from tgdsl.errors import ObservationError
 from tgdsl.fields import Positive, SpecModel
 from tgdsl.layout import Layout
 
@@ -30,19 +33,21 @@ class NoneObservation(SpecModel):
     """Nothing."""
 
 
-class _Of(SpecModel):
+class OfReading(SpecModel):
+    """What all types have in common that observe a reading."""
+
     of: str
     """The reading that is observed: a sensor's name, or `<sensor>/clean`."""
 
 
-class BoolObservation(_Of):
+class BoolObservation(OfReading):
     """Contact bit per taxel, of a `contact` sensor."""
 
     type: Literal["bool"]
     """Contact bit per taxel."""
 
 
-class AggBoolObservation(_Of):
+class AggBoolObservation(OfReading):
     """Contact bit per link: whether more than a number of its taxels are in contact; of a `contact` sensor."""
 
     type: Literal["agg_bool"]
@@ -51,14 +56,14 @@ class AggBoolObservation(_Of):
     """Taxels that must be exceeded."""
 
 
-class DepthObservation(_Of):
+class DepthObservation(OfReading):
     """Depth per taxel [m], of a `contact_depth` sensor."""
 
     type: Literal["depth"]
     """Depth per taxel [m]."""
 
 
-class AggForceObservation(_Of):
+class AggForceObservation(OfReading):
     """Force per link estimated as scale · P · Σ depth · normal, of a `contact_depth` sensor."""
 
     type: Literal["agg_force"]
@@ -69,46 +74,67 @@ class AggForceObservation(_Of):
     """Order of the link-frame axes; `zyx` is that of the XHand1's aggregate pressure."""
 
 
-class ForceObservation(_Of):
+class ForceObservation(OfReading):
     """Force per taxel [N], link frame, of a `kinematic_taxel`, `force_taxel` or `proximity` sensor."""
 
     type: Literal["force"]
     """Force per taxel [N]."""
 
 
-class ForceTorqueObservation(_Of):
+class ForceTorqueObservation(OfReading):
     """Force [N] and torque [N·m] per taxel, link frame, of a `kinematic_taxel` sensor."""
 
     type: Literal["force_torque"]
     """Force [N] and torque [N·m] per taxel."""
 
 
-class ElastomerObservation(_Of):
+class ElastomerObservation(OfReading):
     """Displacement of each marker [m], link frame, of an `elastomer` sensor."""
 
     type: Literal["elastomer"]
     """Displacement of each marker [m]."""
 
 
-class ProximityObservation(_Of):
+class ProximityObservation(OfReading):
     """Force and torque signal per taxel [N, N·m], link frame, of a `proximity` sensor."""
 
     type: Literal["proximity"]
     """Force and torque signal per taxel."""
 
 
-class LinkBoolObservation(_Of):
+class LinkBoolObservation(OfReading):
     """Contact bit per body, as the solver has it, of a `link_contact` sensor."""
 
     type: Literal["link_bool"]
     """Contact bit per body."""
 
 
-class LinkForceObservation(_Of):
+class LinkForceObservation(OfReading):
     """The solver's force on each body [N], in the body's frame, of a `link_contact` sensor."""
 
     type: Literal["link_force"]
     """The solver's force on each body [N]."""
+
+
+class TaxelCountsObservation(SpecModel):
+    """Raw force of each of an XHand1's own taxels [counts]; from hardware alone.
+
+    Flattened channel-major: x of the thumb's 120 taxels in the order of the wire, then of the index, middle, ring and little
+    finger's; then y, then z. Neither tare nor calibration is applied. Where these taxels sit is not published.
+    """
+
+    type: Literal["taxel_counts"]
+    """Raw force of each of the hand's own taxels [counts]; from hardware alone."""
+
+
+class TaxelSaturatedObservation(SpecModel):
+    """Whether a component of each of an XHand1's own taxels is at the end of its range; from hardware alone.
+
+    120 bits of the thumb in the order of the wire, then of the index, middle, ring and little finger.
+    """
+
+    type: Literal["taxel_saturated"]
+    """Whether each of the hand's own taxels is at the end of its range; from hardware alone."""
 
 
 ObservationSpec = Annotated[
@@ -122,7 +148,9 @@ ObservationSpec = Annotated[
     | ElastomerObservation
     | ProximityObservation
     | LinkBoolObservation
-    | LinkForceObservation,
+    | LinkForceObservation
+    | TaxelCountsObservation
+    | TaxelSaturatedObservation,
     Field(discriminator="type"),
 ]
 
@@ -141,6 +169,9 @@ WANTED: dict[str, tuple[tuple[str, ...], str]] = {
 }
 """Channels of a reading that each observation type takes, in order, and what the reading has rows of."""
 
+HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}
+"""Observation types of the real hand alone, and how many features each has."""
+
 
 def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
     """Return the folded operator of an aggregate: a matrix (taxel, feature), and the threshold of a count."""
@@ -153,6 +184,12 @@ def lower(spec: ObservationSpec, layout: Layout) -> dict[str, np.ndarray]:
         per_axis = [spec.scale * layout.normal[:, axis, None] * belongs for axis in axes]
         return {"operator": np.concatenate(per_axis, axis=1)}
     return {}
+
+
+def hand_only_error(group: str, index: int, type_: str) -> ObservationError:
+    """Return the error of an observation that only the real hand has."""
+    what = f'observation {group}[{index}] is "{type_}", which only a real XHand1 has'
+    return ObservationError(f'{what}, and no simulation; read one with tgdsl.connect(touch, "xhand1")')
 
 
 def num_features(type_: str, num_rows: int, num_links: int) -> int:

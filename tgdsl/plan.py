@@ -46,7 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 5
+FORMAT = 6
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -288,7 +288,18 @@ class PlannedSensor:
 
 @dataclass(frozen=True)
 class PlannedObservation:
-    """One term of an observation group."""
+    """One term of an observation group.
+
+    Attributes:
+        group: The group.
+        index: Which of its terms.
+        type: Its type.
+        reading: The reading that is observed; None if it is of none.
+        channels: Channels of the reading.
+        constants: Names of what was folded for it.
+        num_features: How many features it gives.
+        axes: Order of the link-frame axes of an aggregate force; else empty.
+    """
 
     group: str
     index: int
@@ -297,6 +308,7 @@ class PlannedObservation:
     channels: tuple[int, ...]
     constants: tuple[str, ...]
     num_features: int
+    axes: Literal["", "xyz", "zyx"] = ""
 
 
 @dataclass(frozen=True)
@@ -416,6 +428,10 @@ class Plan:
     def layout_of(self, sensor: PlannedSensor) -> Layout:
         """Return the taxels of one sensor."""
         return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"])
+
+    def sensor_of(self, reading: str) -> PlannedSensor:
+        """Return the sensor that a reading is of."""
+        return next(sensor for sensor in self.sensors if reading in [own.name for own in sensor.readings])
 
     def to_json(self) -> str:
         """Return everything but the arrays, of which only a hash, with sorted keys."""

@@ -5,8 +5,6 @@ Shapes: `env` environments, `row` taxels or bodies, `channel` numbers per row.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,7 +13,7 @@ from tgdsl.geometry.query import Felt, Probes
 from tgdsl.plan import PlannedSensor
 from tgdsl.sensors import Kind
 from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.instant import Now, Planes
+from tgdsl.sensors.noise.instant import Now
 
 Tensors = dict[str, Tensor]
 
@@ -42,35 +40,32 @@ def read(
         memory: What it remembers, by name.
         now: When it is read; None if it does not matter.
     """
-    names = sensor.signal
     terms = () if sensor.noise is None else sensor.noise.terms
     gain = stages.gain(knobs, now, felt.depth) if "gain" in terms and now is not None else None
     if gain is not None and kind.gains_depth:
         felt = felt._replace(depth=gain * felt.depth)
     found, new = kind.forward(felt, probes, constants, _own(memory))
-    clean: Planes = [found[name] for name in names]
-    signal, noted = clean, {}
+    planes, new = [found[name] for name in sensor.signal], dict(new)
+    signal = clean = torch.stack(planes, dim=1)
     if gain is not None and not kind.gains_depth:
-        signal = [gain * plane for plane in signal]
+        signal = torch.stack([gain * plane for plane in planes], dim=1)
     if terms:
-        past = {key: [memory[f"noise/{key}/{name}"] for name in names] for key in _keys(memory, "noise/")}
+        past = {name.removeprefix("noise/"): value for name, value in memory.items() if name.startswith("noise/")}
         signal, noted = stages.disturb(signal, terms, knobs, past, now)
-    new = dict(new)
-    for key, planes in noted.items():
-        new |= {f"noise/{key}/{name}": plane for name, plane in zip(names, planes, strict=True)}
+        new |= {f"noise/{name}": value for name, value in noted.items()}
     own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
     readings: Tensors = {}
-    for reading, which, planes in zip(own, ("measured", "clean"), (signal, clean), strict=False):
-        made: Mapping[str, Tensor] = {**found, **dict(zip(names, planes, strict=True))}
+    for reading, which, made in zip(own, ("measured", "clean"), (signal, clean), strict=False):
         if now is not None and now.is_sample is not None:
-            held = {name: torch.where(now.is_sample, made[name], memory[f"sample/{which}/{name}"]) for name in names}
-            new |= {f"sample/{which}/{name}": plane for name, plane in held.items()}
-            made = {**made, **held}
+            made = torch.where(now.is_sample[..., None], made, memory[f"sample/{which}"])
+            new[f"sample/{which}"] = made
         if kind.decide is not None:
             released = {name: knobs[name][:, 0] for name in ("release_threshold",) if name in knobs}
-            made, decided = kind.decide(made, {**constants, **released}, _own(memory))
+            planes = dict(zip(sensor.signal, made.unbind(1), strict=True))
+            planes, decided = kind.decide(planes, {**constants, **released}, _own(memory))
+            made = torch.stack([planes[name] for name in reading.channels], dim=1)
             new |= decided
-        readings[reading.name] = torch.stack([made[name] for name in reading.channels], dim=1).transpose(1, 2)
+        readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
         readings[reading.name] = torch.stack([found[name] for name in reading.channels], dim=1).transpose(1, 2)
     if sensor.period > 0 and now is not None:
@@ -81,11 +76,6 @@ def read(
 def _own(memory: Tensors) -> Tensors:
     """Return what the kind remembers."""
     return {name: value for name, value in memory.items() if "/" not in name}
-
-
-def _keys(memory: Tensors, prefix: str) -> list[str]:
-    """Return what is remembered of each channel under a prefix."""
-    return list(dict.fromkeys(name.split("/")[1] for name in memory if name.startswith(prefix)))
 
 
 def _phase(phase: Float[Tensor, " env"], period: float, now: Now) -> Float[Tensor, " env"]:

@@ -63,12 +63,10 @@ class Noise:
         self._rows, self.key = [sets[i] for i in which], random.sensor_key(seed, name)
         self.lowered = lower_noise(sets, which, channels, self.layout, True)
         self.constants = {key: torch.tensor(value, dtype=dtype) for key, value in self.lowered.constants.items()}
-        self.memory = {
-            key: [torch.full((num_envs, count), math.nan, dtype=dtype) for _ in channels] for key in self.lowered.memory
-        }
+        self.memory = {key: torch.full((num_envs, len(channels), count), math.nan, dtype=dtype) for key in self.lowered.memory}
         if "ring" in self.memory:
             length = max(math.ceil(self.lowered.past / dt - 1e-6), 1)
-            self.memory["ring"] = [torch.full((num_envs, length, count), math.nan, dtype=dtype) for _ in channels]
+            self.memory["ring"] = torch.full((num_envs, length, len(channels), count), math.nan, dtype=dtype)
         self.env = torch.arange(num_envs) + first_env
         self.ages = torch.zeros(length if "ring" in self.memory else 1, dtype=dtype)
         self.step = 0
@@ -89,20 +87,20 @@ class Noise:
     def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
-        planes = list(torch.as_tensor(signal, dtype=self.dtype).expand(shape).unbind(-1))
+        signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
         now = self.now(dt, is_sample)
         values = stages.knob_values(self.constants, now)
         if "gain" in self.lowered.terms:
-            planes = [stages.gain(values, now, plane) * plane for plane in planes]
-        planes, new = stages.disturb(planes, self.lowered.terms, values, self.memory, now)
+            signal = stages.gain(values, now, signal)[:, None] * signal
+        signal, new = stages.disturb(signal, self.lowered.terms, values, self.memory, now)
         for key, noted in new.items():
-            for held, plane in zip(self.memory[key], noted, strict=True):
-                place = held[:, self.step % held.shape[1]] if key == "ring" else held
-                place.copy_(plane)
+            held = self.memory[key]
+            place = held[:, self.step % held.shape[1]] if key == "ring" else held
+            place.copy_(noted)
         self.ages = torch.cat([torch.zeros_like(self.ages[:1]), self.ages[:-1] + dt])
         self.step += 1
         self.age += 1
-        return torch.stack(planes, dim=-1)
+        return signal.transpose(1, 2)
 
     def reset(self, env_ids: Any = slice(None)) -> None:
         """Begin a new episode in some environments."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import select
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Lowered, ProbeSpec
-from tgdsl.sensors.noise import Knobs, resolve_noise
+from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
 from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise
 
 
@@ -68,7 +68,13 @@ def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Lin
 
 
 def imperfections(
-    name: str, spec: ProbeSpec, kind: Kind, knobs: Sequence[Knobs], lowered: Lowered, layout: Layout
+    name: str,
+    spec: ProbeSpec,
+    kind: Kind,
+    knobs: Sequence[Knobs],
+    lowered: Lowered,
+    layout: Layout,
+    named: Mapping[str, NoiseSpec],
 ) -> LoweredNoise | None:
     """Return the lowered noise of a sensor; None if all its knobs are neutral.
 
@@ -79,12 +85,13 @@ def imperfections(
         knobs: The knobs of each of its links.
         lowered: The sensor, lowered.
         layout: Its taxels.
+        named: The noise profiles of the document.
 
     Raises:
         LowerError: If a knob names a quantity that the sensor does not read.
     """
     if not any(own.active() for own in knobs):
-        if spec.noise == "noisy":
+        if built_in(spec.noise, named) == "noisy":
             warnings.warn(f'sensor "{name}": the profile "noisy" has no knobs for {kind.name}, so it reads clean', stacklevel=2)
         return None
     different = list(dict.fromkeys(own.model_dump_json() for own in knobs))

@@ -63,7 +63,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
     loaded.raise_problems()
     noisy = measured_spec(spec, knobs)
     lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
-    noise = imperfections(name, spec, kind, knobs, lowered, layout)
+    noise = imperfections(name, spec, kind, knobs, lowered, layout, loaded.spec.noise)
     both = spec.readout == "both"
     if noise is not None and noise.radius > 0 and clean.moments is not None:
         request = dataclasses.replace(clean.moments, radius_noise=noise.radius)
@@ -212,17 +212,17 @@ def _sensor(
         n: PlannedMemory(m.rest, m.shape if isinstance(m.shape, tuple) else shapes[m.shape]) for n, m in lowered.state.items()
     }
     signal = lowered.signal or lowered.channels
-    names, shape = [channel.name for channel in signal], (rows[lowered.rows],)
+    shape = (len(signal), rows[lowered.rows])
     if part.noise is not None:
         for name, value in part.noise.constants.items():
             arrays[f"sensors/{part.name}/noise/{name}"] = value
         for term in part.noise.memory:
             past = part.noise.past if term == "ring" else 0.0
-            memory |= {f"noise/{term}/{name}": PlannedMemory(0.0, shape, past) for name in names}
+            memory[f"noise/{term}"] = PlannedMemory(0.0, shape, past)
     if part.spec.rate is not None:
         memory["sample/phase"] = PlannedMemory(0.0, ())
         held = ["measured", "clean"][: len(readings)]
-        memory |= {f"sample/{which}/{name}": PlannedMemory(0.0, shape) for which in held for name in names}
+        memory |= {f"sample/{which}": PlannedMemory(0.0, shape) for which in held}
     return PlannedSensor(
         name=part.name,
         sensor=part.sensor,
@@ -232,7 +232,7 @@ def _sensor(
         folder=part.folder,
         constants=tuple(sorted(lowered.constants)),
         state=memory,
-        signal=tuple(names),
+        signal=tuple(channel.name for channel in signal),
         readings=(*readings, *reports),
         noise=None if part.noise is None else _noise(part.noise),
         period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
@@ -253,8 +253,9 @@ def _observations(
     for group, specs in loaded.spec.observations.items():
         for i, spec in enumerate(specs):
             path: Path = ("observations", group, i)
-            if isinstance(spec, observations.NoneObservation):
-                terms.append(PlannedObservation(group, i, spec.type, None, (), (), 0))
+            if not isinstance(spec, observations.OfReading):
+                count = observations.HAND_ONLY.get(spec.type, 0)
+                terms.append(PlannedObservation(group, i, spec.type, None, (), (), count))
                 continue
             if spec.of not in found:
                 hint = did_you_mean(spec.of, found, "readings")
@@ -272,7 +273,8 @@ def _observations(
                 arrays[f"observations/{group}/{i}/{name}"] = value
             channels = tuple(reading.channels.index(channel) for channel in wanted)
             count = max(reading.steps, 1) * observations.num_features(spec.type, reading.num_rows, len(layout.links))
-            terms.append(PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count))
+            axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
+            terms.append(PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count, axes))
     return tuple(terms)
 
 

@@ -1,6 +1,6 @@
 """When a reading is made, and with which random numbers.
 
-Shapes: `env` environments, `taxel` rows of the reading.
+Shapes: `env` environments, `channel` numbers of a signal, `row` its rows.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.random import Stream
 
-Planes = list[Tensor]
-"""The channels of a signal: tensors (env, taxel)."""
+Signal = Float[Tensor, "env channel row"]
+"""What noise is done to."""
 
 
 class Now(NamedTuple):
@@ -38,16 +39,17 @@ class Now(NamedTuple):
     streams: Mapping[int, Stream]
 
 
-def of(values: Tensor, c: int) -> Tensor:
-    """Return a knob's values for one channel."""
-    return values[:, c if values.shape[1] > 1 else 0]
+def stored(first: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+    """Return tensors of one shape unchanged: for a compiler that fuses, a place where they are kept and not formed anew.
 
-
-def row_index(row: int, like: Tensor) -> Tensor:
-    """Return the numbers of a row's random words: as many as there are taxels."""
-    return torch.arange(like.shape[-1], dtype=torch.int32, device=like.device) + row * like.shape[-1]
+    What is drawn per environment would else be drawn for each number that it is used for. One tensor alone is kept beside its
+    negative: two that are the same would count as one, and not be kept.
+    """
+    return torch.stack((first, *(others or (-first,)))).unbind()[: 1 + len(others)]
 
 
 def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:
-    """Return a uniform number between 0 and 1 for each taxel of `like`: those of a row of a purpose."""
-    return random.uniform(random.words(now.streams[purpose], row_index(row, like)), like.dtype)
+    """Return a uniform number between 0 and 1 for each of the last axis of `like`: those of a row of a purpose, (env, …)."""
+    count = like.shape[-1]
+    index = torch.arange(count, dtype=torch.int32, device=like.device) + row * count
+    return random.uniform(random.words(now.streams[purpose], index), like.dtype)

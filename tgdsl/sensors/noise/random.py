@@ -22,7 +22,6 @@ Shapes: `env` environments, `taxel` taxels.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -37,6 +36,8 @@ READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 PER_STEP = frozenset({READING, RADIUS, JITTER})
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
+ANGLE = 3.141592653589793 / 2048
+"""Step of a normal pair's angle [rad]."""
 PURPOSES = tuple(0x3C6EF372 + 0x1B873593 * i % 2**30 for i in range(12))
 """A constant for each purpose and half of a key."""
 
@@ -77,12 +78,12 @@ def streams(
             word = mix(mix(env.to(torch.int32) ^ own) ^ counter.to(torch.int32))
             words.append(mix(word ^ mix((counter >> 32).to(torch.int32)) ^ PURPOSES[2 * purpose + half]))
     # Stacked, they are stored once per environment; a compiler that fuses would else form them anew for every taxel.
-    stored = torch.stack(words, dim=1)[..., None].unbind(1)
-    return {purpose: Stream(stored[2 * i], stored[2 * i + 1]) for i, purpose in enumerate(purposes)}
+    kept = torch.stack(words, dim=1)[..., None].unbind(1)
+    return {purpose: Stream(kept[2 * i], kept[2 * i + 1]) for i, purpose in enumerate(purposes)}
 
 
-def words(stream: Stream, index: Int[Tensor, "*taxel"]) -> Int[Tensor, "env taxel"]:
-    """Return the words of these numbers, int32."""
+def words(stream: Stream, index: Int[Tensor, "*row"]) -> Int[Tensor, "*both"]:
+    """Return the words of these numbers, int32; the keys of the stream broadcast with them."""
     return mix(index ^ stream.first) ^ stream.second
 
 
@@ -99,10 +100,10 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     """
     share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
     radius = torch.sqrt(-2.0 * torch.log(share))
-    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (math.pi / 2048)
+    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * ANGLE
     square = angle * angle
-    sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square / 5040)))
-    cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square / 40320)))
+    sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square * (1 / 5040))))
+    cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square * (1 / 40320))))
     along = radius * cosine * (1 - (word & 2)).to(dtype)
     across = radius * sine
     is_turned = (word & 1) == 1

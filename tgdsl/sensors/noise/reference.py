@@ -85,7 +85,7 @@ class ReferenceNoise:
         self._drawn: dict[str, np.ndarray] = {}
         low, high = self._knob("gain_low"), self._knob("gain_high")
         self.gain: Signal = low + self._uniform(random.GAIN)[:, :1] * (high - low)
-        share = self._uniform(random.DEAD, 1 + len(self._channels))
+        share = self._uniform(random.DEAD, 2)
         self.is_dead = share[:, :1] < self._knob("dead_probability")
         low, high = self._knob("dead_low"), self._knob("dead_high")
         self.stuck: Signal = low + share[:, 1:] * (high - low)

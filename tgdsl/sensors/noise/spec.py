@@ -233,3 +233,10 @@ def resolve_noise(
         return resolve_noise(named[noise], kind, named, (*seen, noise))
     base, links = resolve_noise(noise.like, kind, named, seen)
     return noise.over(base), (*links, *noise.links.items())
+
+
+def built_in(noise: str | NoiseSpec, named: Mapping[str, NoiseSpec]) -> str:
+    """Return the built-in profile that a sensor's noise starts from in the end; profiles that lead in a circle have none."""
+    while not isinstance(noise, str) or noise in named:
+        noise = named[noise] if isinstance(noise, str) else noise.like
+    return noise

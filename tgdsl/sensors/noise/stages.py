@@ -7,13 +7,14 @@
     delay         x ← x(t − Δ),  Δ = Δ_read + U[0, J] at each reading, the same for all taxels
     offset        y = x + b + n_t + d_t,  n_t ~ N(0, σ²),  d_t = d_(t−1) + w_t,  w_t ~ N(0, σ_rw²)
     quantization  y ← q round(y/q)
-    dead          y ← z_j where M_j,  M_j ~ Bernoulli(p),  z_j ~ U[low, high], both at reset
+    dead          y ← z_j where M_j,  M_j ~ Bernoulli(p),  z_j = low + s_j (high − low),  s_j ~ U[0, 1], both at reset
 
-for each channel alone; d = 0 and ξ = 0 at reset, and what was before it counts as equal to the first signal after it. The
-hysteresis is a Maxwell branch, exact for signals that are linear between calls, and the delay reads such a signal too, so both
-are the same at any step. Crosstalk mixes the taxels of one link: K_ij = exp(−|x_i − x_j|²/2σ²) where their normals are within
-90°, else 0; columns of W add up to 1, so the sum over a link is what it was, at edges and corners too. Where σ is a range, G
-mixes the kernels of its ends with a share that is drawn uniformly. Gradients pass the quantiser as if it were not there.
+for each channel alone, but M_j and s_j are of the taxel; d = 0 and ξ = 0 at reset, and what was before it counts as equal to
+the first signal after it. The hysteresis is a Maxwell branch, exact for signals that are linear between calls, and the delay
+reads such a signal too, so both are the same at any step. Crosstalk mixes the taxels of one link:
+K_ij = exp(−|x_i − x_j|²/2σ²) where their normals are within 90°, else 0; columns of W add up to 1, so the sum over a link is
+what it was, at edges and corners too. Where σ is a range, G mixes the kernels of its ends with a share that is drawn uniformly.
+Gradients pass the quantiser as if it were not there.
 
 Where a kind makes bits of its signal (`contact`, `link_contact`), all this is done to the signal, before the threshold. A
 sensor with a rate of its own holds y between its samples: n, d and J are drawn once per sample.
@@ -22,7 +23,7 @@ Source: Chung et al., *Tactile Genesis*, appendix, "Sensor Noise Model". Departu
 paper's ξ ← e^(−r) ξ + x_t − x_(t−1) depends on the step; crosstalk works on any layout and keeps the sum, where a blur that is
 padded with zeros loses half of a force at a corner.
 
-Shapes: `env` environments, `taxel` rows of the reading; values of knobs broadcast with (env, channel, taxel).
+Shapes: `env` environments, `channel` numbers of the signal, `row` its rows; values of knobs broadcast with all three.
 """
 
 from __future__ import annotations
@@ -33,10 +34,13 @@ import torch
 from torch import Tensor
 
 from tgdsl.sensors.noise import filters, random
-from tgdsl.sensors.noise.instant import Now, Planes, of, row_index, uniform
+from tgdsl.sensors.noise.instant import Now, Signal, stored, uniform
 
 TERMS = ("radius_noise", "gain", "hysteresis", "crosstalk", "delay", "bias", "white_noise", "drift", "quantization", "dead")
 """The stages that a plan names, in their order."""
+
+TIMELESS = frozenset({"crosstalk", "bias", "quantization", "release_threshold"})
+"""Stages that need not know when a reading is made, unless a knob of theirs is a range."""
 
 PARAMETERS = (
     "radius_noise",
@@ -72,9 +76,8 @@ def knob_values(constants: Mapping[str, Tensor], now: Now | None) -> dict[str, T
     if drawn and now is not None:
         stream, like = now.streams[random.PARAMETER], constants[drawn[0]]
         place = [torch.full((1,), PARAMETERS.index(name), dtype=torch.int32, device=like.device) for name in drawn]
-        # Stacked, they are stored, see `random.streams`.
-        shares = torch.stack([random.uniform(random.words(stream, index), like.dtype) for index in place], dim=1)
-        for name, share in zip(drawn, shares.unbind(1), strict=True):
+        shares = stored(*[random.uniform(random.words(stream, index), like.dtype) for index in place])
+        for name, share in zip(drawn, shares, strict=True):
             low, high = constants[name]
             values[name] = low + share[..., None] * (high - low)
     return values
@@ -87,76 +90,82 @@ def shifted(radius: Tensor, shift: Tensor) -> Tensor:
 
 def radius_shift(half_width: Tensor, now: Now, like: Tensor) -> Tensor:
     """Return by how much each probe's radius is off (env, taxel) [m]."""
-    return half_width[:, 0] * (2 * uniform(now, random.RADIUS, 0, like) - 1)
+    (share,) = stored(uniform(now, random.RADIUS, 0, like))
+    return half_width[:, 0] * (2 * share - 1)
 
 
 def gain(values: Mapping[str, Tensor], now: Now, like: Tensor) -> Tensor:
     """Return each taxel's gain (env, taxel)."""
     low, high = values["gain_low"][:, 0], values["gain_high"][:, 0]
-    return low + uniform(now, random.GAIN, 0, like) * (high - low)
+    (share,) = stored(uniform(now, random.GAIN, 0, like))
+    return low + share * (high - low)
 
 
 def disturb(
-    planes: Planes, terms: Sequence[str], values: Mapping[str, Tensor], memory: Mapping[str, Planes], now: Now | None
-) -> tuple[Planes, dict[str, Planes]]:
+    signal: Signal, terms: Sequence[str], values: Mapping[str, Tensor], memory: Mapping[str, Tensor], now: Now | None
+) -> tuple[Signal, dict[str, Tensor]]:
     """Return what is read of a signal, and the new memory.
 
     Args:
-        planes: The signal, channel by channel; its gain, if there is one, is applied already.
+        signal: The signal; its gain, if there is one, is applied already.
         terms: The stages there are.
         values: The knobs' values.
-        memory: By name and channel, (env, taxel); of `ring`, (env, call, taxel), the new one holds this call alone.
+        memory: By name (env, channel, row); of `ring`, (env, call, channel, row), the new one holds this call alone.
         now: When; None if no stage wants to know.
     """
-    new: dict[str, Planes] = {}
+    assert now is not None or set(terms) <= TIMELESS, terms
+    new: dict[str, Tensor] = {}
     if "hysteresis" in terms and now is not None:
-        planes, more = filters.hysteresis(planes, values, memory, now)
+        signal, more = filters.hysteresis(signal, values, memory, now)
         new |= more
     if "crosstalk" in terms:
-        planes = filters.crosstalk(planes, values)
+        signal = filters.crosstalk(signal, values)
     if "delay" in terms and now is not None:
-        new["ring"] = planes
-        planes = filters.delayed(planes, values, memory["ring"], now)
+        new["ring"] = signal
+        signal = filters.delayed(signal, values, memory["ring"], now)
     if "bias" in terms:
-        planes = [plane + of(values["bias"], c) for c, plane in enumerate(planes)]
+        signal = signal + values["bias"]
     if ("white_noise" in terms or "drift" in terms) and now is not None:
-        planes, more = _random_offset(planes, terms, values, memory, now)
+        signal, more = _with_random_offset(signal, terms, values, memory, now)
         new |= more
     if "quantization" in terms:
-        planes = [_quantized(plane, of(values["quantization"], c)) for c, plane in enumerate(planes)]
+        signal = _quantized(signal, values["quantization"])
     if "dead" in terms and now is not None:
-        is_dead = uniform(now, random.DEAD, 0, planes[0]) < values["dead_probability"][:, 0]
-        planes = [torch.where(is_dead, _stuck(values, c, plane, now), plane) for c, plane in enumerate(planes)]
-    return planes, new
+        signal = _with_dead(signal, values, now)
+    return signal, new
 
 
-def _random_offset(
-    planes: Planes, terms: Sequence[str], values: Mapping[str, Tensor], memory: Mapping[str, Planes], now: Now
-) -> tuple[Planes, dict[str, Planes]]:
+def _with_random_offset(
+    signal: Signal, terms: Sequence[str], values: Mapping[str, Tensor], memory: Mapping[str, Tensor], now: Now
+) -> tuple[Signal, dict[str, Tensor]]:
     """Return the signal with white noise and drift, and the random walk; both are of the same pair of normal numbers."""
-    result, walks = [], []
-    for c, plane in enumerate(planes):
-        word = random.words(now.streams[random.READING], row_index(c, plane))
-        noise, step = random.normal_pair(word, plane.dtype)
-        if "white_noise" in terms:
-            plane = plane + of(values["white_noise"], c) * noise
-        if "drift" in terms:
-            step = of(values["drift"], c) * step
-            step = step if now.is_sample is None else torch.where(now.is_sample, step, 0.0)
-            walks.append(torch.where(now.age == 0, 0.0, memory["walk"][c]) + step)
-            plane = plane + walks[-1]
-        result.append(plane)
-    return result, {"walk": walks} if walks else {}
+    channels, rows = signal.shape[1:]
+    index = torch.arange(channels * rows, dtype=torch.int32, device=signal.device).view(channels, rows)
+    first, second = now.streams[random.READING]
+    noise, step = random.normal_pair(random.words(random.Stream(first[..., None], second[..., None]), index), signal.dtype)
+    if "white_noise" in terms:
+        signal = signal + values["white_noise"] * noise
+    if "drift" not in terms:
+        return signal, {}
+    step = values["drift"] * step
+    step = step if now.is_sample is None else torch.where(now.is_sample[..., None], step, 0.0)
+    walk = torch.where(now.age[..., None] == 0, 0.0, memory["walk"]) + step
+    return signal + walk, {"walk": walk}
 
 
-def _quantized(plane: Tensor, step: Tensor) -> Tensor:
-    level = step * torch.round(plane / torch.where(step > 0, step, 1.0))
-    level = torch.where(step > 0, level, plane)
-    return level.detach() + (plane - plane.detach()) if plane.requires_grad else level
+def _quantized(signal: Signal, step: Tensor) -> Signal:
+    (per_step,) = stored(torch.where(step > 0, 1 / torch.where(step > 0, step, 1.0), 0.0))
+    level = torch.where(step > 0, step * torch.round(signal * per_step), signal)
+    return level.detach() + (signal - signal.detach()) if signal.requires_grad else level
 
 
-def _stuck(values: Mapping[str, Tensor], c: int, plane: Tensor, now: Now) -> Tensor:
-    low = of(values["dead_low"], c)
-    if "dead_high" not in values:
-        return low
-    return low + uniform(now, random.DEAD, c + 1, plane) * (of(values["dead_high"], c) - low)
+def _with_dead(signal: Signal, values: Mapping[str, Tensor], now: Now) -> Signal:
+    """Return the signal with dead taxels stuck, in all channels at the same share of their ranges."""
+    one = signal[:, 0]
+    share = uniform(now, random.DEAD, 1, one) if "dead_high" in values else torch.zeros_like(one)
+    is_dead = uniform(now, random.DEAD, 0, one) < values["dead_probability"][:, 0]
+    (share,) = stored(torch.where(is_dead, share, -1.0))
+    share, stuck = share[:, None], values["dead_low"]
+    if "dead_high" in values:
+        stuck = stuck + share * (values["dead_high"] - stuck)
+    return torch.where(share < 0, signal, stuck)
