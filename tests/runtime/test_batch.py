@@ -308,6 +308,18 @@ def test_reset_starts_the_named_environments_and_no_others(tmp_path, ids):
     np.testing.assert_array_equal(sim.batch.qpos[1], fresh.batch.qpos[0])
 
 
+@pytest.mark.parametrize("ids", [[3, 1], torch.tensor([3, 1, 3]), np.array([3, 1])])
+def test_environments_are_reset_in_any_order(tmp_path, ids):
+    touch, _ = arm(tmp_path)
+    sims = [BatchSimulation(touch, 4, keyframe="home") for _ in range(2)]
+    for sim, chosen in zip(sims, (ids, [1, 3]), strict=True):
+        for _ in range(3):
+            sim.step(np.array([0.2, -0.3]))
+        sim.reset(chosen)
+    for name in ("qpos", "qvel", "ctrl", "time"):
+        np.testing.assert_array_equal(getattr(sims[0].batch, name), getattr(sims[1].batch, name), err_msg=name)
+
+
 @pytest.mark.parametrize("ids", [[], torch.zeros(0, dtype=torch.long), np.zeros(3, dtype=bool)])
 def test_reset_of_none_does_nothing(tmp_path, ids):
     touch, _ = arm(tmp_path)
@@ -436,7 +448,8 @@ def test_rk4_is_refused_because_its_poses_and_contacts_are_of_two_instants(tmp_p
         simulate(touch, 1)
 
 
-def test_other_devices(tmp_path):
+def test_bodies_that_a_scene_lacks_are_called_bodies(tmp_path):
     touch, _ = arm(tmp_path)
-    with pytest.raises(SimulationError, match=r'^physics on "cuda" is not supported by this version of tgdsl, expected "cpu"$'):
-        simulate(touch, 1, device="cuda")
+    other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body name='zzz'/></worldbody></mujoco>")
+    with pytest.raises(SimulationError, match=r'^the scene has no body "arm"; known bodies: world, zzz$'):
+        BatchSimulation(touch, 1, model=other)

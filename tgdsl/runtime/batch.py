@@ -6,20 +6,22 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, Literal, overload
 
 import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, did_you_mean, listed
+from tgdsl.errors import SimulationError, listed
 from tgdsl.module import TactileModule
-from tgdsl.plan import contact_sensor_names
+from tgdsl.runtime.controls import control_tensor, refuse_unfinite
+from tgdsl.runtime.lookup import body_id, contact_sensor, env_indices, keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.source import EnvIds
+from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
 
@@ -82,12 +84,12 @@ class BatchSimulation:
             raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
         self.substeps = substeps
         self._touch = touch
-        self._keyframe = -1 if keyframe is None else self._id("key", keyframe, "keyframe")
-        self._body_ids = np.array([self._id("body", name, "body") for name in touch.inputs.bodies], dtype=np.intp)
+        self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
+        self._body_ids = np.array([body_id(model, name) for name in touch.inputs.bodies], dtype=np.intp)
         self._root_ids = self.model.body_rootid[self._body_ids]
-        self._slots = [self._sensor(i, 0) for i in range(len(touch.inputs.pairs))]
-        nets = range(len(touch.inputs.pairs)) if "contact_netforce" in touch.inputs.fields else []
-        self._nets = [self._sensor(i, 1) for i in nets]
+        self._slots = [contact_sensor(model, pair, 0) for pair in touch.inputs.pairs]
+        nets = touch.inputs.pairs if "contact_netforce" in touch.inputs.fields else ()
+        self._nets = [contact_sensor(model, pair, 1) for pair in nets]
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
         for name in _DERIVED:
@@ -149,7 +151,7 @@ class BatchSimulation:
         Raises:
             SimulationError: If there are no such environments, or MuJoCo reports one as failed.
         """
-        ids = self._indices(env_ids)
+        ids = np.unique(env_indices(env_ids, self.num_envs))  # MuJoCo takes them in ascending order, each once
         if len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
             self._touch.reset(torch.from_numpy(ids))
@@ -175,23 +177,26 @@ class BatchSimulation:
         """
         if self._objects is None:
             raise SimulationError("no object of this module differs between environments")
-        ids = self._indices(env_ids)
+        ids = env_indices(env_ids, self.num_envs)
         self._objects.choose(ids, variants or {}, sizes or {})
         models = self._objects.models()
         self._run(lambda: self.batch.set_models(models))
         self.reset(ids)
 
+    def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
+        """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
+        return self.batch.xpos[env], self.batch.xquat[env]
+
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of one environment."""
+        return self.batch.get_model(env)
+
     def _set_control(self, control: Tensor | Array | None) -> None:
         if control is None:
             return
-        values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control, dtype=np.float64)
-        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
-            raise SimulationError(
-                f"control has shape {values.shape}, expected ({self.num_envs}, {self.model.nu}) or ({self.model.nu},)"
-            )
-        if not np.isfinite(values).all():
-            raise SimulationError(f"control is not finite in environments {_bad_rows(values)}")
-        self.batch.ctrl[...] = values
+        values = control_tensor(control, self.num_envs, self.model.nu).cpu()
+        refuse_unfinite(values)
+        self.batch.ctrl[...] = values.numpy()
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
@@ -209,46 +214,11 @@ class BatchSimulation:
             values["dt"] = dt
         return SceneState(**values)
 
-    def _indices(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
-        """Return environments as indices, from indices or a mask.
-
-        Raises:
-            SimulationError: If there are no such environments.
-        """
-        if env_ids is None:
-            return np.arange(self.num_envs)
-        found = np.asarray(torch.as_tensor(env_ids).cpu())
-        if found.dtype == bool and found.shape == (self.num_envs,):
-            return np.flatnonzero(found)
-        is_index = found.dtype.kind in "iu" and found.ndim == 1 and ((found >= 0) & (found < self.num_envs)).all()
-        if found.size and not is_index:
-            what = f"indices from 0 to {self.num_envs - 1}, or a mask of {self.num_envs}"
-            raise SimulationError(f"env_ids: found {listed([str(value) for value in found.ravel()])}, expected {what}")
-        return found.reshape(-1).astype(np.int64)
-
     def _run(self, call: Callable[[], None]) -> None:
         try:
             call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
-
-    def _id(self, kind: str, name: str, what: str) -> int:
-        try:
-            return getattr(self.model, kind)(name).id
-        except KeyError as error:
-            count = {"key": self.model.nkey, "body": self.model.nbody}[kind]
-            known = [getattr(self.model, kind)(i).name for i in range(count)]
-            raise SimulationError(f'the scene has no {what} "{name}"; {did_you_mean(name, known, what + "s")}') from error
-
-    def _sensor(self, pair: int, which: int) -> slice:
-        """Return where a pair's contact sensor (0: slots, 1: net force) stands in `sensordata`."""
-        name = contact_sensor_names(self._touch.inputs.pairs[pair])[which]
-        try:
-            sensor = self.model.sensor(name)
-        except KeyError as error:
-            what = f'the scene has no contact sensor "{name}", which the module wants'
-            raise SimulationError(f"{what}; add them with tgdsl.instrument(spec, touch.inputs) before compiling") from error
-        return slice(int(sensor.adr[0]), int(sensor.adr[0] + sensor.dim[0]))
 
     def _body_pos(self) -> Float[Array, "env body 3"]:
         return self.batch.xpos[:, self._body_ids]
@@ -269,7 +239,7 @@ class BatchSimulation:
 
     def _slot_part(self, first: int) -> Float[Array, "env pair slot 3"]:
         """Return three numbers of each slot: 1 force, 4 torque, 7 position, 10 normal, 13 tangent."""
-        slots = np.stack([self.batch.sensordata[:, part] for part in self._slots], axis=1)
+        slots = np.stack([self.batch.sensordata[:, part.start : part.stop] for part in self._slots], axis=1)
         return slots.reshape(*slots.shape[:2], -1, _SLOT_SIZE)[..., first : first + 3]
 
     def _in_world(self, first: int) -> Float[Array, "env pair slot 3"]:
@@ -303,11 +273,28 @@ def _present(objects: EnvObjects | None) -> EnvObjects:
     return objects
 
 
-def _bad_rows(values: Array) -> str:
-    rows = np.flatnonzero(~np.isfinite(np.atleast_2d(values)).all(axis=1))
-    return listed([str(row) for row in rows])
-
-
+@overload
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: Literal["cpu"] = "cpu",
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+) -> BatchSimulation: ...
+@overload
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: str,
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> BatchSimulation | WarpSimulation: ...
 def simulate(
     touch: TactileModule,
     num_envs: int,
@@ -316,21 +303,32 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
-) -> BatchSimulation:
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> BatchSimulation | WarpSimulation:
     """Simulate the scene that a module was compiled for.
 
     Args:
         touch: The module.
         num_envs: Number of environments.
-        device: Where physics runs; `cpu` is MuJoCo's Batch. The state is handed out on the module's device.
+        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. The state is handed out on the
+            module's device; both on one GPU need no copies.
         substeps: Physics steps per control step.
         threads: CPU threads; 0: one per CPU.
         keyframe: Name of the keyframe to start from.
+        nconmax: On a GPU, room for contacts per environment, in a pool that all share: see `WarpSimulation`.
+        njmax: On a GPU, room for rows of constraints in each environment.
 
     Raises:
         ArtifactError: If an asset of the scene is missing or has changed.
-        SimulationError: If the device is not supported, or the scene lacks what the module wants.
+        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
+            wants.
     """
-    if device != "cpu":
-        raise SimulationError(f'physics on "{device}" is not supported by this version of tgdsl, expected "cpu"')
-    return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe)
+    if device == "cpu":
+        if nconmax is not None or njmax is not None:
+            raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
+        return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe)
+    if threads:
+        raise SimulationError(f'threads is {threads}, but only physics on "cpu" has threads, and the device is "{device}"')
+    keys: dict[str, Any] = {"nconmax": nconmax, "njmax": njmax}
+    return WarpSimulation(touch, num_envs, device=device, substeps=substeps, keyframe=keyframe, **keys)

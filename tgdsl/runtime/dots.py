@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tgdsl.history import last_step
 from tgdsl.module import Output, TactileModule
-from tgdsl.runtime.batch import BatchSimulation
+from tgdsl.runtime.source import Simulator
 
 Array = np.ndarray
 
@@ -80,7 +80,7 @@ class Dots(Taxels):
         return " · ".join(part for part in (total, most) if part)
 
 
-def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: Tensor, env: int) -> Dots:
+def dots_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Dots:
     """Return where the taxels of a reading are in one environment, and what they read.
 
     A reading of bodies has one dot for each, amid its taxels.
@@ -93,7 +93,7 @@ def dots_of(touch: TactileModule, sim: BatchSimulation, output: Output, values: 
         env: Which environment.
     """
     table = touch.taxels[output.sensor]
-    pose = Pose(sim.batch.xpos[env], sim.batch.xquat[env])
+    pose = Pose(*sim.body_poses(env))
     pos, normal = in_world(sim.model, pose, table["body"], table["pos"], table["normal"])
     size = np.sqrt(table["area"]) * (table["radius"] > 0)
     bodies = np.array(table["body"])

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from tgdsl.module import TactileModule
-from tgdsl.runtime.batch import BatchSimulation
 from tgdsl.runtime.dots import Dots, dots_of
+from tgdsl.runtime.source import Simulator
 from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
 
 PANEL = (3.9, 3.7)
@@ -24,7 +24,7 @@ ARROW = 0.09
 
 
 def overview(
-    touch: TactileModule, sim: BatchSimulation, readings: Mapping[str, Tensor], path: Path, *, env: int = 0, title: str = ""
+    touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor], path: Path, *, env: int = 0, title: str = ""
 ) -> Path:
     """Draw every reading of one environment, and write the picture.
 
@@ -51,9 +51,7 @@ def overview(
     return path
 
 
-def drawing(
-    touch: TactileModule, sim: BatchSimulation, readings: Mapping[str, Tensor], *, env: int = 0, title: str = ""
-) -> Figure:
+def drawing(touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor], *, env: int = 0, title: str = "") -> Figure:
     """Return what `overview` writes; its axes are the panels, in the order of the module's outputs."""
     outputs = [output for output in touch.outputs if output.name in readings]
     if not outputs:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module import TactileModule
-from tgdsl.runtime.batch import BatchSimulation
+from tgdsl.runtime.source import Simulator
 
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
@@ -102,7 +102,7 @@ def recorded_controls(path: Path) -> Controls:
     return controls.astype(np.float64)
 
 
-def rollout(touch: TactileModule, sim: BatchSimulation, controls: Controls) -> Iterator[Step]:
+def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
     """Step a scene through controls and yield the readings after each control step."""
     for index, control in enumerate(controls):
         sim.step(control)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+import mujoco
 import numpy as np
+from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.state import SceneState
@@ -39,4 +41,32 @@ class Source(Protocol):
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start some environments (default: all) anew, and what the module remembers of them."""
+        ...
+
+
+@runtime_checkable
+class Simulator(Source, Protocol):
+    """A source that steps MuJoCo's model of the scene: what rollouts and pictures ask of it.
+
+    Attributes:
+        model: The compiled scene; where objects differ between environments, that of the first.
+    """
+
+    model: mujoco.MjModel
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        ...
+
+    def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
+        """Return where all bodies of the model are in one environment, at the state's instant.
+
+        Returns:
+            Origins [m] and quaternions w, x, y, z, both in the world.
+        """
+        ...
+
+    def env_model(self, env: int) -> mujoco.MjModel:
+        """Return the model of one environment, its objects as they are there."""
         ...

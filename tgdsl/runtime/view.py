@@ -17,7 +17,6 @@ from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module import Output, TactileModule
-from tgdsl.runtime.batch import BatchSimulation
 from tgdsl.runtime.dots import Dots, Pose, dots_of
 from tgdsl.runtime.shot import (
     Screen,
@@ -32,6 +31,7 @@ from tgdsl.runtime.shot import (
     solid_of,
     unit,
 )
+from tgdsl.runtime.source import Simulator
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
@@ -50,7 +50,7 @@ class ViewError(TgdslError):
 
 def picture(
     touch: TactileModule,
-    sim: BatchSimulation,
+    sim: Simulator,
     readings: Mapping[str, Tensor],
     path: Path,
     *,
@@ -124,7 +124,7 @@ class Backdrop(NamedTuple):
     screen: Screen
 
 
-def scene_of(touch: TactileModule, sim: BatchSimulation, dots: Dots, env: int, width: int, height: int) -> Backdrop:
+def scene_of(touch: TactileModule, sim: Simulator, dots: Dots, env: int, width: int, height: int) -> Backdrop:
     """Draw robot and felt objects, seen from where some taxels are in view.
 
     Args:
@@ -135,11 +135,11 @@ def scene_of(touch: TactileModule, sim: BatchSimulation, dots: Dots, env: int, w
         width: Columns, before `FINE` of them become one pixel.
         height: Rows, likewise.
     """
-    model, pose = sim.model, Pose(sim.batch.xpos[env], sim.batch.xquat[env])
+    model, pose = sim.model, Pose(*sim.body_poses(env))
     carriers = {model.body(link.body).id for link in touch.plan.links}
     framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects}
-    hand, objects = (solid_of(sim.batch.get_model(env), pose, bodies) for bodies in (robot - felt, felt))
+    hand, objects = (solid_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
     camera = camera_for(dots, pose.pos[min(framed)])
     box = _window(camera.project(hand.corners[frame] if frame.any() else dots.pos[:, None]), camera.project(objects.corners))

@@ -1,0 +1,44 @@
+"""Actuator controls as users hand them to a simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, listed
+
+
+def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: int) -> Float[Tensor, "*env actuator"]:
+    """Return controls as a tensor without gradients where they are; an array becomes float64.
+
+    Args:
+        control: Controls, (env, actuator), or (actuator,) for all environments alike.
+        num_envs: Number of environments.
+        num_actuators: Number of actuators of the model.
+
+    Raises:
+        SimulationError: If their shape is another one.
+    """
+    values = control.detach() if isinstance(control, Tensor) else torch.from_numpy(np.array(control, dtype=np.float64))
+    if tuple(values.shape) not in ((num_actuators,), (num_envs, num_actuators)):
+        expected = f"({num_envs}, {num_actuators}) or ({num_actuators},)"
+        raise SimulationError(f"control has shape {tuple(values.shape)}, expected {expected}")
+    return values
+
+
+def is_unfinite(values: Float[Tensor, "*env actuator"]) -> Bool[Tensor, "*env"]:
+    """Return which environments' controls hold a number that is not finite; of controls for all alike, whether these do."""
+    return ~torch.isfinite(values).all(dim=-1)
+
+
+def refuse_unfinite(values: Float[Tensor, "*env actuator"]) -> None:
+    """Look at controls on the host.
+
+    Raises:
+        SimulationError: If any is not finite.
+    """
+    rows = torch.nonzero(is_unfinite(values).reshape(-1)).flatten().tolist()
+    if rows:
+        raise SimulationError(f"control is not finite in environments {listed([str(row) for row in rows])}")

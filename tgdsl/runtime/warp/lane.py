@@ -1,0 +1,147 @@
+"""Where the work of Warp and torch is done, in one order, and how it is captured as CUDA graphs."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
+
+import torch
+
+from tgdsl.errors import SimulationError
+
+T = TypeVar("T")
+_EAGER_CALLS = 2
+"""Calls before the one that is captured: they load kernels and make what lasts."""
+
+
+def libraries() -> tuple[Any, Any]:
+    """Return the modules `warp` and `mujoco_warp`.
+
+    Raises:
+        SimulationError: If they are not installed.
+    """
+    try:
+        import mujoco_warp
+        import warp
+    except ImportError as error:
+        raise SimulationError('physics on a GPU needs MuJoCo Warp: pip install "tgdsl[gpu]"') from error
+    return warp, mujoco_warp
+
+
+class Lane:
+    """A device, and on a GPU the stream that Warp and torch share there.
+
+    Attributes:
+        device: The device.
+        is_captured: Whether what is called again and again is captured as CUDA graphs.
+    """
+
+    def __init__(self, device: str, graph: bool = True):
+        """Open the device.
+
+        Args:
+            device: As torch names it: "cpu", "cuda" or "cuda:1".
+            graph: Whether to capture graphs; on the CPU there are none.
+
+        Raises:
+            SimulationError: If there is no such device, or Warp is not installed.
+        """
+        self._warp = libraries()[0]
+        try:
+            self.device = torch.empty(0, device=device).device
+        except (RuntimeError, AssertionError) as error:
+            raise SimulationError(f'there is no device "{device}" to run physics on: {error}') from error
+        if self.device.type not in ("cpu", "cuda"):
+            raise SimulationError(f'physics on "{device}" is not supported, expected "cuda" or "cpu"')
+        self.is_captured = graph and self.device.type == "cuda"
+        with self._quiet():
+            self._warp.init()
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
+        self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
+
+    @contextlib.contextmanager
+    def work(self) -> Iterator[None]:
+        """Put what Warp and torch are told inside after all that torch has been told before, and before what comes then.
+
+        Tensors made inside are ordinary ones without gradients, also under `inference_mode`: compiled code is the same in both.
+        """
+        with self._quiet(), self._warp.ScopedDevice(str(self.device)), torch.inference_mode(False), torch.no_grad():
+            if self._stream is None:
+                yield
+                return
+            self._stream.wait_stream(torch.cuda.current_stream(self.device))
+            try:
+                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream):
+                    yield
+            finally:
+                torch.cuda.current_stream(self.device).wait_stream(self._stream)
+
+    def capture(self, body: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
+        """Capture work without doing it; return the graph, and what the body returned: tensors that a replay fills.
+
+        torch owns the capture and Warp is told of it. Nothing may be collected meanwhile: to free one of Warp's arrays breaks
+        a capture.
+
+        Raises:
+            SimulationError: If the work cannot be captured.
+        """
+        graph = torch.cuda.CUDAGraph()
+        with self.work():
+            gc.collect()
+            was_enabled = gc.isenabled()
+            gc.disable()
+            try:
+                with (
+                    torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
+                    self._warp.ScopedCapture(stream=self._warp_stream, external=True),
+                ):
+                    result = body()
+            except RuntimeError as error:
+                raise SimulationError(f"no CUDA graph can be made of this ({error}); graph=False does without") from error
+            finally:
+                if was_enabled:
+                    gc.enable()
+        return graph, result
+
+    def replay(self, graph: torch.cuda.CUDAGraph) -> None:
+        """Do what was captured, after all that torch has been told before."""
+        with torch.cuda.device(self.device):
+            graph.replay()
+
+    @contextlib.contextmanager
+    def _quiet(self) -> Iterator[None]:
+        """Keep Warp from announcing itself and the kernels that it loads."""
+        before = self._warp.config.log_level
+        self._warp.config.log_level = max(before, self._warp.LOG_ERROR)
+        try:
+            yield
+        finally:
+            self._warp.config.log_level = before
+
+
+class Replay(Generic[T]):
+    """Work that is done again and again on the same arrays: on a GPU captured at its third call, and replayed from then on."""
+
+    def __init__(self, lane: Lane, body: Callable[[], T]):
+        """Take work that reads and writes the same arrays each time, and nothing of the host."""
+        self._lane, self._body = lane, body
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was captured: it is captured anew."""
+        self._eager_calls = 0
+        self._captured: tuple[torch.cuda.CUDAGraph, T] | None = None
+
+    def __call__(self) -> T:
+        """Do the work; tensors that a replay returns are the same each time."""
+        if not self._lane.is_captured or self._eager_calls < _EAGER_CALLS:
+            self._eager_calls += 1
+            with self._lane.work():
+                return self._body()
+        if self._captured is None:
+            self._captured = self._lane.capture(self._body)
+        graph, result = self._captured
+        self._lane.replay(graph)
+        return result

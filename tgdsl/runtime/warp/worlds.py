@@ -1,0 +1,186 @@
+"""MuJoCo Warp's model and data on a device, torch's views of their arrays, and what is done to them.
+
+Shapes: `env` environments (MuJoCo Warp's worlds).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.warp.faults import Faults
+from tgdsl.runtime.warp.lane import Lane, Replay, libraries
+from tgdsl.runtime.warp.reading import SOURCES
+
+INTEGRATED = (
+    *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
+    *("mocap_pos", "mocap_quat", "userdata"),
+)
+"""What the future of an environment follows from: MuJoCo's `mjSTATE_INTEGRATION`."""
+_WATCHED = ("overflow", "nefc", "nacon", "ncollision")
+DEFAULT_NCONMAX = 48
+"""Contacts per environment that there is room for, unless said otherwise."""
+
+
+class Worlds:
+    """Environments of one model, all arrays on the device.
+
+    Attributes:
+        model: MuJoCo Warp's model.
+        data: MuJoCo Warp's data.
+        arrays: Live tensors of `data`, (env, …): what is integrated, what a state is read from, `geom_xpos` and `geom_xmat`.
+        parameters: Live tensors of those fields of `model` that environments have of their own, (env, …).
+        faults: What has gone wrong.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        lane: Lane,
+        *,
+        keyframe: int = -1,
+        nconmax: int | None = None,
+        njmax: int | None = None,
+        per_env: Sequence[str] = (),
+    ):
+        """Put model and data on the device, all environments at the start.
+
+        Args:
+            model: The scene.
+            num_envs: Number of environments.
+            lane: Where to work.
+            keyframe: Index of the keyframe to start from; -1: the model's own initial state.
+            nconmax: Room for contacts per environment; all environments share it.
+            njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts make.
+            per_env: Fields of the model that environments have of their own.
+
+        Raises:
+            SimulationError: If MuJoCo Warp does not support something of the model, or a field cannot differ.
+        """
+        check_supported(model)
+        self.nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
+        rows = constraint_rows(model, self.nconmax) if njmax is None else njmax
+        wp, self._mjw = libraries()
+        start = mujoco.MjData(model)
+        if keyframe >= 0:
+            mujoco.mj_resetDataKeyframe(model, start, keyframe)
+        with lane.work():
+            try:
+                self.model: Any = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
+                self.data: Any = self._mjw.put_data(model, start, num_envs, self.nconmax, njmax=rows)
+            except (NotImplementedError, ValueError) as error:
+                raise SimulationError(f"MuJoCo Warp: {error}") from error
+            self.model.opt.warn_overflow = 0  # it would be printed; here it is an error
+            # MuJoCo Warp takes this flag for one thing alone: boxes then meet as in MuJoCo, whose normal is the first box's
+            # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+            names = (*INTEGRATED, *SOURCES, *_WATCHED, "geom_xpos", "geom_xmat")
+            self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
+            self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
+            self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
+            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
+            self._is_reset = torch.zeros_like(self._is_stale)
+        self._has_stale = True
+        self.faults = Faults(self.arrays)
+        self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self._evaluate_stale)
+
+    def step(self, num_steps: int) -> None:
+        """Advance all environments by some physics steps: work for a `Replay`.
+
+        Poses, velocities and contacts are then those at the start of the last of them.
+        """
+        for _ in range(num_steps):
+            self._mjw.step(self.model, self.data)
+        self._is_stale.zero_()
+        self.faults.update()
+
+    def stepped(self) -> None:
+        """Take note, on the host, that all environments have been stepped."""
+        self._has_stale = False
+
+    def reset(self, mask: Bool[Tensor, " env"]) -> None:
+        """Start some environments anew. Their poses and contacts are evaluated when they are next asked for."""
+        self._is_reset.copy_(mask)
+        self._reset()
+        self._has_stale = True
+
+    def refresh(self) -> None:
+        """Evaluate poses, velocities and contacts of the environments that have been reset since the last step."""
+        if self._has_stale:
+            self._refresh()
+            self._has_stale = False
+
+    def forget_graphs(self) -> None:
+        """Capture anew at the next calls."""
+        self._reset.forget()
+        self._refresh.forget()
+
+    def account(self) -> str:
+        """Return what has gone wrong since the last reset, in words; it waits for a GPU."""
+        sizes = {
+            "njmax": int(self.data.njmax),
+            "nconmax": self.nconmax,
+            "naconmax": int(self.data.naconmax),
+            "maxmatch": int(self.model.opt.contact_sensor_maxmatch),
+            "nefc": int(self.arrays["nefc"].max()),
+            "nacon": int(self.arrays["nacon"].max()),
+            "ncollision": int(self.arrays["ncollision"].max()),
+        }
+        return self.faults.account(sizes)
+
+    def _restart(self) -> None:
+        for name, start in self._start.items():
+            array = self.arrays[name]
+            if array.numel():
+                array.copy_(torch.where(_like(self._is_reset, array), start, array))
+        self.faults.clear(self._is_reset)
+        self._is_stale |= self._is_reset
+
+    def _evaluate_stale(self) -> None:
+        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
+        kept = {name: self.arrays[name].clone() for name in SOURCES}
+        self._mjw.forward(self.model, self.data)
+        for name, before in kept.items():
+            array = self.arrays[name]
+            if array.numel():
+                array.copy_(torch.where(_like(self._is_stale, array), array, before))
+        self._is_stale.zero_()
+
+
+def check_supported(model: mujoco.MjModel) -> None:
+    """Raise what would make a state one of several instants.
+
+    Raises:
+        SimulationError: If the integrator is RK4, or sleeping is enabled.
+    """
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise SimulationError("bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
+
+
+def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
+    """Return how many rows of constraints a number of contacts makes at most, and all limits and equalities besides."""
+    dim = max([1, *model.geom_condim.tolist(), *model.pair_dim.tolist()])
+    is_pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    per_contact = 2 * (dim - 1) if is_pyramidal and dim > 1 else dim
+    limits = np.count_nonzero(model.jnt_limited) + 2 * np.count_nonzero(model.tendon_limited)
+    friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
+    return int(num_contacts * per_contact + 6 * model.neq + 2 * limits + friction)
+
+
+def _view(wp: Any, array: Any, lane: Lane) -> Tensor:
+    """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=lane.device)
+
+
+def _like(mask: Bool[Tensor, " env"], array: Tensor) -> Tensor:
+    return mask.reshape(-1, *[1] * (array.ndim - 1))
