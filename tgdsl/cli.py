@@ -1,4 +1,7 @@
-"""The command line: what to do with documents and artefacts, and `main`. Commands on robots are in `robot_commands`."""
+"""The command line: what to do with documents and artefacts, and `main`.
+
+Commands on robots are in `robot_commands`, on real hands in `hand_commands` and `calibrate_commands`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from tgdsl.calibrate_commands import Calibrate
 from tgdsl.errors import SpecError, TgdslError, did_you_mean
+from tgdsl.hand_commands import Hand
 from tgdsl.robot_commands import ExportUsd, Import, LayoutNew, Links
 
 if TYPE_CHECKING:
@@ -256,6 +261,8 @@ Command = (
     | Annotated[LayoutNew, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
+    | Annotated[Hand, tyro.conf.subcommand("hand")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
 )
 
 

@@ -27,6 +27,14 @@ class SimulationError(TgdslError):
     """A simulator that cannot run what was asked of it, or that diverged."""
 
 
+class ObservationError(TgdslError):
+    """An observation that its source cannot give."""
+
+
+class HandError(TgdslError):
+    """Base of every error of a real (or emulated) hand; `tgdsl.runtime.xhand1.errors` has the others."""
+
+
 @dataclass(frozen=True, order=True)
 class Problem:
     """One mistake in a document.

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
 
 from tgdsl.errors import Problem, SpecError, did_you_mean
 from tgdsl.schema import files, yaml
@@ -16,6 +18,8 @@ from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.yaml import Path, Source
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
+
+S = TypeVar("S", bound=BaseModel)
 
 
 @dataclass
@@ -125,12 +129,27 @@ def load_layout(path: FilePath) -> LoadedLayout:
     Raises:
         SpecError: All its mistakes.
     """
+    spec, source = read_spec(path, LayoutSpec, ("resolutions",))
+    return LoadedLayout(spec, source, (), path.parent)
+
+
+def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+    """Read a file that holds one model and nothing else, and where its values stand.
+
+    Args:
+        path: The file.
+        model: What it holds.
+        required: Keys that it must have.
+
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
     source = _read_file(path, str(path))
     problems = list(source.problems)
-    spec = read_as(source, (), LayoutSpec, problems, required=("resolutions",))
-    if problems or not isinstance(spec, LayoutSpec):
+    spec = read_as(source, (), model, problems, required=required)
+    if problems or not isinstance(spec, model):
         raise SpecError(problems)
-    return LoadedLayout(spec, source, (), path.parent)
+    return spec, source
 
 
 def _read_file(path: FilePath, name: str) -> Source:

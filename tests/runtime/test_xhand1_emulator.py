@@ -1,0 +1,163 @@
+"""The emulated hand and its line against closed forms; and minutes of it, marked slow."""
+
+import math
+import runpy
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from xhand1_hands import Stamps, Wait
+
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulated_body import TipForces
+from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulator import Emulator
+from tgdsl.runtime.xhand1.errors import HandError
+from tgdsl.runtime.xhand1.faulty_line import Faults, FaultyLine
+from tgdsl.runtime.xhand1.parser import FrameParser
+from tgdsl.runtime.xhand1.payloads import PASSIVE, HandState, JointCommand, Mode, decode_state, encode_command
+from tgdsl.runtime.xhand1.protocol import Command, Frame, encode_frame
+
+BAUD = 3_000_000
+MOVING = tuple(JointCommand(0.1 * i, 100, 0, 0, 300, Mode.POSITION) for i in range(12))
+
+
+def ask(hand: EmulatedHand, now: float, joints=PASSIVE) -> HandState:
+    reply = hand.answer(Frame(0xFE, hand.address, Command.EXCHANGE, encode_command(joints)), now)
+    assert reply is not None
+    assert (reply.source, reply.destination, reply.command) == (hand.address, 0xFE, 2)
+    return decode_state(reply.payload)
+
+
+def test_joints_follow_first_order_and_stay_when_passive():
+    hand = EmulatedHand(time_constant_s=0.05)
+    ask(hand, 10.0, MOVING)
+    for after in (0.01, 0.05, 0.2):
+        expected = 0.1 * np.arange(12) * (1 - math.exp(-after / 0.05))
+        assert ask(hand, 10.0 + after, MOVING).position == pytest.approx(expected, abs=1e-6)
+    held = hand.position
+    ask(hand, 10.2, PASSIVE)
+    assert ask(hand, 60.0, PASSIVE).position == pytest.approx(held, abs=1e-6)
+    assert hand.is_passive
+
+
+@pytest.mark.parametrize("lacking", [{"mode": Mode.PASSIVE}, {"kp": 0}, {"current_limit": 0}])
+def test_a_joint_without_mode_gain_or_current_stays(lacking):
+    hand = EmulatedHand()
+    joint = JointCommand(**({"position": 1.0, "kp": 100, "current_limit": 300, "mode": Mode.POSITION} | lacking))
+    ask(hand, 1.0, [joint] * 12)
+    assert (ask(hand, 2.0, [joint] * 12).position == 0).all()
+
+
+def test_fingertips_feel_the_field_rounded_and_cut_to_a_byte():
+    def field(time_s, position):
+        taxel = np.zeros((5, 120, 3))
+        taxel[1, 7] = [-300, 300, -5]
+        return TipForces(np.full((5, 3), time_s), taxel)
+
+    state = ask(EmulatedHand(forces=field), 12.4)
+    assert (state.total_force == 12).all()
+    assert state.taxel_force[1, 7].tolist() == [-128, 127, 0]
+    assert np.count_nonzero(state.taxel_force) == 2
+
+
+def test_what_a_hand_does_not_know_it_refuses_and_what_is_for_others_it_ignores():
+    hand = EmulatedHand(2)
+    assert hand.answer(Frame(0xFE, 0x80, Command.VERSION), 0.0) is None
+    assert hand.answer(Frame(0xFE, 0x82, Command.RESET), 0.0) == Frame(0x82, 0xFE, 0, b"\x14")
+    assert hand.answer(Frame(0xFE, 0x82, Command.EXCHANGE, b"short"), 0.0) == Frame(0x82, 0xFE, 0, b"\x02")
+    assert hand.answer(Frame(0xFE, 0x82, Command.READ_REGISTER, b"\x35\x00"), 0.0) == Frame(0x82, 0xFE, 0x15, b"\x02")
+
+
+def test_bytes_take_their_time_and_follow_one_another():
+    """They come out as at the far end of an adapter: 124 at a time, whatever frame they are of, and the rest at the end."""
+    line, byte, both = FaultyLine(BAUD, Faults(), 0), 10 / BAUD, b"a" * 2217 + b"b" * 297
+    line.send(both[:2217], b"", 5.0)
+    line.send(both[2217:], b"", 5.001)
+    out = b""
+    for num_chunks in (1, 17, 18, 20):
+        end = 5.0 + 124 * num_chunks * byte
+        out += line.due(end - 1e-6)
+        assert len(out) == 124 * (num_chunks - 1)
+        out += line.due(end + 1e-9)
+        assert out == both[: 124 * num_chunks]
+    assert line.due(5.0 + 2514 * byte - 1e-6) == b""
+    assert line.next_due() == pytest.approx(5.0 + 2514 * byte)
+    assert line.due(10.0) == both[20 * 124 :]
+    assert line.next_due() is None
+
+
+def test_after_a_pause_the_line_starts_anew():
+    line = FaultyLine(BAUD, Faults(), 0)
+    line.send(b"a" * 100, b"", 5.0)
+    line.send(b"b" * 100, b"", 6.0)
+    assert line.due(5.0 + 1001 / BAUD) == b"a" * 100
+    assert line.due(6.0 + 999 / BAUD) == b""
+    assert line.due(6.0 + 1001 / BAUD) == b"b" * 100
+
+
+REPLY, OTHER = encode_frame(Frame(0x80, 0xFE, 2, bytes(50))), encode_frame(Frame(0x81, 0xFE, 2, bytes(50)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "frames"),
+    [("corrupt", 0), ("truncate", 0), ("drop", 0), ("delay", 1), ("duplicate", 2), ("noise", 1), ("foreign", 2)],
+)
+def test_each_fault_does_what_it_says(fault, frames):
+    line = FaultyLine(BAUD, Faults(**{fault: 1.0}), 1)
+    line.send(REPLY, OTHER, 0.0)
+    early, late = line.due(0.039), line.due(1.0)
+    assert (late if fault == "delay" else early) == early + late
+    parser = FrameParser()
+    found = parser.feed(early + late) + parser.flush()
+    assert len(found) == frames
+    assert [frame.source for frame in found] == ([0x81, 0x80] if fault == "foreign" else [0x80] * frames)
+    assert line.counts[fault] == 1
+
+
+def test_faults_are_as_frequent_as_they_say_and_the_same_for_a_seed():
+    lines = [FaultyLine(BAUD, Faults.each(0.05), 4) for _ in range(2)]
+    for line in lines:
+        for _ in range(4000):
+            line.send(REPLY, OTHER, 0.0)
+    assert lines[0].due(1e9) == lines[1].due(1e9)
+    spread = 5 * math.sqrt(4000 * 0.05 * 0.95)
+    for name in ("corrupt", "delay", "drop", "duplicate", "foreign", "noise", "truncate"):
+        assert abs(lines[0].counts[name] - 200) < spread
+    assert "silence" not in lines[0].counts
+
+
+@pytest.mark.slow
+def test_a_minute_at_the_highest_rate_loses_nothing(capsys):
+    """The benchmark's own run, short; how even the readings come depends on the machine, and is printed."""
+    soak = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "hand_soak.py"))["soak"]
+    found = soak(60.0)
+    assert (found.num_lost, found.num_lost_bytes) == (0, 0)
+    counters = found.counters
+    assert (counters.num_timeouts, counters.num_damaged, counters.num_unexpected, counters.num_discarded_bytes) == (0, 0, 0, 0)
+    assert np.all(np.diff(found.received_at) > 0.97 * 2514 * 10 / BAUD)
+    assert "lost: 0 exchanges, 0 bytes" in found.text()
+    with capsys.disabled():
+        print(f"\n{found.text()}")
+
+
+@pytest.mark.slow
+def test_a_minute_with_one_fault_of_each_kind_in_twenty():
+    stamps = Stamps()
+    with Emulator(EmulatedHand(forces=stamps), seed=7) as emulator, XHand1.open(emulator.device) as hand:
+        emulator.set_faults(Faults.each(0.05))
+        found, errors, waits = [], [], []
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline:
+            with Wait() as wait:
+                try:
+                    found.append(stamps.check(hand.read()))
+                except HandError as error:
+                    errors.append(type(error))
+            waits.append(wait.seconds)
+    assert HandError not in errors
+    assert np.all(np.diff(found) >= 1)
+    assert len(found) > 100
+    assert np.quantile(waits, 0.99) < 0.1
+    print(f"\n{len(found)} readings, {len(errors)} named errors, longest wait {1e3 * max(waits):.1f} ms")

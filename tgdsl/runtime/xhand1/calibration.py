@@ -1,0 +1,189 @@
+"""What fingertip counts mean, for one hand: a YAML file of scale, axes, bias and tare per finger.
+
+    force = rotation · (scale ∘ (counts − tare)) + bias
+
+`counts` are the hand's own, `tare` what it reads unloaded, `scale` is along the sensor's axes, `rotation` turns them into the
+axes of the fingertip's link in the robot file, and `bias` is in the file's unit. What unit and axes the counts have is not
+published: without a file they stay counts along the sensor's axes.
+
+Shapes: `finger` thumb, index, middle, ring, pinky.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Num
+from pydantic import model_validator
+
+from tgdsl.fields import Number, Positive, SpecModel
+from tgdsl.runtime.xhand1.driver import Tare
+from tgdsl.runtime.xhand1.payloads import FINGERS
+from tgdsl.schema.load import read_spec
+
+Sign = Literal[-1, 1]
+Row = tuple[Number, Number, Number]
+_ORTHOGONAL = 1e-4
+"""Largest error of a rotation's product with its transpose: five written digits."""
+
+
+class FingerSpec(SpecModel):
+    """One fingertip."""
+
+    scale: tuple[Positive, Positive, Positive] | None = None
+    """Unit per count along the sensor's x, y, z; default, where the unit is counts: 1."""
+    signs: tuple[Sign, Sign, Sign] | None = None
+    """1 or -1 for each of the sensor's axes, if they are parallel to the link's."""
+    rotation: tuple[Row, Row, Row] | None = None
+    """Rows of the matrix that takes the sensor's axes to the link's; it may also mirror or exchange axes."""
+    bias: Row = (0.0, 0.0, 0.0)
+    """What is added at the end, along the link's axes [unit]."""
+    tare: Row = (0.0, 0.0, 0.0)
+    """What the sensor reads unloaded [counts]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> FingerSpec:
+        if self.signs is not None and self.rotation is not None:
+            raise ValueError("found `signs` and `rotation`, expected one of them")
+        matrix = self.matrix
+        error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+        if error > _ORTHOGONAL:
+            raise ValueError(f"rotation is off by {error:.2g}, expected rows of length 1 at right angles")
+        return self
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation, whichever way it is written."""
+        if self.rotation is not None:
+            return np.array(self.rotation, dtype=np.float64)
+        return np.diag(np.array(self.signs or (1, 1, 1), dtype=np.float64))
+
+
+class FingersSpec(SpecModel):
+    """All fingertips."""
+
+    thumb: FingerSpec
+    """The thumb's."""
+    index: FingerSpec
+    """The index finger's."""
+    middle: FingerSpec
+    """The middle finger's."""
+    ring: FingerSpec
+    """The ring finger's."""
+    pinky: FingerSpec
+    """The pinky's."""
+
+
+class CalibrationSpec(SpecModel):
+    """What one hand's counts mean."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    hand: str | None = None
+    """Which hand it is for, in the user's words."""
+    units: Literal["counts", "N"] = "counts"
+    """Unit of the forces that come out."""
+    contact_threshold: Positive | None = None
+    """Force above which a fingertip is in contact, for the observation `agg_bool` [unit]."""
+    fingers: FingersSpec
+    """The fingertips."""
+
+    @model_validator(mode="after")
+    def _check(self) -> CalibrationSpec:
+        without = [name for name in FINGERS if getattr(self.fingers, name).scale is None]
+        if self.units == "N" and without:
+            raise ValueError(f"the unit is N, but {', '.join(without)} without `scale`; expected N per count")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What one hand's counts mean.
+
+    Attributes:
+        units: Unit of what `apply` returns.
+        scale: Unit per count, along the sensor's axes.
+        rotation: From the sensor's axes to the link's.
+        bias: What is added at the end [units].
+        tare: What the sensors read unloaded [counts].
+        hand: Which hand it is for, or empty.
+        contact_threshold: Force above which a fingertip is in contact [units]; None if that was not said.
+    """
+
+    units: Literal["counts", "N"]
+    scale: Float[np.ndarray, "finger 3"]
+    rotation: Float[np.ndarray, "finger 3 3"]
+    bias: Float[np.ndarray, "finger 3"]
+    tare: Float[np.ndarray, "finger 3"]
+    hand: str = ""
+    contact_threshold: float | None = None
+
+    @classmethod
+    def none(cls) -> Calibration:
+        """Return that of a hand of which nothing is known: counts stay what they are."""
+        num = len(FINGERS)
+        zero = np.zeros((num, 3))
+        return cls("counts", np.ones((num, 3)), np.tile(np.eye(3), (num, 1, 1)), zero, zero)
+
+    def apply(self, counts: Num[np.ndarray, "*batch finger 3"]) -> Float[np.ndarray, "*batch finger 3"]:
+        """Return the force on each fingertip, along its link's axes [units].
+
+        Args:
+            counts: What the hand sums up per fingertip, `HandState.total_force`.
+        """
+        along_sensor = self.scale * (counts - self.tare)
+        return np.einsum("fij,...fj->...fi", self.rotation, along_sensor) + self.bias
+
+    def counts_of(self, force: Float[np.ndarray, "*batch finger 3"]) -> Float[np.ndarray, "*batch finger 3"]:
+        """Return the counts, not rounded, that `apply` makes a force of: what an emulated fingertip is to feel.
+
+        Args:
+            force: Force on each fingertip, along its link's axes [units].
+        """
+        return np.einsum("fij,...fi->...fj", self.rotation, force - self.bias) / self.scale + self.tare
+
+    def with_tare(self, tare: Tare) -> Calibration:
+        """Return the same with another tare."""
+        return replace(self, tare=tare.mean)
+
+    def text(self) -> str:
+        """Return the YAML that `load_calibration` reads."""
+        lines = ["tgdsl: 1", *([f"hand: {_quoted(self.hand)}"] if self.hand else []), f"units: {self.units}"]
+        if self.contact_threshold is not None:
+            lines.append(f"contact_threshold: {self.contact_threshold!r}")
+        lines.append("fingers:")
+        for i, name in enumerate(FINGERS):
+            lines += [f"  {name}:", f"    scale: {_row(self.scale[i])}"]
+            lines += [f"    rotation: [{', '.join(_row(row) for row in self.rotation[i])}]"]
+            lines += [f"    bias: {_row(self.bias[i])}", f"    tare: {_row(self.tare[i])}"]
+        return "\n".join(lines) + "\n"
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
+    spec, _ = read_spec(path, CalibrationSpec, ("tgdsl", "fingers"))
+    fingers = [getattr(spec.fingers, name) for name in FINGERS]
+    return Calibration(
+        spec.units,
+        np.array([finger.scale or (1.0, 1.0, 1.0) for finger in fingers], dtype=np.float64),
+        np.stack([finger.matrix for finger in fingers]),
+        np.array([finger.bias for finger in fingers], dtype=np.float64),
+        np.array([finger.tare for finger in fingers], dtype=np.float64),
+        spec.hand or "",
+        spec.contact_threshold,
+    )
+
+
+def _row(values: Float[np.ndarray, " axis"]) -> str:
+    return f"[{', '.join(repr(float(value)) for value in values)}]"
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

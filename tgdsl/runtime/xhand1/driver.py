@@ -1,0 +1,264 @@
+"""The XHand1 on a serial port: read it, and move it only where limits allow."""
+
+from __future__ import annotations
+
+import atexit
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.runtime.xhand1.errors import HandError, HandTimeoutError, MotionError, StaleReadingError
+from tgdsl.runtime.xhand1.link import Link, LinkCounters, LinkTiming
+from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
+from tgdsl.runtime.xhand1.payloads import NUM_JOINTS, encode_register_request
+from tgdsl.runtime.xhand1.protocol import Command
+from tgdsl.runtime.xhand1.reader import HandReader, Reading
+from tgdsl.runtime.xhand1.replies import Addresses
+from tgdsl.runtime.xhand1.serial_port import Port, open_serial_port
+
+MAX_AGE_S = 0.1
+READ_TIMEOUT_S = 0.08
+_PATIENCE_S = 1.0
+_CLOSE_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Tare:
+    """What the fingertips read while nothing touches them.
+
+    Attributes:
+        mean: Mean of the frames [counts].
+        spread: Largest less least of the frames [counts].
+        num_frames: How many frames.
+    """
+
+    mean: Float[np.ndarray, "finger 3"]
+    spread: Float[np.ndarray, "finger 3"]
+    num_frames: int
+
+
+class XHand1:
+    """A hand that is being read. Use it as a context manager, or call `close`.
+
+    A thread exchanges with the hand all the time. Unless motion limits were given, every exchange asks for mode 0 with no gain
+    and no current. With them, the hand moves only while commands keep coming; any failure on the line, a command beyond the
+    limits, a missed watchdog and `close` make it passive, until `resume`.
+
+    What this cannot do: if the process is killed or the cable is pulled, no more is sent, and what the hand then does with its
+    last command is not published.
+    """
+
+    def __init__(self, reader: HandReader, max_age_s: float, patience_s: float):
+        """Take over a reader that runs; use `open`."""
+        self._reader = reader
+        self._max_age_s = max_age_s
+        self._patience_s = patience_s
+        self._handed_out = 0
+        atexit.register(self._leave)
+
+    @classmethod
+    def open(
+        cls,
+        device: str,
+        addresses: Addresses | None = None,
+        *,
+        motion: MotionLimits | None = None,
+        timing: LinkTiming | None = None,
+        max_age_s: float = MAX_AGE_S,
+        open_port: Callable[[str, int], Port] = open_serial_port,
+    ) -> XHand1:
+        """Open a hand and wait for its first reading.
+
+        Args:
+            device: The serial port, such as `/dev/ttyUSB0`.
+            addresses: Which hand; default: the one with id 0.
+            motion: Leave to move it; default: none.
+            timing: Times of the line.
+            max_age_s: Readings older than this are not handed out [s].
+            open_port: Opens a port, given its name and baud rate.
+
+        Raises:
+            HandDisconnectedError: If the port cannot be opened.
+            HandError: If the hand does not answer, or not as expected.
+        """
+        timing = timing or LinkTiming()
+        addresses = addresses or Addresses()
+
+        def connect(counters: LinkCounters) -> Link:
+            return Link(open_port(device, timing.baud), addresses, timing, counters)
+
+        reader = HandReader(connect(LinkCounters()), connect, Motion(motion) if motion else None)
+        reader.start()
+        patience = _PATIENCE_S + 4 * timing.reply_timeout_s  # three requests for the version, and another
+        hand = cls(reader, max_age_s, patience)
+        try:
+            with reader.changed:
+                reader.changed.wait_for(lambda: reader.reading or reader.ended, patience)
+                if reader.reading is None:
+                    raise hand._why_no_reading()
+        except BaseException:
+            hand.close()
+            raise
+        return hand
+
+    def read(self, timeout_s: float = READ_TIMEOUT_S) -> Reading:
+        """Return the newest reading, one that was not handed out before; wait for it if need be.
+
+        Args:
+            timeout_s: How long to wait [s].
+
+        Raises:
+            HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandChecksumError`,
+                `HandDisconnectedError` and so on; `StaleReadingError` if nothing failed but none came in time.
+            HandClosedError: If the hand was closed.
+        """
+        reader = self._reader
+        with reader.changed:
+            reader.changed.wait_for(lambda: self._is_new(reader.reading) or reader.ended, timeout_s)
+            if reader.ended is not None:
+                raise reader.ended
+            reading = reader.reading
+            if reading is None or not self._is_new(reading):
+                raise self._why_no_reading()
+            self._handed_out = reading.sequence
+            return reading
+
+    def command(self, target: Sequence[float] | Float[np.ndarray, " joint"]) -> None:
+        """Set where the joints shall go; to be called again within the watchdog's time, also to stay there.
+
+        Args:
+            target: Joint angles in the order of the joints' ids [rad].
+
+        Raises:
+            MotionError: If the hand was opened for reading alone, was made passive, or a target is outside its range.
+            WatchdogError: If the last command is too long ago.
+            HandClosedError: If the hand was closed.
+        """
+        reader, now = self._reader, time.monotonic()
+        with reader.changed:
+            if reader.ended is not None:
+                raise reader.ended
+            if reader.motion is None:
+                raise MotionError("this hand was opened for reading alone; to move it, open it with motion=MotionLimits(...)")
+            angles = np.asarray(target, dtype=np.float64)
+            if angles.shape != (NUM_JOINTS,):
+                raise reader.motion.stop(MotionError(f"the target has shape {angles.shape}, expected ({NUM_JOINTS},)"))
+            reading = reader.reading
+            is_known = reading is not None and reading.age_s(now) <= self._max_age_s
+            reader.motion.command(angles, now, reading.state.position.astype(np.float64) if reading and is_known else None)
+
+    def relax(self) -> None:
+        """Make the hand passive until the next command; one that was stopped stays so until `resume`."""
+        with self._reader.changed:
+            if self._reader.motion is not None:
+                self._reader.motion.relax()
+
+    def resume(self) -> None:
+        """Allow commands again after the hand was made passive; it stays passive until the next one."""
+        with self._reader.changed:
+            if self._reader.motion is not None:
+                self._reader.motion.resume()
+
+    @property
+    def stopped(self) -> HandError | None:
+        """Why the hand was made passive; None if it was not."""
+        with self._reader.changed:
+            return None if self._reader.motion is None else self._reader.motion.stopped
+
+    @property
+    def watchdog_s(self) -> float | None:
+        """Time within which commands must follow one another [s]; None if the hand was opened for reading alone."""
+        return None if self._reader.motion is None else self._reader.motion.limits.watchdog_s
+
+    @property
+    def counters(self) -> LinkCounters:
+        """What happened on the line so far."""
+        return replace(self._reader.counters)
+
+    @property
+    def num_reconnects(self) -> int:
+        """How often the port went away and was opened anew."""
+        return self._reader.num_connects
+
+    def tare(self, num_frames: int = 20) -> Tare:
+        """Return what the fingertips read now, while nothing touches them. Nothing is sent to the hand for it.
+
+        Args:
+            num_frames: How many readings to take, at least 5.
+
+        Raises:
+            HandError: If a reading fails, a force is at the end of its range, or fewer than 5 frames are asked for.
+        """
+        if num_frames < 5:
+            raise HandError(f"a tare over {num_frames} frames, expected at least 5")
+        states = [self.read().state for _ in range(num_frames)]
+        if any(state.is_total_saturated.any() for state in states):
+            raise HandError("a fingertip's force is at the end of its range; nothing may touch the hand while it is tared")
+        forces = np.array([state.total_force for state in states], dtype=np.float64)
+        return Tare(forces.mean(axis=0), np.ptp(forces, axis=0), num_frames)
+
+    def read_register(self, number: int) -> bytes:
+        """Return what a register's reply holds, as it came: its layout is unverified.
+
+        Raises:
+            HandError: If the hand does not answer.
+        """
+        request = encode_register_request(number)
+        return self._run(lambda link: link.exchange(Command.READ_REGISTER, request).payload)
+
+    def version(self) -> bytes:
+        """Return what the version's reply holds, as it came: its layout is unverified.
+
+        Raises:
+            HandError: If the hand does not answer.
+        """
+        return self._run(lambda link: link.exchange(Command.VERSION).payload)
+
+    def close(self) -> None:
+        """Make the hand passive, if it is not, and let go of the port.
+
+        Raises:
+            HandError: If the hand was moving and did not confirm that it is passive.
+        """
+        self._leave()
+        if self._reader.is_alive():
+            raise HandError(
+                f"the hand's reader did not end within {_CLOSE_TIMEOUT_S:g} s: switch the hand's power off if it moves"
+            )
+        if self._reader.left_driven is not None:
+            error = self._reader.left_driven
+            raise HandError(f"the hand did not confirm that it is passive: switch its power off ({error})") from error
+
+    def __enter__(self) -> XHand1:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def _is_new(self, reading: Reading | None) -> bool:
+        return reading is not None and reading.sequence > self._handed_out and reading.age_s() <= self._max_age_s
+
+    def _why_no_reading(self) -> HandError:
+        reading, failure = self._reader.reading, self._reader.failure
+        if self._reader.ended is not None:
+            return self._reader.ended
+        if failure is not None and (reading is None or failure[1] > reading.received_at):
+            return type(failure[0])(str(failure[0]))
+        if reading is None:
+            return HandTimeoutError("the hand has not answered yet")
+        return StaleReadingError(f"no new reading came in time; the newest is {1e3 * reading.age_s():.0f} ms old")
+
+    def _run(self, job: Callable[[Link], bytes]) -> bytes:
+        try:
+            return self._reader.submit(job).result(self._patience_s)
+        except TimeoutError as error:
+            raise HandTimeoutError(f"the line was not free within {self._patience_s:g} s") from error
+
+    def _leave(self) -> None:
+        atexit.unregister(self._leave)
+        self._reader.stop()
+        self._reader.join(_CLOSE_TIMEOUT_S)

@@ -1,0 +1,80 @@
+"""Which hand it is, in its own words. Versions and registers are asked for; no request holds a set-point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tgdsl.runtime.xhand1.errors import HandChecksumError, HandRefusedError, HandTimeoutError
+from tgdsl.runtime.xhand1.find import FoundHand
+from tgdsl.runtime.xhand1.link import Link, LinkTiming
+from tgdsl.runtime.xhand1.payloads import encode_register_request
+from tgdsl.runtime.xhand1.protocol import Command, Register
+from tgdsl.runtime.xhand1.serial_port import Port, open_serial_port
+
+UNTOLD = "not told"
+
+
+@dataclass(frozen=True)
+class HandIdentity:
+    """What a hand tells of itself; bytes as they came, for the layout of these replies is unverified.
+
+    Attributes:
+        device: The serial port that it was found on.
+        hand_id: Its id.
+        version: Its version; empty if it was not asked.
+        side: Register 20, which hand it is; None if it does not tell.
+        serial_number: Register 21; None if it does not tell.
+        name: Register 54; None if it does not tell.
+    """
+
+    device: str
+    hand_id: int
+    version: bytes = b""
+    side: bytes | None = None
+    serial_number: bytes | None = None
+    name: bytes | None = None
+
+    def __str__(self) -> str:
+        told = {"version": self.version, "side": self.side, "serial number": self.serial_number, "name": self.name}
+        return f"{self.device}: hand {self.hand_id}, " + ", ".join(f"{what} {shown(value)}" for what, value in told.items())
+
+
+def identify(
+    found: FoundHand, *, timing: LinkTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
+) -> HandIdentity:
+    """Ask a hand that was found for its registers.
+
+    Args:
+        found: The hand.
+        timing: Times of the line.
+        open_port: Opens a port, given its name and baud rate.
+
+    Raises:
+        HandDisconnectedError: If the port cannot be opened, or went away.
+    """
+    timing = timing or LinkTiming()
+    link = Link(open_port(found.device, timing.baud), found.addresses, timing)
+    try:
+        told = [_register(link, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
+    finally:
+        link.close()
+    return HandIdentity(found.device, found.addresses.hand_id, found.version, *told)
+
+
+def shown(value: bytes | None) -> str:
+    """Return what a reply held as text if it is text, padded with zeros or not; else as hexadecimal bytes."""
+    if value is None:
+        return UNTOLD
+    text = value.rstrip(b"\0")
+    if text and text.isascii() and text.decode().isprintable():
+        return f'"{text.decode()}"'
+    return value.hex(" ") or "empty"
+
+
+def _register(link: Link, number: int) -> bytes | None:
+    """Return what a register holds; None if the hand refuses to tell, or does not answer."""
+    try:
+        return link.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
+    except (HandRefusedError, HandTimeoutError, HandChecksumError):
+        return None

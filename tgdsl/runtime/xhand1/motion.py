@@ -1,0 +1,206 @@
+"""What the driver may make the hand do: nothing, unless limits say otherwise; and the set-points that stay within them.
+
+No clock and no I/O here: time is passed in. A hand that was stopped, for whatever reason, stays passive until `resume`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from tgdsl.errors import listed
+from tgdsl.runtime.xhand1.errors import HandError, MotionError, WatchdogError
+from tgdsl.runtime.xhand1.payloads import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
+
+JointArray = Float[np.ndarray, " joint"]
+ROUNDING = 1e-6
+"""How far a target may lie beyond its range and is taken for its end [rad]: float32 angles are rounded by less."""
+_LONGEST_STEP_S = 0.05
+"""Set-points move no further in one exchange than in this time, however long it took [s]."""
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Leave to move, and how far it goes. One value per joint, in the order of their ids.
+
+    Attributes:
+        lower: Least set-point [rad].
+        upper: Largest set-point [rad].
+        speed: How fast a set-point may move [rad/s].
+        current_limit: Largest motor current [mA]; what torque it makes is not published.
+        kp: Proportional gain [hand's unit].
+        ki: Integral gain [hand's unit].
+        kd: Derivative gain [hand's unit].
+        watchdog_s: The hand is made passive if no command comes for this long [s].
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    speed: tuple[float, ...]
+    current_limit: tuple[int, ...]
+    kp: int
+    ki: int = 0
+    kd: int = 0
+    watchdog_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        """Refuse limits that limit nothing.
+
+        Raises:
+            MotionError: If there are not 12 of each, a range is empty, or a limit is not finite or not positive.
+        """
+        for name in ("lower", "upper", "speed", "current_limit"):
+            values = getattr(self, name)
+            if len(values) != NUM_JOINTS or not np.isfinite(values).all():
+                raise MotionError(f"{name} is {values}, expected {NUM_JOINTS} finite numbers")
+        for i, name in enumerate(JOINTS):
+            if not self.lower[i] < self.upper[i]:
+                raise MotionError(f"{name}: the range is {self.lower[i]:g} to {self.upper[i]:g} rad, expected lower < upper")
+            if not self.speed[i] > 0 or not 0 < self.current_limit[i] <= 0xFFFF:
+                found = f"speed {self.speed[i]:g} rad/s, current {self.current_limit[i]} mA"
+                raise MotionError(f"{name}: {found}; expected more than 0, and at most 65535 mA")
+        if not 0 < self.watchdog_s <= 1:
+            raise MotionError(f"watchdog_s is {self.watchdog_s:g}, expected more than 0 and at most 1 s")
+
+    @classmethod
+    def of_robot(
+        cls,
+        model: mujoco.MjModel,
+        *,
+        speed: float,
+        current_limit: int,
+        kp: int,
+        ki: int = 0,
+        kd: int = 0,
+        watchdog_s: float = 0.1,
+    ) -> MotionLimits:
+        """Return limits with the joint ranges of a robot file, and one speed and current for all joints.
+
+        Args:
+            model: The robot, right or left, with the vendor's joint names.
+            speed: How fast set-points may move [rad/s].
+            current_limit: Largest motor current [mA].
+            kp: Proportional gain [hand's unit].
+            ki: Integral gain [hand's unit].
+            kd: Derivative gain [hand's unit].
+            watchdog_s: The hand is made passive if no command comes for this long [s].
+
+        Raises:
+            MotionError: If the robot lacks a joint, or one has no range.
+        """
+        ranges = joint_ranges(model)
+        lower, upper = (tuple(map(float, ranges[:, i])) for i in (0, 1))
+        speeds, currents = (speed,) * NUM_JOINTS, (current_limit,) * NUM_JOINTS
+        return cls(lower, upper, speeds, currents, kp, ki, kd, watchdog_s)
+
+
+def joint_ids(model: mujoco.MjModel) -> Int[np.ndarray, " joint"]:
+    """Return which of a model's joints each of the hand's is, in the order of the hand's ids.
+
+    Raises:
+        MotionError: If the robot lacks a joint, or one has no range.
+    """
+    names = [model.joint(i).name for i in range(model.njnt)]
+    ids = []
+    for wanted in JOINTS:
+        found = [i for i, name in enumerate(names) if name == wanted or name.endswith(f"_hand_{wanted}")]
+        if len(found) != 1 or not model.jnt_limited[found[0]]:
+            raise MotionError(f"expected one joint {wanted} with a range; the robot has {listed(names) or 'none'}")
+        ids.append(found[0])
+    return np.array(ids)
+
+
+def joint_ranges(model: mujoco.MjModel) -> Float[np.ndarray, "joint 2"]:
+    """Return the range of each joint in the order of the hand's ids [rad].
+
+    Raises:
+        MotionError: If the robot lacks a joint, or one has no range.
+    """
+    return model.jnt_range[joint_ids(model)]
+
+
+class Motion:
+    """The set-points of a hand that may move. The first starts from where the joints are; each moves at a limited speed."""
+
+    def __init__(self, limits: MotionLimits):
+        """Start passive."""
+        self.limits = limits
+        self._stopped: HandError | None = None
+        self._target: JointArray | None = None
+        self._setpoint = np.zeros(NUM_JOINTS)
+        self._commanded_at = self._stepped_at = 0.0
+
+    @property
+    def stopped(self) -> HandError | None:
+        """Why the hand was made passive; None if it was not."""
+        return self._stopped
+
+    def command(self, target: JointArray, now: float, measured: JointArray | None) -> None:
+        """Take a new target.
+
+        Args:
+            target: Joint angles to go to [rad].
+            now: Time [s].
+            measured: Where the joints are [rad]; None if that is not known.
+
+        Raises:
+            MotionError: If a target is outside its range, or it is not known where the joints are. The hand is then passive.
+            HandError: If the hand was stopped, of the kind that stopped it.
+            WatchdogError: If the last command is too long ago. The hand is then passive.
+        """
+        self._watch(now)
+        if self._stopped is not None:
+            raise type(self._stopped)(f"the hand was made passive: {self._stopped}; call resume() to go on")
+        lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
+        outside = ~((target >= lower - ROUNDING) & (target <= upper + ROUNDING))
+        if outside.any():
+            i = int(np.argmax(outside))
+            what = f"{JOINTS[i]}: target {target[i]:g} rad, expected {lower[i]:g} to {upper[i]:g}"
+            raise self.stop(MotionError(what))
+        if self._target is None:
+            if measured is None:
+                raise self.stop(MotionError("where the joints are is not known, so no set-point can start from there"))
+            self._setpoint, self._stepped_at = measured.astype(np.float64), now
+        self._target, self._commanded_at = np.clip(target.astype(np.float64), lower, upper), now
+
+    def joints(self, now: float) -> tuple[JointCommand, ...]:
+        """Return what to send now: set-points one step on, or `PASSIVE`."""
+        self._watch(now)
+        if self._target is None:
+            return PASSIVE
+        reach = np.array(self.limits.speed) * min(max(now - self._stepped_at, 0.0), _LONGEST_STEP_S)
+        self._setpoint = np.clip(self._target, self._setpoint - reach, self._setpoint + reach)
+        self._stepped_at = now
+        limits = self.limits
+        return tuple(
+            JointCommand(float(position), limits.kp, limits.ki, limits.kd, current, Mode.POSITION)
+            for position, current in zip(self._setpoint, limits.current_limit, strict=True)
+        )
+
+    def stop(self, reason: HandError) -> HandError:
+        """Make the hand passive until `resume`, if it is not already, and return the reason."""
+        self._target = None
+        self._stopped = self._stopped or reason
+        return reason
+
+    def fail(self, reason: HandError) -> None:
+        """Make the hand passive if it is moving."""
+        if self._target is not None:
+            self.stop(reason)
+
+    def relax(self) -> None:
+        """Make the hand passive until the next command; one that was stopped stays so until `resume`."""
+        self._target = None
+
+    def resume(self) -> None:
+        """Allow commands again."""
+        self._stopped = self._target = None
+
+    def _watch(self, now: float) -> None:
+        waited = now - self._commanded_at
+        if self._target is not None and waited > self.limits.watchdog_s:
+            allowed = 1e3 * self.limits.watchdog_s
+            self.stop(WatchdogError(f"no command came for {1e3 * waited:.0f} ms, expected one every {allowed:.0f} ms"))

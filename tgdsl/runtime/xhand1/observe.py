@@ -1,0 +1,101 @@
+"""A module's observations, made of what a hand says instead of readings: same groups, names, order, dtype and device.
+
+`agg_force` is the calibrated force on each fingertip [unit of the calibration]; the simulation's `scale` is the factor from
+summed depth to that unit. `agg_bool` is whether that force is larger than the calibration's `contact_threshold`, where the
+simulation counts taxels. A sensor's `rate` and `history` are kept as the module keeps them; its noise is not added.
+
+Shapes: `env` one, `finger` and `taxel` as in `payloads`, `feature` numbers of an observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.module import TactileModule
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.fingertips import HandTerm, hand_terms
+from tgdsl.runtime.xhand1.source import HandSample
+
+
+class HandObserver:
+    """Observes one hand for a module.
+
+    Attributes:
+        terms: The observations.
+    """
+
+    def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float):
+        """Look whether a hand can give what the module observes.
+
+        Args:
+            touch: The module.
+            calibration: The hand's; of it the contact threshold is used.
+            control_step: Time from one call of `observe` to the next [s].
+
+        Raises:
+            ObservationError: If a hand cannot give an observation; all of them are named.
+        """
+        self.terms = hand_terms(touch.plan, calibration.contact_threshold)
+        self._like = torch.empty(0, dtype=touch.dtype, device=touch.device)
+        self._threshold = calibration.contact_threshold
+        self._pasts = [_Past(term, control_step, touch.dtype) for term in self.terms]
+
+    def observe(self, sample: HandSample) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the observation groups. To be called once per control step, as sensors may remember their last samples."""
+        groups: dict[str, list[Tensor]] = {}
+        for term, past in zip(self.terms, self._pasts, strict=True):
+            features = _features(term, sample, self._threshold).to(self._like)
+            groups.setdefault(term.planned.group, []).append(past.push(features))
+        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+
+    def reset(self) -> None:
+        """Forget the last samples."""
+        for past in self._pasts:
+            past.reset()
+
+
+def _features(term: HandTerm, sample: HandSample, threshold: float | None) -> Tensor:
+    type_, fingers = term.planned.type, list(term.fingers)
+    if type_ == "agg_force":
+        return sample.tip_force[:, fingers][:, :, list(term.axes)].transpose(1, 2).flatten(1)
+    if type_ == "agg_bool":
+        assert threshold is not None
+        return sample.tip_force[:, fingers].norm(dim=-1) > threshold
+    if type_ == "taxel_counts":
+        return sample.taxel_counts.permute(0, 3, 1, 2).flatten(1)
+    if type_ == "taxel_saturated":
+        return sample.is_taxel_saturated.flatten(1)
+    return sample.tip_force.new_empty((len(sample.tip_force), 0))
+
+
+class _Past:
+    """The samples of one observation: taken when the sensor's rate says so, held until the next, stacked as its history says.
+
+    When a sample is due is found by the module's own arithmetic, in its dtype: see `clock.Clock.now` and `reading.read`.
+    """
+
+    def __init__(self, term: HandTerm, control_step: float, dtype: torch.dtype):
+        self._steps, self._period = term.steps, term.period
+        self._dt = torch.tensor(control_step, dtype=dtype)
+        self.reset()
+
+    def push(self, features: Float[Tensor, "env feature"]) -> Float[Tensor, "env steps_feature"]:
+        """Take what the hand says now, and return what is observed."""
+        if not self._last:
+            self._last = [features] * self._steps
+        else:
+            is_due = not self._period or bool(self._phase + 1.5 * self._dt >= self._period)
+            self._last = [*self._last[1:], features if is_due else self._last[-1]]
+            since = self._phase + self._dt
+            whole = torch.floor((since + 0.5 * self._dt) / self._period).clamp(min=0) if self._period else 0.0
+            self._phase = since - whole * self._period
+        return torch.cat(self._last, dim=1)
+
+    def reset(self) -> None:
+        """Forget them."""
+        self._last: Sequence[Tensor] = []
+        self._phase = torch.zeros_like(self._dt)
