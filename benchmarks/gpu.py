@@ -1,0 +1,386 @@
+"""The module alone on a GPU: time, error and bytes of every kind, by environments, taxels, objects, points and noise.
+
+    python benchmarks/gpu.py artefacts out/gpu                              # where documents can be compiled
+    python benchmarks/gpu.py run out/gpu --out out/gpu.json [--warm]        # on the machine with the GPU
+    python benchmarks/gpu.py table out/gpu.json                             # for docs/performance.md
+    python benchmarks/gpu.py plot out/gpu.json --out docs/images
+    python benchmarks/gpu.py bytes out/gpu                                  # memory of every case, without a GPU
+
+`run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager` tries it out without a GPU. `run --warm` times
+nothing: it fills the compiler's cache, many cases at once. Every row is printed and written as soon as it is known.
+
+Per row: first the error, float32 on the device in three calls in a row against a float64 module, over the largest magnitude of
+each channel. Then medians: of a replayed CUDA graph that holds calls on so many sets of inputs, state and readings that
+together they exceed the GPU's L2 cache; and of a plain call, whose inputs and readings rotate too, but not its state. The copy
+ceiling is how long it takes to copy as many bytes as a call must move, in the same manner, by the faster of two kernels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import math
+import statistics
+import subprocess
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import gpu_plots
+import numpy as np
+import torch
+from gpu_plots import HEAD, Row, load_rows
+from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, state_of
+from torch import Tensor
+
+from tgdsl.artifact import load_plan
+from tgdsl.module import Output, TactileModule
+from tgdsl.plan import Plan
+from tgdsl.state import SceneState
+
+ROTATED = 160e6
+"""Bytes that the sets of buffers have together: the L2 of an H200 holds 60 MB."""
+MOST_SETS = 256
+LONG = 1_000.0
+"""When to stop repeating [ms]."""
+CALLS = 3
+"""Calls in a row whose readings are compared."""
+Tensors = dict[str, Tensor]
+Core = Callable[[Tensors, Tensors], Tensors]
+Arrays = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One case: its plan, and its code for all numbers of environments."""
+
+    case: Case
+    plan: Plan
+    core: Core
+    device: torch.device
+
+    @classmethod
+    def of(cls, case: Case, options: argparse.Namespace) -> Bench:
+        """Load an artefact; code is compiled at its first call."""
+        plan, device = load_plan(artefact(options.folder, case)), torch.empty(0, device=options.device).device
+        advance = TactileModule(plan).to(device).advance
+        return cls(case, plan, advance if options.eager else torch.compile(advance, fullgraph=True, dynamic=True), device)
+
+    def module(self) -> TactileModule:
+        """Return a module that remembers nothing yet, with the case's code."""
+        touch = TactileModule(self.plan).to(self.device)
+        touch._compiled = self.core
+        return touch
+
+    def states(self, num_envs: int, count: int, seed: int = 0) -> list[SceneState]:
+        """Return random states on the CPU."""
+        return [state_of(TactileModule(self.plan), num_envs, seed + i) for i in range(count)]
+
+
+# Correctness ----------------------------------------------------------------------------------------------------------------
+
+
+def errors(bench: Bench, num_envs: int, where: str) -> np.ndarray:
+    """Return the errors of all numbers read, each over the largest magnitude of its channel."""
+    exact, touch = TactileModule(bench.plan, dtype=torch.float64).to(where), bench.module()
+    wants: dict[str, list[np.ndarray]] = {}
+    founds: dict[str, list[np.ndarray]] = {}
+    for state in bench.states(num_envs, CALLS, seed=100):
+        for kept, readings in ((wants, exact(state.to(where, torch.float64))), (founds, touch(state.to(bench.device)))):
+            for name, value in readings.items():
+                kept.setdefault(name, []).append(value.double().cpu().numpy())
+    found, want = ({name: np.stack(kept) for name, kept in readings.items()} for readings in (founds, wants))
+    return full_scale_errors(exact.outputs, found, want)
+
+
+def full_scale_errors(outputs: Sequence[Output], found: Arrays, want: Arrays) -> np.ndarray:
+    """Return |found − want| (…, channel) of all readings over the largest |want| of each channel, flat.
+
+    Of a sensor's further readings, such as what of a force is missed, the scale is at least that of its other channels of the
+    same unit: they are differences, and may be next to nothing. The error is infinite where all should be 0 and is not.
+
+    Raises:
+        ValueError: If anything is not finite.
+    """
+    largest = {name: np.abs(value).reshape(-1, value.shape[-1]).max(axis=0) for name, value in want.items()}
+    errors = []
+    for output in outputs:
+        apart = np.abs(found[output.name] - want[output.name])
+        if not np.isfinite(apart).all():
+            raise ValueError(f"some of {output.name} is not finite, expected numbers")
+        alike = [o for o in outputs if o.sensor == output.sensor] if output.name != output.sensor else [output]
+        scale = largest[output.name].copy()
+        for other in alike:
+            for unit, size in zip(other.units, largest[other.name], strict=True):
+                is_alike = np.array(output.units) == unit
+                scale = np.where(is_alike & (other is not output), np.maximum(scale, size), scale)
+        scale = np.broadcast_to(scale, apart.shape)
+        errors.append(np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0).reshape(-1))
+    return np.concatenate(errors)
+
+
+# Times ----------------------------------------------------------------------------------------------------------------------
+
+
+def num_sets(num_bytes: float) -> int:
+    """Return how many sets of buffers of so many bytes are rotated."""
+    return min(max(2, math.ceil(ROTATED / num_bytes)), MOST_SETS)
+
+
+def synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def captured(call: Callable[[], Any], device: torch.device) -> Callable[[], None]:
+    """Return a call as a CUDA graph that keeps what it made; on a CPU as it is."""
+    if device.type != "cuda":
+        return call
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(2):
+            call()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph, stream=stream):
+        made = call()
+
+    def replay(_kept: Any = (call, made)) -> None:  # the graph reads and writes their memory, so they must live as long
+        graph.replay()
+
+    return replay
+
+
+def median_ms(call: Callable[[], Any], repeats: int, device: torch.device, batch: int = 5) -> float:
+    """Return the median time of a call [ms], of batches of them; on a GPU between CUDA events."""
+
+    def taken() -> float:
+        if device.type != "cuda":
+            start = time.perf_counter()
+            for _ in range(batch):
+                call()
+            return 1e3 * (time.perf_counter() - start)
+        events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+        events[0].record()
+        for _ in range(batch):
+            call()
+        events[1].record()
+        torch.cuda.synchronize()
+        return events[0].elapsed_time(events[1])
+
+    return median_of(taken, repeats) / batch
+
+
+def plain_ms(touch: TactileModule, states: list[SceneState], repeats: int, device: torch.device, batch: int = 20) -> float:
+    """Return the median time of a call of the module [ms], host and device, of batches that end when all is done."""
+    kept = deque(maxlen=8)  # kept, so that readings do not come to lie where the last ones were
+
+    def taken() -> float:
+        synchronize(device)
+        start = time.perf_counter()
+        for i in range(batch):
+            kept.append(touch(states[i % len(states)]))
+        synchronize(device)
+        return 1e3 * (time.perf_counter() - start)
+
+    return median_of(taken, repeats) / batch
+
+
+def median_of(taken: Callable[[], float], repeats: int) -> float:
+    """Return the median of times [ms] after one that does not count; of fewer, but three, once they add up to `LONG`."""
+    taken()
+    times: list[float] = []
+    while len(times) < repeats and not (sum(times) > LONG and len(times) >= 3):
+        times.append(taken())
+    return statistics.median(times)
+
+
+def copy_ms(num_bytes: int, repeats: int, device: torch.device) -> float:
+    """Return the median time [ms] of a copy that reads and writes so many bytes together, by the faster of two kernels."""
+    pairs = [torch.rand(2, max(num_bytes // 8, 1), device=device).unbind(0) for _ in range(num_sets(num_bytes))]
+    ways = (lambda: [to.copy_(of) for of, to in pairs], lambda: [torch.neg(of, out=to) for of, to in pairs])
+    return min(median_ms(captured(way, device), repeats, device) for way in ways) / len(pairs)
+
+
+def rotating(bench: Bench, touch: TactileModule, states: list[SceneState], count: int) -> list[tuple[Tensors, Tensors]]:
+    """Return sets of inputs and state, each in memory of its own; the state is what the module remembers."""
+    num_envs = next(value for value in vars(states[0]).values() if isinstance(value, Tensor)).shape[0]
+    dt = DT if "dt" in bench.plan.inputs.fields else None
+    sets = []
+    for i in range(count):
+        tensors = states[i % len(states)].checked(bench.plan.inputs, bench.device)
+        tensors = {name: value.roll(97 * (i // len(states)), 0) for name, value in tensors.items()}
+        if dt is not None:
+            tensors["dt"] = torch.tensor(dt, dtype=torch.float32, device=bench.device)
+        memory = touch.memory.tensors(num_envs, dt, torch.float32, bench.device)
+        sets.append((tensors, {name: value.clone() for name, value in memory.items()}))
+    return sets
+
+
+def transient_bytes(touch: TactileModule, state: SceneState, device: torch.device) -> int | None:
+    """Return the most memory that a plain call has for a while, readings included; None on a CPU."""
+    if device.type != "cuda":
+        return None
+    torch.cuda.synchronize()
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    touch(state)
+    torch.cuda.synchronize()
+    return torch.cuda.max_memory_allocated() - before
+
+
+def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Namespace) -> Row:
+    """Time one case at one number of environments."""
+    start = time.perf_counter()
+    case, device = bench.case, bench.device
+    size = bytes_of(TactileModule(bench.plan))
+    states = [state.to(device) for state in bench.states(num_envs, 4)]
+    touch = bench.module()
+    readings = [touch(state) for state in states][-1]
+    active = next(iter(readings.values()))
+    sets = rotating(bench, touch, states, options.sets or num_sets(num_envs * size.held))
+    graph = median_ms(captured(lambda: [bench.core(*one) for one in sets], device), options.repeats, device) / len(sets)
+    return Row(
+        case=case.name,
+        kind=case.kind,
+        noise=case.noise,
+        num_envs=num_envs,
+        num_taxels=size.num_taxels,
+        num_objects=case.num_objects,
+        points=case.points,
+        in_contact=float((active != 0).any(dim=-1).double().mean()),
+        error=float(np.quantile(error, 0.999, method="higher")),
+        error_largest=float(error.max()),
+        graph=graph,
+        plain=plain_ms(touch, states, options.repeats, device),
+        copy=copy_ms(num_envs * size.moved, options.repeats, device),
+        sets=len(sets),
+        moved=num_envs * size.moved,
+        per_taxel=size.per_taxel,
+        ring_per_taxel=size.ring_per_taxel,
+        anchors_per_taxel=size.anchors / size.num_taxels,
+        per_anchor=size.per_anchor,
+        transient=transient_bytes(touch, states[0], device),
+        seconds=time.perf_counter() - start,
+    )
+
+
+# Runs -----------------------------------------------------------------------------------------------------------------------
+
+
+def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
+    """Measure a case at each number of environments; one that fails is reported, and the others go on."""
+    torch.compiler.reset()
+    try:
+        bench = Bench.of(case, options)
+        with torch.no_grad():  # code is made for many environments, then checked on few
+            bench.module()(bench.states((options.envs or case.envs)[0], 1)[0].to(bench.device))
+            error = errors(bench, options.check_envs, options.exact_on)
+    except Exception:  # of one case: the others are wanted all the same
+        print(f"{case.name}: FAILED\n{traceback.format_exc()}", flush=True)
+        return
+    for num_envs in options.envs or case.envs:
+        try:
+            with torch.no_grad():
+                row = measure(bench, num_envs, error, options)
+        except Exception:
+            print(f"{case.name} × {num_envs}: FAILED\n{traceback.format_exc()}", flush=True)
+        else:
+            yield row
+        gc.collect()
+        if bench.device.type == "cuda":
+            torch.cuda.empty_cache()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure cases and write each row down; stop in time and say what is left."""
+    if options.warm:
+        warm(options)
+        return
+    if options.compile_only:
+        for name in options.rows:
+            bench = Bench.of(CASES[name], options)
+            with torch.no_grad():
+                bench.module()(bench.states((options.envs or bench.case.envs)[0], 1)[0].to(bench.device))
+        return
+    start, left = time.perf_counter(), []
+    where = torch.cuda.get_device_name() if options.device != "cpu" else "CPU"
+    versions = {"device": where, "torch": torch.__version__, "repeats": options.repeats}
+    print(f"torch {torch.__version__}, {where}, float32, medians of up to {options.repeats}; times [ms]\n{HEAD}", flush=True)
+    for name in options.rows:
+        if time.perf_counter() - start > 60 * options.minutes:
+            left.append(name)
+            continue
+        for row in rows_of(CASES[name], options):
+            print(row.line(), flush=True)
+            write(options.out, row, versions)
+    print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {' '.join(left)}" if left else ""))
+
+
+def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
+    """Add a row to a JSON file, in the place of that of the same measurement."""
+    kept = [other for other in load_rows([path]) if other.key != row.key] if path.exists() else []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**versions, "rows": [asdict(other) for other in (*kept, row)]}, indent=1))
+
+
+def warm(options: argparse.Namespace) -> None:
+    """Fill the compiler's cache, each case in a process of its own."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    own = [sys.executable, __file__, "run", str(options.folder), "--out", str(options.out), "--compile-only"]
+    own += ["--device", options.device, *(["--eager"] if options.eager else [])]
+    own += ["--envs", *map(str, options.envs)] if options.envs else []
+
+    def compile_one(name: str) -> str:
+        start = time.perf_counter()
+        done = subprocess.run([*own, "--rows", name], capture_output=True, text=True)
+        account = "" if done.returncode == 0 else f"  FAILED\n{done.stdout[-1500:]}{done.stderr[-1500:]}"
+        return f"{name:<32}{time.perf_counter() - start:7.1f} s{account}"
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for line in pool.map(compile_one, options.rows):
+            print(line, flush=True)
+    for path in Path(cache_dir()).rglob("*.best_config"):
+        path.unlink()  # chosen by timing while other processes ran
+
+
+def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    making = commands.add_parser("artefacts", help="compile all documents")
+    making.add_argument("folder", type=Path)
+    making.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
+    making.set_defaults(call=lambda options: make_artefacts(options.folder, [CASES[name] for name in options.rows]))
+    running = commands.add_parser("run", help="measure")
+    running.add_argument("folder", type=Path)
+    running.add_argument("--out", type=Path, required=True, help="JSON file; other rows of an earlier run are kept")
+    running.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
+    running.add_argument("--envs", nargs="+", type=int, help="these instead of each case's numbers of environments")
+    running.add_argument("--device", default="cuda")
+    running.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
+    running.add_argument("--repeats", type=int, default=30)
+    running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
+    running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
+    running.add_argument("--exact-on", default="cpu", help="where the float64 module runs")
+    running.add_argument("--minutes", type=float, default=math.inf, help="begin no case after so long")
+    running.add_argument("--warm", action="store_true", help="fill the compiler's cache, time nothing")
+    running.add_argument("--jobs", type=int, default=8, help="processes of --warm")
+    running.add_argument("--compile-only", action="store_true", help="compile the rows' cases in this process, time nothing")
+    running.set_defaults(call=run)
+    gpu_plots.add_commands(commands)
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    chosen = parsed()
+    chosen.call(chosen)

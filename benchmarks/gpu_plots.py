@@ -1,0 +1,363 @@
+"""What `gpu.py` measured: its rows, what is asked of them, the tables and the plots."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gpu_scenes import CASES, KNOBS, MAIN, artefact, bytes_of
+
+from tgdsl.artifact import load
+
+CLOSE = 1e-5
+"""Largest error that 99.9 % of all numbers may have, of full scale."""
+FEWER_TIMES = 6.0
+"""How many times less than the rival's a time is to be."""
+CLEAN_BYTES, NOISY_BYTES, ANCHOR_BYTES = 40.0, 120.0, 16.0
+"""Most bytes per taxel and environment without and with noise, and per point that an elastomer tracks."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case at one number of environments: sizes, errors of full scale, median times [ms], bytes.
+
+    Attributes:
+        in_contact: Share of taxels that read something.
+        error: What 99.9 % of all numbers stay within; the rest may be on the other side of a jump, such as a rounding step.
+        error_largest: The largest one.
+        graph: A call in a replayed CUDA graph.
+        plain: A call from Python.
+        copy: A copy of as many bytes as a call must move.
+        sets: Sets of buffers in the graph.
+        moved: What a call must move [bytes].
+        per_taxel: Readings and state per taxel and environment, less ring and anchors [bytes].
+        ring_per_taxel: The delay's ring per taxel and environment [bytes].
+        anchors_per_taxel: What an elastomer remembers of points or taxels that can hold on, per taxel and environment [bytes].
+        per_anchor: What is remembered per point or taxel that can hold on, and environment [bytes].
+        transient: Most memory that a plain call has for a while [bytes]; None where that was not measured.
+        seconds: How long it took to measure this.
+    """
+
+    case: str
+    kind: str
+    noise: str
+    num_envs: int
+    num_taxels: int
+    num_objects: int
+    points: int
+    in_contact: float
+    error: float
+    error_largest: float
+    graph: float
+    plain: float
+    copy: float
+    sets: int
+    moved: int
+    per_taxel: float
+    ring_per_taxel: float
+    anchors_per_taxel: float
+    per_anchor: float
+    transient: int | None
+    seconds: float
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Case and number of environments."""
+        return self.case, self.num_envs
+
+    @property
+    def rate(self) -> float:
+        """Taxels read per second, by graph replay."""
+        return 1e3 * self.num_envs * self.num_taxels / self.graph
+
+    def line(self) -> str:
+        """Return the row as text."""
+        target = TARGETS.get(self.key, Target())
+        asked = f"{shown(target.limit)}{shown(target.rival)}{judged(self, None).partition(':')[0]:>6}"
+        held = "" if self.transient is None else f"{self.transient / self.num_envs / self.num_taxels:9.1f}"
+        return (
+            f"{self.case:<30}{self.num_envs:>6} ×{self.num_taxels:>6}{self.in_contact:6.0%}{self.error:9.1e}"
+            f"{self.error_largest:9.1e}{self.graph:9.4f}{self.plain:9.4f}{self.copy:9.4f}{self.graph / self.copy:9.3g}{asked}"
+            f"{1e-6 * self.moved:9.1f}{self.per_taxel:8.1f}{self.ring_per_taxel:8.1f}{held}{self.seconds:7.1f} s"
+        )
+
+
+HEAD = (
+    f"{'case':<30}{'envs':>6} ×{'taxels':>6}{'felt':>6}{'99.9 %':>9}{'largest':>9}{'graph':>9}{'plain':>9}{'copy':>9}"
+    f"{'ratio':>9}{'limit':>9}{'rival':>9}{'met':>6}{'MB':>9}{'B/taxel':>8}{'ring':>8}{'peak':>9}"
+)
+
+
+# What is asked --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is asked of a row.
+
+    Attributes:
+        limit: Most time of a call in a graph [ms].
+        plain: Most time of a plain call [ms].
+        rival: What genesis-world 1.4.5 takes for one update of such a sensor on an H200 [ms].
+        times_clean: How many times the row "kinematic" of as many environments it may take.
+    """
+
+    limit: float | None = None
+    plain: float | None = None
+    rival: float | None = None
+    times_clean: float | None = None
+
+
+TARGETS: dict[tuple[str, int], Target] = {
+    ("depth", MAIN): Target(0.012, 0.08, 0.16),
+    ("kinematic", MAIN): Target(0.03, 0.08, 0.41),
+    ("kinematic-full", MAIN): Target(times_clean=3.0),
+    ("kinematic-10-objects", MAIN): Target(0.15, rival=0.41),
+    ("kinematic-5-sensors", MAIN): Target(0.14, rival=1.92),
+    ("kinematic-1000-taxels", MAIN): Target(0.28),
+    ("kinematic-1000-taxels", 20_480): Target(),
+    ("kinematic-10000-taxels", 1_024): Target(0.12, rival=2.17),
+    ("proximity", MAIN): Target(0.07, rival=0.48),
+    ("force", MAIN): Target(0.10),
+    ("elastomer-500-points", MAIN): Target(0.40, rival=2.58),
+    ("elastomer-1000-points", MAIN): Target(0.7),
+}
+"""Limits, in the order of the table; one without numbers is only to run."""
+
+
+def unmet(row: Row, clean: Row | None) -> list[str]:
+    """Return what of all that is asked of a row it does not reach, in words.
+
+    Args:
+        row: The row.
+        clean: The row that `times_clean` speaks of; None where it is not known, which counts as not reached.
+    """
+    target = TARGETS.get(row.key, Target())
+    most_bytes = CLEAN_BYTES if row.noise == "clean" else NOISY_BYTES
+    found = {
+        f"graph {row.graph:.4g} ms > {target.limit} ms": target.limit is not None and row.graph > target.limit,
+        f"plain {row.plain:.4g} ms > {target.plain} ms": target.plain is not None and row.plain > target.plain,
+        f"{row.per_taxel:.1f} B per taxel > {most_bytes:g} B": row.per_taxel > most_bytes,
+        f"{row.per_anchor:.1f} B per tracked point > {ANCHOR_BYTES:g} B": row.per_anchor > ANCHOR_BYTES,
+        f"error {row.error:.1e} > {CLOSE:.0e}": row.error > CLOSE,
+    }
+    if target.rival is not None:
+        less = target.rival / row.graph
+        found[f"{less:.1f} times less than the rival's, not {FEWER_TIMES:g}"] = less < FEWER_TIMES
+    if target.times_clean is not None:
+        ratio = None if clean is None else row.graph / clean.graph
+        said = "clean not measured" if ratio is None else f"{ratio:.2f} × clean > {target.times_clean:g} ×"
+        found[said] = ratio is None or ratio > target.times_clean
+    return [said for said, is_missed in found.items() if is_missed]
+
+
+def judged(row: Row, clean: Row | None) -> str:
+    """Return "yes", or "no" and why; a dash where no time is asked for, or that which it is compared with is not known."""
+    target = TARGETS.get(row.key)
+    if target is not None and target.times_clean is not None and clean is None:
+        return "–"
+    missed = unmet(row, clean)
+    if missed:
+        return f"no: {'; '.join(missed)}"
+    return "–" if target is None else "yes"
+
+
+def load_rows(paths: Iterable[Path]) -> list[Row]:
+    """Return the rows of JSON files; of two of the same measurement the later one."""
+    rows: dict[tuple[str, int], Row] = {}
+    for path in paths:
+        rows |= {row.key: row for row in (Row(**found) for found in json.loads(path.read_text())["rows"])}
+    return list(rows.values())
+
+
+# Tables ---------------------------------------------------------------------------------------------------------------------
+
+
+def shown(value: float | None) -> str:
+    """Return a number in a column of nine."""
+    return f"{'–':>9}" if value is None else f"{value:9.4g}"
+
+
+def limits_table(rows: list[Row]) -> list[str]:
+    """Return the markdown table of the rows that have limits."""
+    by_key = {row.key: row for row in rows}
+    heads = "error (largest) | graph, ms | limit, ms | met | plain, ms | MB moved | ratio to copy | rival, ms | times less"
+    lines = [f"| case | envs × taxels | {heads} |", f"|{'---|' * 11}"]
+    for key, target in TARGETS.items():
+        if key not in by_key:
+            lines.append(f"| {key[0]} | {key[1]:,} × | not measured |{' |' * 8}")
+            continue
+        row, clean = by_key[key], by_key.get(("kinematic", key[1]))
+        limit = f"{target.times_clean:g} × clean" if target.times_clean is not None else "–"
+        limit = f"{target.limit:g}" if target.limit is not None else limit
+        rival = "– | –" if target.rival is None else f"{target.rival:g} | {target.rival / row.graph:.1f}"
+        lines.append(
+            f"| {row.case} | {row.num_envs:,} × {row.num_taxels:,} | {row.error:.0e} ({row.error_largest:.0e}) "
+            f"| {row.graph:.4f} | {limit} | {judged(row, clean)} | {row.plain:.3f} | {1e-6 * row.moved:.1f} "
+            f"| {row.graph / row.copy:.2f} | {rival} |"
+        )
+    return lines
+
+
+def others_table(rows: list[Row]) -> list[str]:
+    """Return the markdown table of the other rows; what is asked of them all is the error and the bytes."""
+    heads = "error (largest) | graph, ms | plain, ms | MB moved | ratio to copy | bytes held | at once | not met"
+    lines = [f"| case | envs × taxels | {heads} |", f"|{'---|' * 10}"]
+    for row in (row for row in rows if row.key not in TARGETS):
+        at_once = "–" if row.transient is None else f"{row.transient / row.num_envs / row.num_taxels:.1f}"
+        lines.append(
+            f"| {row.case} | {row.num_envs:,} × {row.num_taxels:,} | {row.error:.0e} ({row.error_largest:.0e}) "
+            f"| {row.graph:.4f} | {row.plain:.3f} | {1e-6 * row.moved:.1f} | {row.graph / row.copy:.2f} "
+            f"| {row.per_taxel:.1f} | {at_once} | {'; '.join(unmet(row, None))} |"
+        )
+    return lines
+
+
+def table(options: argparse.Namespace) -> None:
+    """Print what was measured as markdown."""
+    for path in options.results:
+        kept = json.loads(path.read_text())
+        print(f"{kept['device']}, torch {kept['torch']}, float32, medians of up to {kept['repeats']}")
+    rows = load_rows(options.results)
+    print("", *limits_table(rows), "", *others_table(rows), sep="\n")
+
+
+def bytes_table(options: argparse.Namespace) -> None:
+    """Print per taxel and environment what every case gives out and remembers, as markdown."""
+    print(f"| case | readings | state | in all | delay's ring | per tracked point | moved per call |\n|{'---|' * 7}")
+    for case in CASES.values():
+        path = artefact(options.folder, case)
+        if path.exists():
+            size = bytes_of(load(path))
+            parts = (size.outputs, size.state, size.outputs + size.state)
+            per = " | ".join(f"{value / size.num_taxels:.1f}" for value in parts)
+            ring = f"{size.ring_calls} × {size.ring_entry / size.num_taxels:.1f}" if size.ring_calls else "–"
+            anchor = f"{size.per_anchor:.0f}" if size.num_anchors else "–"
+            print(f"| {case.name} | {per} | {ring} | {anchor} | {size.moved / size.num_taxels:.1f} |")
+
+
+# Plots ----------------------------------------------------------------------------------------------------------------------
+
+COLOURS = ("#1b7f4d", "#3b6fb6", "#b5542c", "#e0a03a", "#7a4fa3", "#c2315b", "#2b2f36", "#5aa7a7")
+RIVALS = {  # of the same GPU and scene: environments × taxels, ms
+    "contact_depth": (16_384, 100, 0.16),
+    "kinematic_taxel": (16_384, 100, 0.41),
+    "proximity": (16_384, 100, 0.48),
+    "elastomer": (16_384, 100, 2.58),
+}
+WIDE_RIVAL = (1_024, 10_000, 2.17)
+RIVAL_BYTES = 400.0
+"""What the rival holds, about, per taxel and environment."""
+Chosen = dict[str, list[Row]]
+
+
+def _by_envs(rows: list[Row]) -> Chosen:
+    names = [name for name, case in CASES.items() if len(case.envs) > 2 and case.num_taxels == 100]
+    return {name: sorted((row for row in rows if row.case == name), key=lambda row: row.num_envs) for name in names}
+
+
+def _by_taxels(rows: list[Row]) -> Chosen:
+    wanted = [r for r in rows if r.kind == "kinematic_taxel" and r.num_envs == 1_024 and r.num_objects == 1]
+    return {
+        f"kinematic, {noise}": sorted((r for r in wanted if r.noise == noise), key=lambda row: row.num_taxels)
+        for noise in ("clean", "noisy")
+    }
+
+
+def _by_objects(rows: list[Row]) -> Chosen:
+    wanted = [r for r in rows if r.kind == "kinematic_taxel" and r.noise == "clean" and r.num_envs == MAIN]
+    wanted = [r for r in wanted if r.num_taxels == 100]
+    return {"kinematic, clean": sorted(wanted, key=lambda row: row.num_objects)}
+
+
+def _by_points(rows: list[Row]) -> Chosen:
+    wanted = sorted((r for r in rows if r.points and r.noise == "clean" and r.num_envs == 1_024), key=lambda row: row.points)
+    return {kind: [row for row in wanted if row.kind == kind] for kind in ("elastomer", "proximity")}
+
+
+def throughput(rows: list[Row]) -> Any:
+    """Return the figure of taxels read per second, by environments, taxels, objects and points; crosses are the rival's."""
+    from matplotlib.figure import Figure
+
+    panels: list[tuple[str, Chosen, Callable[[Row], int]]] = [
+        ("environments", _by_envs(rows), lambda row: row.num_envs),
+        ("taxels, 1,024 environments", _by_taxels(rows), lambda row: row.num_taxels),
+        ("felt objects, 16,384 environments", _by_objects(rows), lambda row: row.num_objects),
+        ("points of each object, 1,024 environments", _by_points(rows), lambda row: row.points),
+    ]
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    for axes, (label, chosen, of) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        for (name, own), colour in zip(chosen.items(), COLOURS, strict=False):
+            axes.plot([of(r) for r in own], [r.rate for r in own], "o-", color=colour, markersize=4, label=name)
+            rival = RIVALS.get(own[0].kind) if own and label == "environments" and own[0].noise == "clean" else None
+            if rival is not None:
+                axes.plot(rival[0], 1e3 * rival[0] * rival[1] / rival[2], "x", color=colour, markersize=8)
+        if label.startswith("taxels") and any(chosen.values()):
+            axes.plot(WIDE_RIVAL[1], 1e3 * WIDE_RIVAL[0] * WIDE_RIVAL[1] / WIDE_RIVAL[2], "kx", markersize=8, label="rival")
+        scale = "log" if any(chosen.values()) else "linear"
+        axes.set(xscale=scale, yscale=scale, xlabel=label, ylabel="taxels read per second")
+        axes.grid(alpha=0.25, which="both")
+        if any(chosen.values()):
+            at = sorted({of(row) for own in chosen.values() for row in own})
+            axes.set_xticks(at, [f"{value:,}" for value in at])
+            axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
+            axes.legend(frameon=False, fontsize=8.5)
+    return figure
+
+
+def memory(rows: list[Row]) -> Any:
+    """Return the figure of bytes per taxel and environment, and what noise costs in time."""
+    from matplotlib.figure import Figure
+
+    main = {row.case: row for row in rows if row.num_envs == MAIN and row.num_taxels == 100}
+    names = [name for name, row in main.items() if row.noise in ("clean", "noisy", "full") and row.num_objects == 1]
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    starts = [0.0] * len(names)
+    for part, label, colour in (
+        ("per_taxel", "readings and state", COLOURS[1]),
+        ("anchors_per_taxel", "an elastomer's tracked points", COLOURS[0]),
+        ("ring_per_taxel", "the delay's ring", COLOURS[3]),
+    ):
+        sizes = [getattr(main[name], part) for name in names]
+        left.barh(names, sizes, left=starts, color=colour, label=label)
+        starts = [start + size for start, size in zip(starts, sizes, strict=True)]
+    left.axvline(RIVAL_BYTES, color="#888", linestyle="--", label="rival, about")
+    left.set(xlabel="bytes per taxel and environment", xlim=(0, 1.05 * RIVAL_BYTES))
+    if "kinematic" in main:
+        terms = [name for name in ("kinematic-noisy", "kinematic-full", *(f"kinematic-{k}" for k in KNOBS)) if name in main]
+        shares = [main[name].graph / main["kinematic"].graph for name in terms]
+        right.barh([name.removeprefix("kinematic-") for name in terms], shares, color=COLOURS[0])
+    right.axvline(1, color="#888")
+    right.set(xlabel="kinematic_taxel: time over that of clean, 16,384 environments")
+    for axes in (left, right):
+        axes.invert_yaxis()
+        axes.grid(alpha=0.25, axis="x")
+    left.legend(frameon=False, fontsize=8.5)
+    return figure
+
+
+def plot(options: argparse.Namespace) -> None:
+    """Draw what was measured."""
+    rows = load_rows(options.results)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, draw in {"gpu_throughput": throughput, "gpu_memory": memory}.items():
+        draw(rows).savefig(options.out / f"{name}.png", dpi=110)
+        print(options.out / f"{name}.png")
+
+
+def add_commands(commands: Any) -> None:
+    """Add `table`, `plot` and `bytes` to a command line."""
+    for name, call in {"table": table, "plot": plot}.items():
+        command = commands.add_parser(name, help=str(call.__doc__))
+        command.add_argument("results", type=Path, nargs="+", help="JSON files of `run`")
+        command.set_defaults(call=call)
+        if name == "plot":
+            command.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
+    counting = commands.add_parser("bytes", help=str(bytes_table.__doc__))
+    counting.add_argument("folder", type=Path)
+    counting.set_defaults(call=bytes_table)

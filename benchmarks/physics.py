@@ -1,0 +1,368 @@
+"""Physics and touch end to end: MuJoCo Warp steps thousands of environments, the module reads them; what does touch cost?
+
+    python benchmarks/physics.py artefacts out/physics                                # where documents can be compiled
+    python benchmarks/physics.py run out/physics --out out/physics.json [--warm]      # on the machine with the GPU
+    python benchmarks/physics.py plot out/physics.json --out docs/images/physics.png
+
+Scenes: the pyramid of ten cubes (examples/pyramid.yaml) and the XHand1 with a cube (examples/xhand1_palm.yaml) at 199 and 667
+taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo Warp and what `tgdsl.load` needs, no more.
+`run --warm` times nothing: it fills the caches of compiled kernels, all modules at once.
+
+A scene is first stepped once without sensors, and some instants are kept. From each of them every module's control step is
+timed again and again, in turn with one without sensors: physics does the same work each time. Times are medians by CUDA events:
+`plain` is the step without sensors (nor contact sensors in MuJoCo's model), `step` the same with touch in the same CUDA graph,
+`module` a graph of the module alone, on that state, and `read` one that gathers the state too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import statistics
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import torch
+from physics_scenes import MODULES, PLAIN, SCENES, Scene, artefact, make_artefacts
+from torch import Tensor
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.module import TactileModule
+from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.scene import scene_model
+
+# What is timed --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Row:
+    """One module at one number of environments; times [ms] of one control step, None where it could not be measured."""
+
+    scene: str
+    module: str
+    num_envs: int
+    substeps: int
+    num_taxels: int
+    plain: float
+    step: float
+    module_alone: float
+    read: float
+    contacts: float
+    fault: str = ""
+
+    def line(self) -> str:
+        """Return the row as text."""
+        rate, share = 1e3 * self.num_envs / self.step, (self.step - self.plain) / self.step
+        times = f"{self.plain:9.3f}{self.step:9.3f}{self.read:9.4f}{self.module_alone:9.4f}"
+        shares = f"{share:8.1%}{self.module_alone / self.step:8.2%}"
+        return f"  {self.num_envs:>6} {self.module:<28}{times}{rate:13,.0f}{shares}{self.contacts:10.1f}  {self.fault}"
+
+
+HEAD = (
+    f"  {'envs':>6} {'module':<28}{'plain':>9}{'step':>9}{'read':>9}{'module':>9}{'env-steps/s':>13}{'share':>8}{'module':>8}"
+)
+
+
+class Instants:
+    """States of a scene without sensors along a run, from which steps are timed."""
+
+    KEPT = ("time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl")
+
+    def __init__(self, sim: WarpSimulation, scene: Scene, count: int):
+        """Step the scene and keep instants: of the hand along a squeeze, of the pyramid while it settles."""
+        self._kept: list[dict[str, Tensor]] = []
+        model, device = sim.model, sim.arrays["qpos"].device
+        rest = squeeze = torch.zeros(model.nu, device=device)
+        if scene.keyframe is None:
+            generator = torch.Generator().manual_seed(0)
+            sim.arrays["qvel"].copy_(0.02 * torch.randn(sim.arrays["qvel"].shape, generator=generator))
+        else:
+            rest, squeeze = (
+                torch.tensor(model.key(name).ctrl, dtype=torch.float32, device=device) for name in ("rest", "squeeze")
+            )
+        strength = torch.linspace(0.3, 1.2, sim.num_envs, device=device)[:, None]
+        steps, every = (30, 5) if scene.keyframe is None else (60, 8)
+        for i in range(steps + every * count):
+            sim.step(rest + (squeeze - rest) * strength * min(1.0, i / steps))
+            if i >= steps and (i - steps) % every == 0:
+                self._kept.append({name: sim.arrays[name].clone() for name in self.KEPT})
+        if fault := fault_of(sim):
+            print(f"  {sim.num_envs} environments, while they settle: {fault}")
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def restore(self, i: int, sim: WarpSimulation) -> None:
+        """Put environments where they were."""
+        for name, value in self._kept[i].items():
+            sim.arrays[name].copy_(value)
+
+
+def interval(call: Callable[[], Any], device: torch.device) -> Callable[[], float]:
+    """Start a call; return what gives its time [ms] when all is done."""
+    if device.type == "cpu":
+        start = time.perf_counter()
+        call()
+        taken = 1e3 * (time.perf_counter() - start)
+        return lambda: taken
+    events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
+    events[0].record()
+    call()
+    events[1].record()
+    return lambda: events[0].elapsed_time(events[1])
+
+
+def synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+def replayed(call: Callable[[], Any], device: torch.device) -> Callable[[], Any]:
+    """Return a call as a CUDA graph; on a CPU as it is."""
+    if device.type == "cpu":
+        return call
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(3):
+            call()
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    gc.collect()
+    gc.disable()  # to free one of Warp's arrays would break the capture
+    try:
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            call()
+    finally:
+        gc.enable()
+    return lambda _inputs=call: graph.replay()  # the graph reads their memory, so they must live as long
+
+
+def median_of(call: Callable[[], Any], repeats: int, device: torch.device, batch: int = 10) -> float:
+    """Return the median time of a call [ms], of batches of them."""
+
+    def calls() -> None:
+        for _ in range(batch):
+            call()
+
+    calls()
+    times = [interval(calls, device) for _ in range(repeats)]
+    synchronize(device)
+    return statistics.median(taken() for taken in times) / batch
+
+
+def paired(plain: WarpSimulation, sim: WarpSimulation, instants: Instants, repeats: int) -> tuple[float, float]:
+    """Return the median times [ms] of a step without sensors and of one with them, taken in turn from the same instants."""
+    times: tuple[list[Callable[[], float]], list[Callable[[], float]]] = ([], [])
+    device = sim.arrays["qpos"].device
+    for own, call in ((plain, plain.step), (sim, sim.step_and_read)):
+        for _ in range(5):  # what the module remembers is made at the first, and the graph is captured two calls after that
+            instants.restore(0, own)
+            call()
+    for _ in range(repeats):
+        for i in range(len(instants)):
+            for own, call, kept in ((plain, plain.step, times[0]), (sim, sim.step_and_read, times[1])):
+                instants.restore(i, own)
+                kept.append(interval(call, device))
+    synchronize(device)
+    first, second = (statistics.median(taken() for taken in own) for own in times)
+    return first, second
+
+
+def simulation(touch: TactileModule, scene: Scene, num_envs: int, options: argparse.Namespace) -> WarpSimulation:
+    """Return environments of a scene; what goes wrong is asked for in the end, so that it does not disturb the timing."""
+    model = scene_model(touch.plan.scene)
+    if scene.is_pyramidal:
+        model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    keys: dict[str, Any] = {"nconmax": scene.nconmax, "njmax": scene.njmax, "graph": not options.eager}
+    keys |= {"substeps": scene.substeps, "keyframe": scene.keyframe, "model": model, "device": options.device}
+    sim = WarpSimulation(touch, num_envs, **keys)
+    if options.native_ccd:
+        sim.warp_model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    sim._worlds.faults.have_shown = lambda: False
+    return sim
+
+
+def fault_of(sim: WarpSimulation) -> str:
+    """Return what has gone wrong, in words."""
+    try:
+        sim.check()
+    except SimulationError as error:
+        return str(error)
+    return ""
+
+
+def measure(
+    name: str, module: str, compiled: TactileModule, plain: WarpSimulation, instants: Instants, options: argparse.Namespace
+) -> Row:
+    """Time one module on the environments of a simulator without sensors."""
+    scene, device = SCENES[name], torch.device(options.device)
+    touch = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
+    touch._compiled = compiled._compiled  # code for one number of environments serves for all
+    sim = simulation(touch, scene, plain.num_envs, options)
+    before, step = paired(plain, sim, instants, options.repeats)
+    fault = fault_of(sim)
+    contacts = int(sim.warp_data.nacon.numpy()[0]) / sim.num_envs
+    state = sim.state()
+    alone = median_of(replayed(lambda: touch(state), device), options.repeats, device)
+    read = median_of(replayed(lambda: touch(sim.state()), device), options.repeats, device)
+    rows = touch.outputs[0].shape[0] if module != "link_contact" else len(touch.taxels["s0"]["link"])
+    return Row(name, module, plain.num_envs, scene.substeps, rows, before, step, alone, read, contacts, fault)
+
+
+def run_scene(name: str, options: argparse.Namespace, versions: dict[str, str]) -> None:
+    """Time a scene's modules and write each down; one that fails is reported, and the others go on."""
+    scene, rows = SCENES[name], []
+    touch = tgdsl.load(artefact(options.folder, scene, PLAIN), device=options.device)
+    sims = {num_envs: simulation(touch, scene, num_envs, options) for num_envs in options.envs}
+    instants = {num_envs: Instants(sim, scene, options.instants) for num_envs, sim in sims.items()}
+    print(f"\n{name}: control steps of {scene.substeps} physics steps, times [ms], shares of the step\n{HEAD}", flush=True)
+    for module in [module for module in scene.modules if module in options.modules]:
+        torch.compiler.reset()
+        compiled = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
+        if not options.eager:
+            compiled.compile()
+        for num_envs in options.envs:
+            try:
+                with torch.no_grad():
+                    row = measure(name, module, compiled, sims[num_envs], instants[num_envs], options)
+            except Exception:  # of one module: the others are wanted all the same
+                print(f"  {num_envs:>6} {module}: FAILED\n{traceback.format_exc()}", flush=True)
+            else:
+                rows.append(row)
+                print(row.line(), flush=True)
+                write(options.out, rows, versions)
+            gc.collect()
+            if options.device != "cpu":
+                torch.cuda.empty_cache()
+
+
+def run(options: argparse.Namespace) -> None:
+    """Time scenes, each in a process of its own, and write what was measured."""
+    if options.warm:
+        warm(options)
+        return
+    if len(options.scenes) > 1:
+        for name in options.scenes:
+            subprocess.run([*command(options, [name], options.modules, options.envs), "--out", str(options.out)], check=False)
+        return
+    where = torch.cuda.get_device_name() if options.device != "cpu" else "CPU"
+    print(f"torch {torch.__version__}, MuJoCo {mujoco.__version__}, {where}, medians of {options.repeats}")
+    run_scene(options.scenes[0], options, {"torch": torch.__version__, "mujoco": mujoco.__version__, "device": where})
+
+
+def write(path: Path, rows: list[Row], versions: dict[str, str]) -> None:
+    """Write rows to a JSON file, in the place of those of the same measurements that it holds."""
+    kept = json.loads(path.read_text())["rows"] if path.exists() else []
+    done = {(row.scene, row.module, row.num_envs) for row in rows}
+    kept = [row for row in kept if (row["scene"], row["module"], row["num_envs"]) not in done]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**versions, "rows": kept + [asdict(row) for row in rows]}, indent=1))
+
+
+def command(options: argparse.Namespace, scenes: Sequence[str], modules: Sequence[str], envs: Sequence[int]) -> list[str]:
+    """Return the command line that runs some modules of some scenes."""
+    own = [sys.executable, "-u", __file__, "run", str(options.folder), "--device", options.device]
+    own += ["--native-ccd"] if options.native_ccd else []
+    own += ["--repeats", str(options.repeats), "--instants", str(options.instants), *(["--eager"] if options.eager else [])]
+    return [*own, "--scenes", *scenes, "--modules", *modules, "--envs", *map(str, envs)]
+
+
+def warm(options: argparse.Namespace) -> None:
+    """Compile all kernels: each module in a process of its own, some at a time, on few environments."""
+    scratch = options.out.with_suffix(".json")
+
+    def compile_one(job: tuple[str, str]) -> str:
+        out = scratch.with_stem("-".join((scratch.stem, *job)).replace(" ", "_").replace(",", ""))
+        own = [*command(options, [job[0]], [job[1]], [256]), "--out", str(out)]
+        start = time.perf_counter()
+        done = subprocess.run(own, capture_output=True, text=True)
+        out.unlink(missing_ok=True)
+        has_failed = done.returncode != 0 or "FAILED" in done.stdout
+        account = f"\n{done.stdout[-1500:]}{done.stderr[-1500:]}" if has_failed else "ok"
+        return f"{job[0]:<20}{job[1]:<28}{time.perf_counter() - start:7.1f} s  {account}"
+
+    wanted = {name: [m for m in SCENES[name].modules if m in options.modules] for name in options.scenes}
+    first = [(name, modules[0]) for name, modules in wanted.items()]  # physics, which all of a scene's modules share
+    rest = [(name, module) for name, modules in wanted.items() for module in modules[1:]]
+    for jobs in (first, rest):
+        with ThreadPoolExecutor(options.jobs) as pool:
+            for line in pool.map(compile_one, jobs):
+                print(line, flush=True)
+
+
+# The plot -------------------------------------------------------------------------------------------------------------------
+
+
+def plot(options: argparse.Namespace) -> None:
+    """Draw throughput against environments, and what touch adds to a step, one column per scene."""
+    from matplotlib.figure import Figure
+
+    rows = [Row(**row) for row in json.loads(options.results.read_text())["rows"]]
+    names = [name for name in SCENES if any(row.scene == name for row in rows)]
+    figure = Figure(figsize=(4.6 * len(names), 8.2), layout="constrained")
+    panels = figure.subplots(2, len(names), squeeze=False)
+    colours = [f"C{i % 10}" for i in range(len(MODULES))]
+    for column, name in enumerate(names):
+        own = [row for row in rows if row.scene == name]
+        envs = sorted({row.num_envs for row in own})
+        plain = [statistics.median(row.plain for row in own if row.num_envs == n) for n in envs]
+        panels[0, column].plot(envs, [1e3 * n / ms for n, ms in zip(envs, plain, strict=True)], "k--", label="no sensors")
+        for module, colour in zip(MODULES, colours, strict=True):
+            found = sorted((row for row in own if row.module == module), key=lambda row: row.num_envs)
+            at = [row.num_envs for row in found]
+            style = {"color": colour, "marker": "o" if MODULES[module][1] is None else "^", "markersize": 4}
+            panels[0, column].plot(at, [1e3 * row.num_envs / row.step for row in found], label=module, **style)
+            panels[1, column].plot(at, [100 * row.module_alone / row.step for row in found], **style)
+        panels[0, column].set(title=name, xscale="log", yscale="log", ylabel="environments' control steps per second")
+        panels[1, column].set(xscale="log", yscale="log", xlabel="environments", ylabel="the module's time, % of the step")
+        for panel in panels[:, column]:
+            panel.grid(alpha=0.25, which="both")
+            panel.set_xticks(envs, [f"{n:,}" for n in envs])
+            panel.minorticks_off()
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.out, dpi=110)
+
+
+def parsed() -> argparse.Namespace:
+    """Return the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    making = commands.add_parser("artefacts", help="compile all modules")
+    making.add_argument("folder", type=Path)
+    making.set_defaults(call=lambda options: make_artefacts(options.folder))
+    running = commands.add_parser("run", help="time them")
+    running.add_argument("folder", type=Path)
+    running.add_argument("--out", type=Path, required=True, help="JSON file; rows of an earlier run are kept")
+    running.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    running.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
+    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384])
+    running.add_argument("--device", default="cuda")
+    running.add_argument("--repeats", type=int, default=6, help="timed steps from each instant")
+    running.add_argument("--instants", type=int, default=4)
+    running.add_argument("--eager", action="store_true", help="neither compiled modules nor CUDA graphs")
+    running.add_argument("--native-ccd", action="store_true", help="boxes meet by MuJoCo Warp's own way, not by MuJoCo's")
+    running.add_argument("--warm", action="store_true", help="compile all kernels, time nothing")
+    running.add_argument("--jobs", type=int, default=6, help="processes of --warm")
+    running.set_defaults(call=run)
+    drawing = commands.add_parser("plot", help="draw what was measured")
+    drawing.add_argument("results", type=Path)
+    drawing.add_argument("--out", type=Path, default=Path("docs/images/physics.png"))
+    drawing.set_defaults(call=plot)
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    chosen = parsed()
+    chosen.call(chosen)
