@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 TORCH_INDEX ?=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench soak clean
 
 demo: $(READY)
 	@$(BIN)/tgdsl compile examples/xhand1_palm.yaml -o out/xhand1_palm.safetensors
@@ -25,6 +25,11 @@ lint: $(READY)
 
 bench: $(READY)
 	@$(BIN)/python benchmarks/module.py
+
+# Ten minutes of reading an emulated hand at the highest rate that its line allows; SOAK_SECONDS=60 for one.
+SOAK_SECONDS ?= 600
+soak: $(READY)
+	@$(BIN)/python benchmarks/hand_soak.py --seconds $(SOAK_SECONDS)
 
 clean:
 	rm -rf $(VENV) out

@@ -16,15 +16,27 @@ if TYPE_CHECKING:
     from tgdsl.artifact import save as save
     from tgdsl.compiler.pipeline import compile as compile
     from tgdsl.compiler.scene import instrument as instrument
-    from tgdsl.errors import ArtifactError, RobotError, SimulationError, SpecError, StateError, TgdslError
+    from tgdsl.errors import (
+        ArtifactError,
+        HandError,
+        ObservationError,
+        RobotError,
+        SimulationError,
+        SpecError,
+        StateError,
+        TgdslError,
+    )
     from tgdsl.module import TactileModule
     from tgdsl.runtime.batch import BatchSimulation
     from tgdsl.runtime.batch import simulate as simulate
+    from tgdsl.runtime.connect import connect as connect
     from tgdsl.state import SceneState
 
 _PLACES = {
     "ArtifactError": "errors",
     "BatchSimulation": "runtime.batch",
+    "HandError": "errors",
+    "ObservationError": "errors",
     "RobotError": "errors",
     "SceneState": "state",
     "SimulationError": "errors",
@@ -33,6 +45,7 @@ _PLACES = {
     "TactileModule": "module",
     "TgdslError": "errors",
     "compile": "compiler.pipeline",
+    "connect": "runtime.connect",
     "instrument": "compiler.scene",
     "load": "artifact",
     "save": "artifact",
@@ -42,6 +55,8 @@ _PLACES = {
 __all__ = [
     "ArtifactError",
     "BatchSimulation",
+    "HandError",
+    "ObservationError",
     "RobotError",
     "SceneState",
     "SimulationError",
@@ -50,6 +65,7 @@ __all__ = [
     "TactileModule",
     "TgdslError",
     "compile",
+    "connect",
     "instrument",
     "load",
     "save",
