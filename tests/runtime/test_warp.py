@@ -71,6 +71,26 @@ def test_poses_and_contacts_are_those_at_the_start_of_the_last_substep(tmp_path)
     assert sim.control_step == pytest.approx(0.008)
 
 
+@pytest.mark.parametrize(("sensor", "times"), [("", 1), ('<jointpos joint="one" nsample="2" delay=".002"/>', 4)])
+def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor, times):
+    """Contact sensors are read after the last substep alone; one that remembers earlier steps needs them all."""
+    touch = module(tmp_path)
+    spec = mujoco.MjSpec.from_string(SCENE.replace("</mujoco>", f"<sensor>{sensor}</sensor></mujoco>"))
+    tgdsl.instrument(spec, touch.inputs)
+    sim = warp(touch, 2, model=spec.compile(), keyframe="home", substeps=4)
+    plain_step, flags = sim._worlds._mjw.step, []
+
+    def step(model, data):
+        flags.append(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR))
+        plain_step(model, data)
+
+    monkeypatch.setattr(sim._worlds._mjw, "step", step)
+    sim.step()
+    assert [bool(flag) for flag in flags] == [times == 1] * 3 + [False]
+    assert not sim.warp_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    assert (sim.state().contact_found > 0).any()
+
+
 def test_a_resting_cube_weighs_what_it_weighs(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim = warp(touch, 2, model=model, substeps=200)

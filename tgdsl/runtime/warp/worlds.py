@@ -95,10 +95,17 @@ class Worlds:
     def step(self, num_steps: int) -> None:
         """Advance all environments by some physics steps: work for a `Replay`.
 
-        Poses, velocities and contacts are then those at the start of the last of them.
+        Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
+        some of them remember earlier steps.
         """
-        for _ in range(num_steps):
-            self._mjw.step(self.model, self.data)
+        whole = self.model.opt.disableflags
+        idle = whole if self.model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        try:
+            for i in reversed(range(num_steps)):
+                self.model.opt.disableflags = idle if i else whole
+                self._mjw.step(self.model, self.data)
+        finally:
+            self.model.opt.disableflags = whole
         self._is_stale.zero_()
         self.faults.update()
 
