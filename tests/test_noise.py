@@ -589,8 +589,8 @@ def test_gradients_pass_the_quantiser_and_are_gone_where_a_taxel_is_dead(build):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_envs", [4, 37])
-def test_compiled_equals_eager(build, monkeypatch, num_envs):
+def test_compiled_equals_eager(build, monkeypatch):
+    """At two numbers of environments: the second takes over the state of another module."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     sensors = {
         "s": {"noise": EVERY_KNOB, "rate": 60, "history": 3, "readout": "both"},
@@ -598,8 +598,16 @@ def test_compiled_equals_eager(build, monkeypatch, num_envs):
         "d": {"kind": "contact_depth", "noise": {"white_noise": 1e-4, "read_delay": 0.013}, "rate": 60},
     }
     torch.compiler.reset()
-    eager, compiled = build(torch.float32, **sensors), build(torch.float32, **sensors).compile()
-    for call in range(8):
+    eager, more, compiled = (build(torch.float32, **sensors) for _ in range(3))
+    compiled.compile()
+    agree_over_calls(compiled, eager, 4, range(8))
+    read(more, range(2), 37)
+    compiled.load_state_dict(more.state_dict())
+    agree_over_calls(compiled, more, 37, range(2, 8))
+
+
+def agree_over_calls(compiled, eager, num_envs, calls):
+    for call in calls:
         if call == 5:
             for touch in (eager, compiled):
                 touch.reset([1, 3])

@@ -1,6 +1,7 @@
 """The parser against a reference that sees whole streams, over random, damaged, cut and merged ones."""
 
 from itertools import pairwise
+from random import Random
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -60,10 +61,17 @@ def test_any_stream_cut_anywhere_reads_as_a_whole(stream, cuts):
 
 
 @pytest.mark.slow
-@given(STREAMS, CUTS)
-@settings(max_examples=100_000, deadline=None, suppress_health_check=list(HealthCheck))
-def test_a_hundred_thousand_streams_cut_anywhere(stream, cuts):
-    agrees(stream, cuts)
+@given(st.lists(PIECES, min_size=1, max_size=8), st.integers(0, 2**32))
+@settings(max_examples=5_000, deadline=None, suppress_health_check=list(HealthCheck))
+def test_a_hundred_thousand_streams_merged_mutated_and_cut(pieces, seed):
+    """Twenty streams of the same pieces each."""
+    random = Random(seed)
+    for _ in range(20):
+        stream = bytearray(b"".join(random.choices(pieces, k=random.randint(0, 5))))
+        for _ in range(random.randint(0, 3)):
+            at = random.randint(0, len(stream))
+            stream[at : at + random.randint(0, 4)] = random.randbytes(random.randint(0, 4))
+        agrees(bytes(stream), random.choices(range(3000), k=random.randint(0, 5)))
 
 
 @given(st.lists(FRAMES, max_size=20), CUTS)
