@@ -20,6 +20,16 @@ class Constants(nn.Module):
         for name, exact in self._exact.items():
             self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the floats."""
+        return next((b.dtype for b in self._buffers.values() if b is not None and b.is_floating_point()), torch.float32)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all arrays."""
+        return next(b.device for b in self._buffers.values() if b is not None)
+
     def __getitem__(self, name: str) -> Tensor:
         """Return the array of a path."""
         return self._buffers[name]  # type: ignore[return-value]

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from tgdsl.clock import Clock
 from tgdsl.errors import StateError
+from tgdsl.fusion import stored
 from tgdsl.plan import PlannedMemory, PlannedSensor
-from tgdsl.sensors.noise.instant import stored
 
 
 class Memory(nn.Module):
@@ -41,8 +41,7 @@ class Memory(nn.Module):
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call."""
-        held = [len(buffer) for buffer in self._buffers.values() if buffer is not None]
-        return held[0] if held else self.clock.num_envs
+        return next((len(buffer) for buffer in self._buffers.values() if buffer is not None), self.clock.num_envs)
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
@@ -56,7 +55,9 @@ class Memory(nn.Module):
         Raises:
             StateError: If dt is so short that a ring is too short.
         """
-        if self.is_wanted and self.num_envs is None:
+        if not self.is_wanted:
+            return {}
+        if self.num_envs is None:
             with torch.inference_mode(False):
                 for path, (_, _, planned) in self._planned.items():
                     shape = (num_envs, *_calls(planned, dt), *planned.shape)
@@ -94,7 +95,7 @@ def store(memory: dict[str, Tensor], updated: dict[str, Tensor]) -> None:
     with torch.no_grad():
         for name, value in updated.items():
             if value.ndim < memory[name].ndim:
-                (place,) = stored((memory["clock/step"] % memory[name].shape[1])[None])
+                place = stored(memory["clock/step"] % memory[name].shape[1])[None]
                 memory[name].index_copy_(1, place, value.detach()[:, None])
         for name, value in updated.items():
             if value.ndim == memory[name].ndim:

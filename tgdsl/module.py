@@ -132,12 +132,12 @@ class TactileModule(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the readings."""
-        return next((b.dtype for b in self.constants.buffers() if b.is_floating_point()), torch.float32)
+        return self.constants.dtype
 
     @property
     def device(self) -> torch.device:
         """Device of the readings."""
-        return next(self.constants.buffers()).device
+        return self.constants.device
 
     @property
     def has_state(self) -> bool:
@@ -147,7 +147,8 @@ class TactileModule(nn.Module):
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call, or if there is no state."""
-        return next((len(buffer) for buffer in self.histories.buffers()), self.memory.num_envs)
+        found = self.memory.num_envs
+        return next((len(buffer) for buffer in self.histories.buffers()), found) if len(self.histories) else found
 
     def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
         """Read all sensors.
@@ -161,14 +162,16 @@ class TactileModule(nn.Module):
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
         """
-        tensors = state.checked(self.inputs, self.device)
+        dtype, device = self.dtype, self.device
+        tensors = state.checked(self.inputs, device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
-        num_envs = tensors["body_pos"].shape[0]
-        if self.num_envs not in (None, num_envs):
-            raise StateError(f"this module holds the state of {self.num_envs} environments, the scene has {num_envs}")
-        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
-        readings = (self._compiled or self.advance)(tensors, memory)
+        num_envs, held = tensors["body_pos"].shape[0], self.num_envs
+        if held not in (None, num_envs):
+            raise StateError(f"this module holds the state of {held} environments, the scene has {num_envs}")
+        memory = self.memory.tensors(num_envs, state.dt, dtype, device)
+        found = (self._compiled or self.advance)(tensors, memory)
+        readings = {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
         return readings | {name: history.push(readings[name]) for name, history in self.histories.items()}  # type: ignore[operator]
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -185,7 +188,8 @@ class TactileModule(nn.Module):
             memory: State by `sensor:name`, each (env, …), and the clock's.
 
         Returns:
-            Readings by name, and the new state; of a ring, (env, call, …), what is new: (env, …).
+            Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
+            what is new: (env, …).
         """
         pairs = self._pairs(tensors)
         nows, knobs = self._circumstances(tensors, memory)

@@ -30,6 +30,9 @@ def read(
 ) -> tuple[dict[str, Float[Tensor, "env row channel"]], Tensors]:
     """Return a sensor's readings by name, and its new memory.
 
+    Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
+    fuses then has the equation write all channels side by side, and would else form them anew for each number of the noise.
+
     Args:
         sensor: The sensor.
         kind: Its kind.
@@ -48,13 +51,13 @@ def read(
     planes, new = [found[name] for name in sensor.signal], dict(new)
     signal = clean = torch.stack(planes, dim=1)
     if gain is not None and not kind.gains_depth:
-        signal = torch.stack([gain * plane for plane in planes], dim=1)
+        signal = gain[:, None] * clean
     if terms:
         past = {name.removeprefix("noise/"): value for name, value in memory.items() if name.startswith("noise/")}
         signal, noted = stages.disturb(signal, terms, knobs, past, now)
         new |= {f"noise/{name}": value for name, value in noted.items()}
     own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
-    readings: Tensors = {}
+    readings: Tensors = {f"{sensor.name}/signal": clean} if terms else {}
     for reading, which, made in zip(own, ("measured", "clean"), (signal, clean), strict=False):
         if now is not None and now.is_sample is not None:
             made = torch.where(now.is_sample[..., None], made, memory[f"sample/{which}"])

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from tgdsl.fusion import stored
 from tgdsl.sensors.noise import random
-from tgdsl.sensors.noise.instant import Now, Signal, stored
+from tgdsl.sensors.noise.instant import Now, Signal
 
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel to, taxel from): `kernel/0000` and so on, in the order of the taxels."""
@@ -24,7 +25,7 @@ def hysteresis(
     assert now.dt is not None
     ratio = now.dt / values["hysteresis_time"]
     ramp = torch.where(ratio > 0, -torch.expm1(-ratio) / torch.where(ratio > 0, ratio, 1.0), 1.0)
-    decay, ramp = stored(torch.exp(-ratio), ramp)
+    decay, ramp = stored(torch.exp(-ratio)), stored(ramp)
     lag = torch.where(now.age[..., None] == 0, 0.0, decay * memory["lag"] + ramp * (signal - memory["last"]))
     return signal + values["hysteresis_strength"] * lag, {"lag": lag, "last": signal}
 
@@ -59,10 +60,9 @@ def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now
     is_oldest = newer >= torch.clamp(now.age, max=length)
     start = torch.where(newer > 0, ages[(newer - 1).clamp(min=0)], 0.0)
     rest = (late - start) / (ages[newer.clamp(max=length - 1)] - start)
-    rest, is_now = stored(torch.where(is_oldest, 0.0, rest), (newer == 0).to(rest.dtype))
-    slots = stored((now.step - newer) % length, (now.step - newer - 1) % length)
-    after, before = (_entry(ring, slot) for slot in slots)
-    after = torch.where(is_now[:, None] > 0, signal, after)
+    rest, newer = stored(torch.where(is_oldest, 0.0, rest)), stored(newer)
+    after, before = (_entry(ring, stored((now.step - newer - k) % length)) for k in (0, 1))
+    after = torch.where(newer[:, None] == 0, signal, after)
     return torch.where(rest[:, None] > 0, after + rest[:, None] * (before - after), after)
 
 

@@ -39,15 +39,6 @@ class Now(NamedTuple):
     streams: Mapping[int, Stream]
 
 
-def stored(first: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-    """Return tensors of one shape unchanged: for a compiler that fuses, a place where they are kept and not formed anew.
-
-    What is drawn per environment would else be drawn for each number that it is used for. One tensor alone is kept beside its
-    negative: two that are the same would count as one, and not be kept.
-    """
-    return torch.stack((first, *(others or (-first,)))).unbind()[: 1 + len(others)]
-
-
 def uniform(now: Now, purpose: int, row: int, like: Tensor) -> Tensor:
     """Return a uniform number between 0 and 1 for each of the last axis of `like`: those of a row of a purpose, (env, …)."""
     count = like.shape[-1]

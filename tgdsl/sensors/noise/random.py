@@ -30,6 +30,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from tgdsl.fusion import stored
+
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 """What numbers are for: the first three are drawn at each step, the others at each reset."""
 
@@ -77,8 +79,7 @@ def streams(
         for half, own in enumerate(key.unbind()):
             word = mix(mix(env.to(torch.int32) ^ own) ^ counter.to(torch.int32))
             words.append(mix(word ^ mix((counter >> 32).to(torch.int32)) ^ PURPOSES[2 * purpose + half]))
-    # Stacked, they are stored once per environment; a compiler that fuses would else form them anew for every taxel.
-    kept = torch.stack(words, dim=1)[..., None].unbind(1)
+    kept = [stored(word)[:, None] for word in words]  # once per environment, not once per taxel
     return {purpose: Stream(kept[2 * i], kept[2 * i + 1]) for i, purpose in enumerate(purposes)}
 
 
