@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import tgdsl
 from sensors.scenes import module, state
 from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.compiler.quadrature import Pieces
 from tgdsl.errors import SpecError
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.query import MetPoints
@@ -303,6 +304,23 @@ def test_gradients_are_finite_at_first_touch_and_far_away(tmp_path, height):
         given.body_pos.requires_grad_()
         (gradient,) = torch.autograd.grad(touch(given)["s"].sum(), [given.body_pos])
         assert torch.isfinite(gradient).all()
+
+
+def test_points_that_are_near_follow_each_other(tmp_path):
+    """Each face of a cube is one run of the list, and most steps are no longer than a few spacings."""
+    pos = sampled(cube_on(tmp_path))
+    axis = np.abs(pos).argmax(axis=1)
+    is_new = np.diff(2 * axis + (pos[np.arange(NUM), axis] > 0)) != 0
+    assert is_new.sum() == 5
+    steps = np.linalg.norm(np.diff(pos, axis=0), axis=1)
+    assert np.quantile(steps, 0.8) < 2 * np.sqrt(6 * (2 * HALF) ** 2 / NUM)
+
+
+def test_the_order_changes_no_point():
+    corners = np.random.default_rng(0).normal(size=(20, 3, 3))
+    pieces = Pieces(corners, corners.mean(axis=1), corners[:, 0], np.ones(20))
+    plain, ordered = (sorted(draw(50, seed=3).pos.tolist()) for draw in (pieces.random, pieces.random_by_side))
+    assert plain == ordered
 
 
 VARIANTS = [

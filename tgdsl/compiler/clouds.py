@@ -50,7 +50,8 @@ class Cloud:
 def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:
     """Return points drawn alike from all of an object's outer surface [m], always the same ones, and its whole area [m²].
 
-    Kept in the user's cache folder.
+    Points that are near each other mostly follow each other, so that those in contact are in few runs. Kept in the user's cache
+    folder.
 
     Args:
         geoms: The geoms of one variant of an object, none of them a plane.
@@ -62,10 +63,10 @@ def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarr
 
     def make() -> tuple[np.ndarray, float]:
         pieces = outer_surface(geoms, max(AREA_RADIUS, max(map(_extent, geoms)) / FINENESS))
-        return pieces.random(count, seed=0).pos, float(pieces.area.sum())
+        return pieces.random_by_side(count, seed=0).pos, float(pieces.area.sum())
 
     return cache.cached(
-        moments_key(geoms, b"points", AREA_RADIUS, FINENESS, count),
+        moments_key(geoms, b"points side by side", AREA_RADIUS, FINENESS, count),
         make,
         lambda sampled: {"pos": sampled[0], "area": np.asarray(sampled[1])},
         lambda found: (found["pos"], float(found["area"])),

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from tgdsl.compiler.felt import FeltGeom
@@ -58,11 +58,13 @@ class Pieces:
     Attributes:
         corners: Their corners in the body's frame [m]; those of a primitive are chords of it.
         pos: The point of the true surface at the middle of each [m].
+        normal: Unit normal out of the object there.
         area: Surface that each stands for [m²].
     """
 
     corners: Float[np.ndarray, "f 3 3"]
     pos: Float[np.ndarray, "f 3"]
+    normal: Float[np.ndarray, "f 3"]
     area: Float[np.ndarray, " f"]
 
     def quadrature(self, spacing: float) -> Quadrature:
@@ -76,12 +78,26 @@ class Pieces:
 
     def random(self, count: int, seed: int) -> Quadrature:
         """Return points drawn alike from all of the surface, each standing for the same area."""
+        return Quadrature(self._drawn(count, seed)[0], np.full(count, self.area.sum() / count))
+
+    def random_by_side(self, count: int, seed: int) -> Quadrature:
+        """Return the points of `random` in an order in which neighbours are mostly near: side by side, each along a curve.
+
+        The six sides are what faces along one of the axes more than along the others; on each, points follow a Morton curve.
+        """
+        pos, piece = self._drawn(count, seed)
+        normal = self.normal[piece]
+        axis = np.abs(normal).argmax(axis=1)
+        faces_up = normal[np.arange(count), axis] > 0
+        return Quadrature(pos[np.lexsort((_morton(pos), faces_up, axis))], np.full(count, self.area.sum() / count))
+
+    def _drawn(self, count: int, seed: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+        """Return random points, and the piece that each is from."""
         rng = np.random.default_rng(seed)
         piece = rng.choice(len(self.area), count, p=self.area / self.area.sum())
         weight = rng.dirichlet((1.0, 1.0, 1.0), count)
         off = self.pos[piece] - self.corners[piece].mean(axis=1)
-        pos = (weight[:, :, None] * self.corners[piece]).sum(axis=1) + off
-        return Quadrature(pos, np.full(count, self.area.sum() / count))
+        return (weight[:, :, None] * self.corners[piece]).sum(axis=1) + off, piece
 
 
 def outer_surface(geoms: Sequence[FeltGeom], spacing: float) -> Pieces:
@@ -96,7 +112,7 @@ def outer_surface(geoms: Sequence[FeltGeom], spacing: float) -> Pieces:
     """
     solids = [_Geom.of(felt, spacing) for felt in geoms if felt.shape != "plane"]
     empty = np.zeros((0, 3))
-    parts = [(np.zeros((0, 3, 3)), empty, np.zeros(0)), *(_outer(i, solids, spacing) for i in range(len(solids)))]
+    parts = [(np.zeros((0, 3, 3)), empty, empty, np.zeros(0)), *(_outer(i, solids, spacing) for i in range(len(solids)))]
     return Pieces(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -141,12 +157,12 @@ class _Geom:
         return middle, np.where(is_inverted[:, None], -normal, normal)
 
 
-def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return corners, places and areas of the pieces of one geom that are on the outside of all."""
+def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray, ...]:
+    """Return corners, places, normals and areas of the pieces of one geom that are on the outside of all."""
     own, others = solids[i], [(j < i, other) for j, other in enumerate(solids) if j != i]
     corners, kept = own.corners, []
     while len(corners):
-        pos = own.on_surface(corners)[0]
+        pos, normal = own.on_surface(corners)
         side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         is_out, is_cut = np.ones(len(corners), bool), np.zeros(len(corners), bool)
         for is_earlier, other in others:
@@ -159,10 +175,9 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
         is_split = is_out & ((side > spacing) | is_cut)
         is_done = is_out & ~is_split
         done = corners[is_done]
-        kept.append((done, pos[is_done], 0.5 * np.linalg.norm(_cross(done), axis=1)))
+        kept.append((done, pos[is_done], normal[is_done], 0.5 * np.linalg.norm(_cross(done), axis=1)))
         corners = halved(corners[is_split])
-    corners, pos, area = (np.concatenate(part) for part in zip(*kept, strict=True))
-    return corners, pos, area
+    return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
 
 
 def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "4 f"]:
@@ -175,6 +190,15 @@ def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarra
         hidden = other.is_inside(pos + STEP * normal)
         found.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
     return np.array(found)
+
+
+def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Return the places of points on a Morton curve through 1024³ cubes: the bits of their three indices, interleaved."""
+    low = pos.min(axis=0)
+    size = max(float((pos - low).max()), 1e-30)
+    cube = (1023 / size * (pos - low)).astype(np.int64)
+    bit = np.arange(10)
+    return ((cube[:, :, None] >> bit & 1) << (3 * bit + np.arange(3)[:, None])).sum(axis=(1, 2))
 
 
 def _cross(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:

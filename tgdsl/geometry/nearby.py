@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.fusion import takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.moments import MomentField, Moments, PointCloud, cloud_moments, field_moments, plane_moments
 from tgdsl.geometry.planes import Rot, Vec
@@ -58,14 +59,24 @@ def with_moments(felt: Felt, pairs: Pairs, probes: Probes, sources: Sequence[Mom
     motions: dict[str, Motion] = {}
     for source in sources:
         own = slice(source.first_pair, source.first_pair + source.num_pairs)
-        rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
-        point = planes.add(planes.rotate(rotation, probes.pos), gathered(pairs.offset, own, source.pair))
-        moments = _moments(point, source)
-        found[source.name] = Moments(moments.mass, planes.rotate_back(rotation, moments.first))
+        found[source.name] = _felt_moments(pairs, own, probes, source)
         if pairs.motion is not None:
             linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
             motions[source.name] = Motion(linear, angular, turn)
     return felt._replace(moments=found, motions=motions, area={source.name: source.area for source in sources})
+
+
+def _felt_moments(pairs: Pairs, own: slice, probes: Probes, source: MomentSource) -> Moments:
+    """Return the moments of an object at the probes, in their links' frames."""
+    tensors = [source.radius, *probes.pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
+    if isinstance(source.surface, MomentField) and not source.planes and takes_kernel(*tensors):
+        from tgdsl.geometry.nearby_kernel import felt_moments
+
+        return felt_moments(pairs, own, probes.pos, source.pair, source.radius, source.shift, source.surface)
+    rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
+    point = planes.add(planes.rotate(rotation, probes.pos), gathered(pairs.offset, own, source.pair))
+    moments = _moments(point, source)
+    return Moments(moments.mass, planes.rotate_back(rotation, moments.first))
 
 
 def _moments(point: Vec, source: MomentSource) -> Moments:

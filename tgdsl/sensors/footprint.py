@@ -34,9 +34,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.fusion import takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 
@@ -46,6 +47,8 @@ LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
 DAMPING = 0.1
 """What a step of β counts beside its effect on the shares [1]: it bounds steps where taxels of hardly any share decide."""
+FAR = 1e3
+"""Where a kernel that does not know of inactive taxels has them [m]: beyond all contacts' reach."""
 NO_FORCE = 1e-12
 """Force [N] below which a direction fades to zero."""
 
@@ -101,6 +104,82 @@ def footprint(
         for part, g in zip(torque, lever, strict=True)
     )
     return Footprint(captured[..., None] * share, left)
+
+
+class Bodies(NamedTuple):
+    """Which taxels each body has: they stand one body after the other.
+
+    Attributes:
+        taxel: Taxels of each body; a body with fewer than another repeats its first.
+        inverse_radius: 1/R of each [1/m], 0 for inactive ones and those repeated.
+        row: Place of each taxel in these, flattened.
+        first: First taxel of each body, and the number of all.
+    """
+
+    taxel: Int[Tensor, "body padded"]
+    inverse_radius: Float[Tensor, "body padded"]
+    row: Int[Tensor, " taxel"]
+    first: Int[Tensor, " bodies_and_one"]
+
+
+class Shared(NamedTuple):
+    """What contacts' forces become.
+
+    Attributes:
+        force: Force on each taxel, Σ_c γ_c λ_cj f_c [N], planes (env, taxel).
+        carried: Their sum over each body's taxels [N], planes (env, body).
+        residual: What they leave of the moment [N·m], likewise.
+    """
+
+    force: Vec
+    carried: Vec
+    residual: Vec
+
+
+def shared_forces(
+    bodies: Bodies,
+    pos: Vec,
+    depth: Float[Tensor, "env taxel"],
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    radius: Float[Tensor, " body"],
+    levenberg: Float[Tensor, " iteration"],
+) -> Shared:
+    """Share out the contacts of all bodies.
+
+    Args:
+        bodies: Which taxels each body has.
+        pos: Taxel positions [m], planes (taxel,).
+        depth: Depth of each probe [m].
+        point: Contact points [m], planes (env, body, contact).
+        force: Forces on the body [N].
+        torque: Torques on the body at the contact points [N·m].
+        radius: Radius of a footprint r_f [m].
+        levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
+    """
+    taxel, inverse_radius = bodies.taxel, bodies.inverse_radius
+    if takes_kernel(depth, *point, *force, *torque):
+        from tgdsl.sensors import footprint_kernel
+
+        own = inverse_radius.flatten()[bodies.row]
+        weight = depth * own + UNREACHED
+        place = torch.where(own[:, None] > 0, torch.stack(pos, dim=-1), FAR)
+        shared, sums = footprint_kernel.shared_forces(place, weight, point, force, torque, radius, levenberg, bodies.first)
+        return Shared(planes.vec(shared.unbind()), planes.vec(sums[:3].unbind()), planes.vec(sums[3:].unbind()))
+    share, residual = footprint(
+        planes.vec(part[taxel] for part in pos),
+        inverse_radius > 0,
+        depth[:, taxel] * inverse_radius,
+        point,
+        force,
+        torque,
+        radius,
+        levenberg,
+    )
+    padded = planes.vec((share * part[..., None]).sum(dim=2) for part in force)
+    each = planes.vec(part.flatten(1)[:, bodies.row] for part in padded)
+    return Shared(each, planes.vec(part.sum(dim=2) for part in padded), residual)
 
 
 def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:

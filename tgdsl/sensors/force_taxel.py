@@ -105,14 +105,16 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
     """Pad the taxels of each body to the same number, with inactive ones, so that all bodies are one batch."""
     is_active = layout.radius > 0
     counts = np.bincount(layout.body_id)
-    rank = np.arange(layout.num_taxels) - (np.cumsum(counts) - counts)[layout.body_id]
-    taxel = np.repeat((np.cumsum(counts) - counts)[:, None], counts.max(), axis=1)  # padding repeats the body's own first taxel
+    first = np.concatenate([[0], np.cumsum(counts)])
+    taxel = np.repeat(first[:-1, None], counts.max(), axis=1)  # padding repeats the body's own first taxel
+    rank = np.arange(layout.num_taxels) - first[layout.body_id]
     inverse_radius = np.zeros(taxel.shape)
     taxel[layout.body_id, rank] = np.arange(layout.num_taxels)
     inverse_radius[layout.body_id, rank] = np.where(is_active, 1.0 / np.where(is_active, layout.radius, 1.0), 0.0)
     constants = {
         "taxel": taxel,
         "inverse_radius": inverse_radius,
+        "first": first,
         "row": layout.body_id * counts.max() + rank,
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
@@ -136,26 +138,24 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     """Return the force planes [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
     contacts = felt.contacts
     assert contacts is not None
-    taxel, inverse_radius = constants["taxel"], constants["inverse_radius"]
-    shared = footprint.footprint(
-        planes.vec(part[taxel] for part in probes.pos),
-        inverse_radius > 0,
-        felt.depth[:, taxel] * inverse_radius,
+    bodies = footprint.Bodies(constants["taxel"], constants["inverse_radius"], constants["row"], constants["first"])
+    shared = footprint.shared_forces(
+        bodies,
+        probes.pos,
+        felt.depth,
         contacts.pos,
         contacts.force,
         contacts.torque,
         constants["footprint"],
         constants["levenberg"],
     )
-    padded = planes.vec((shared.share * part[..., None]).sum(dim=2) for part in contacts.force)
-    missed = planes.vec(net - part.sum(dim=2) for net, part in zip(contacts.net, padded, strict=True))
-    force = planes.vec(part.flatten(1)[:, constants["row"]] for part in padded)
+    missed = planes.sub(contacts.net, shared.carried)
     readings: dict[str, Tensor] = {}
-    for name, vector in {"force": force, "missed": missed, "residual": shared.residual}.items():
+    for name, vector in {"force": shared.force, "missed": missed, "residual": shared.residual}.items():
         readings |= {f"{name}_{axis}": plane for axis, plane in zip("xyz", vector, strict=True)}
     if "inward" in constants:
         inward = planes.vec(constants["inward"])
-        readings["pressure"] = planes.dot(force, inward).clamp(min=0)
+        readings["pressure"] = planes.dot(shared.force, inward).clamp(min=0)
     return readings, {}
 
 

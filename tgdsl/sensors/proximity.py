@@ -140,7 +140,9 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
             slip = planes.add(slip, _slip(felt, name, probes, constants["is_absolute"]))
     area = constants["area"] if "area" in constants else sum(felt.area.values(), start=zero[:1, :1])
     stiffness, damping = constants["stiffness"] / area, constants["damping"] / area
-    slip = planes.sub(slip, planes.scale(planes.dot(slip, normal), normal))
+    # Less its part along the normal. Without the inner product, which all three components would share, a compiler that fuses
+    # computes all channels in one pass; it would else compute each of them for every number of a reading.
+    slip = planes.cross(planes.cross(normal, slip), normal)
     force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
     torque = planes.scale(stiffness, planes.cross(first, normal))
     if "about_link" in constants:

@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.query import MetPoints
@@ -54,27 +55,28 @@ def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> 
     """Return what the points of each object pull with, and the new anchors."""
     pulls, after, start = [], {name: [] for name in PLANES}, 0
     for points in met:
-        shape = points.distance.shape[1:]
-        end = start + shape[0] * shape[1]
-        x, y, z, held = (state[name][:, start:end].unflatten(1, shape) for name in PLANES)
+        place = planes.vec(map(stored, points.pos))
+        # Flat as the state is: a compiler then reads and writes that in one loop.
+        distance = points.distance.flatten(1)
+        pos, gradient = (planes.vec(part.flatten(1) for part in vector) for vector in (place, points.gradient))
+        end = start + distance.shape[1]
+        x, y, z, held = (state[name][:, start:end] for name in PLANES)
         anchor, start = (x, y, z), end
-        is_held = (held > 0) & ~(points.distance > law.reach + law.exit)
-        depth = torch.relu(law.reach - points.distance)
+        is_held = (held > 0) & ~(distance > law.reach + law.exit)
+        depth = torch.relu(law.reach - distance)
         zero = torch.zeros_like(depth)
-        moved = planes.where(is_held, planes.sub(points.pos, anchor), (zero, zero, zero))
+        moved = planes.where(is_held, planes.sub(pos, anchor), (zero, zero, zero))
         if law.slip is not None:
-            stretch = planes.sub(moved, planes.scale(planes.dot(moved, points.gradient), points.gradient))
+            stretch = planes.sub(moved, planes.scale(planes.dot(moved, gradient), gradient))
             kept, slides = capped(stretch, law.slip * depth)
             slid = planes.sub(stretch, kept)
             moved, anchor = planes.sub(moved, slid), planes.where(slides, planes.add(anchor, slid), anchor)
-        is_taken = ~is_held & (law.reach - points.distance > law.enter)
-        taken = planes.where(is_held, anchor, planes.where(is_taken, points.pos, (zero, zero, zero)))
-        parts = (*points.pos, *planes.scale(depth, moved), *taken, (is_held | is_taken).to(zero.dtype))
-        # Stacked, they are stored once per point; a compiler that fuses would else form them anew for every marker.
-        stored = torch.stack(parts, dim=1).unbind(1)
-        pulls.append(Pull(planes.vec(stored[:3]), planes.vec(stored[3:6])))
-        for name, plane in zip(PLANES, stored[6:], strict=True):
-            after[name].append(plane.flatten(1))
+        is_taken = ~is_held & (law.reach - distance > law.enter)
+        taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
+        shape = points.distance.shape[1:]
+        pulls.append(Pull(place, planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))))
+        for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
+            after[name].append(plane)
     return pulls, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}
 
 
@@ -96,6 +98,10 @@ def drag(met: Sequence[MetPoints], pulls: Sequence[Pull], markers: Markers, num_
 
 def _summed(pull: Pull, markers: Markers) -> Vec:
     """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of one link's markers; point planes (env, point)."""
+    if takes_kernel(*pull.pos, *pull.strength, markers.falloff):
+        from tgdsl.sensors.elastomer.point_sum_kernel import point_sum
+
+        return planes.vec(point_sum(pull.pos, pull.strength, markers.pos, markers.normal, markers.falloff).unbind())
     num_envs, num = pull.pos[0].shape
     # A compiler fuses kernel and sum into one loop, whatever the length.
     step = num if torch.compiler.is_compiling() else BLOCK

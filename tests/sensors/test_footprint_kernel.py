@@ -1,0 +1,119 @@
+"""The kernel that shares out contacts, by Triton's interpreter on the CPU, against the torch code in float64."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tgdsl.fusion import HAS_TRITON
+from tgdsl.sensors.footprint import FAR, LEVENBERG, UNREACHED, Bodies, shared_forces
+
+RADIUS = 0.01
+TOLERANCE = 1e-5
+"""Of the largest force, and of that times a footprint: steps in float32, from differences of moments."""
+
+pytestmark = pytest.mark.skipif(not HAS_TRITON, reason="needs Triton")
+
+
+def pad(num=4):
+    line = (np.arange(num) - (num - 1) / 2) * 0.005
+    x, y = np.meshgrid(line, line, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), 0.001 * np.cos(300 * x.ravel())])
+
+
+def grip(rng, num_envs, num_contacts, pads, half=0.012, steps=2):
+    """Return the arguments of a case: contacts spread over the pads, some without a force, some taxels inactive."""
+    shape = (num_envs, len(pads), num_contacts)
+    point = np.stack([*rng.uniform(-half, half, (2, *shape)), rng.uniform(-0.001, 0.001, shape)])
+    force = rng.uniform(0.2, 1.0, shape) * np.stack([*rng.uniform(-0.5, 0.5, (2, *shape)), -np.ones(shape)])
+    torque = 2e-4 * rng.normal(size=(3, *shape))
+    is_none = rng.random(shape) < 0.3
+    force[:, is_none] = torque[:, is_none] = 0
+    pos = np.concatenate(pads).T
+    is_active = rng.random(pos.shape[1]) < 0.9
+    depth = rng.uniform(0, 0.002, (num_envs, pos.shape[1])) * (rng.random((num_envs, pos.shape[1])) < 0.7)
+    radius = np.linspace(RADIUS, 1.3 * RADIUS, len(pads))
+    counts = np.array([len(each) for each in pads])
+    return bodies_of(counts, is_active), pos, depth, point, force, torque, radius, np.full(steps, LEVENBERG)
+
+
+def bodies_of(counts, is_active):
+    """Return the padded taxels of bodies with so many each, all of a radius of 2 mm."""
+    first = np.concatenate([[0], np.cumsum(counts)])
+    rank = np.arange(first[-1]) - np.repeat(first[:-1], counts)
+    body = np.repeat(np.arange(len(counts)), counts)
+    taxel = np.repeat(first[:-1, None], counts.max(), axis=1)
+    inverse_radius = np.zeros(taxel.shape)
+    taxel[body, rank] = np.arange(first[-1])
+    inverse_radius[body, rank] = is_active / 0.002
+    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first)))
+
+
+def cases():
+    rng = np.random.default_rng(0)
+    found = {
+        "one environment": grip(rng, 1, 8, [pad(3)], steps=4),
+        "several bodies": grip(rng, 9, 3, [pad(3), pad(2)[:3], pad(2)[:1]]),
+        "at the edge": grip(rng, 8, 4, [pad()], half=0.03),
+        "by depth alone": grip(rng, 3, 2, [pad(3)], steps=0),
+        "no contacts": grip(rng, 3, 0, [pad(3)]),
+        "all beyond reach": grip(rng, 3, 4, [pad(3) + 1.0]),
+        "a row": grip(rng, 5, 4, [pad(5)[2::5]]),
+        "many steps": grip(rng, 3, 2, [pad(2)], half=0.015, steps=13),
+        "no force": grip(rng, 3, 5, [pad(2)], steps=1),
+        "not a number": grip(rng, 7, 6, [pad(3), pad(2)], steps=1),
+    }
+    found["no force"][4][:] = 0
+    found["no force"][5][:] = 0
+    depth, point, force, torque = found["not a number"][2:6]
+    depth[0, 1] = point[0, 2, 0, 1] = point[2, 3, 1, 5] = force[1, 4, 1, 2] = torque[2, 5, 0, 5] = np.nan
+    force[:, 2], torque[:, 2] = 0, 0
+    force[:, 6], torque[:, 6], depth[6, 10] = 0, 0, np.nan
+    return found
+
+
+def by_torch(case):
+    bodies, pos, depth, *rest = case
+    planes = [tuple(torch.tensor(value)) for value in rest[:3]]
+    return shared_forces(bodies, tuple(torch.tensor(pos)), torch.tensor(depth), *planes, *map(torch.tensor, rest[3:]))
+
+
+def by_kernel(case):
+    """Return what `shared_forces` does; needs an interpreted Triton."""
+    from tgdsl.sensors import footprint_kernel
+
+    bodies, pos, depth, *rest = case
+    own = bodies.inverse_radius.flatten()[bodies.row]
+    weight = torch.tensor(depth) * own + UNREACHED
+    place = torch.where(own[:, None] > 0, torch.tensor(pos).T, FAR)
+    planes = [tuple(torch.tensor(value, dtype=torch.float32)) for value in rest[:3]]
+    radius, levenberg = (torch.tensor(value, dtype=torch.float32) for value in rest[3:])
+    arguments = (place.float(), weight.float(), *planes, radius, levenberg, bodies.first)
+    shared, sums = footprint_kernel.launch(footprint_kernel.kernel, *arguments)
+    return shared, sums[:3], sums[3:]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """Results of all cases by the interpreter, which has to be chosen before Triton is imported."""
+    path = tmp_path_factory.mktemp("kernel") / "found.pt"
+    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    subprocess.run([sys.executable, __file__, str(path)], env=environment, check=True, cwd=Path(__file__).parent)
+    return torch.load(path)
+
+
+@pytest.mark.parametrize("name", cases())
+def test_the_kernel_is_the_torch_code(found, name):
+    case = cases()[name]
+    expected = by_torch(case)
+    largest = max(1.0, float(np.nanmax(np.abs(case[4]), initial=0.0)))
+    for part, planes, scale in zip(found[name], expected, (1, 1, RADIUS), strict=True):
+        torch.testing.assert_close(part.double(), torch.stack(planes), rtol=0, atol=TOLERANCE * scale * largest, equal_nan=True)
+
+
+if __name__ == "__main__":
+    torch.save({name: by_kernel(case) for name, case in cases().items()}, sys.argv[1])

@@ -1,0 +1,112 @@
+"""The kernel that sums over points, by Triton's interpreter on the CPU, against the torch code that it stands in for."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from tgdsl.fusion import HAS_TRITON
+from tgdsl.geometry.planes import Vec, vec
+from tgdsl.sensors.elastomer.point_anchors import Markers, Pull, _summed
+
+pytestmark = pytest.mark.skipif(not HAS_TRITON, reason="triton is not installed")
+TOLERANCE = 1e-5
+"""Of the largest sum: what float32 leaves of positions of some centimetres and of a few hundred terms."""
+FALLOFF = 2000.0
+CASES = {
+    "one": (1, 1, 1, 1.0),
+    "few": (3, 7, 5, 0.5),
+    "a group that is not full": (2, 41, 33, 0.3),
+    "two chunks, a block that is not full": (2, 300, 100, 0.2),
+    "two blocks": (2, 70, 150, 1.0),
+    "nothing pulls": (2, 50, 40, 0.0),
+}
+"""Environments, points, markers, and which part of the points pulls."""
+
+
+def given(num_envs: int, num_points: int, num_markers: int, share: float) -> tuple[Pull, Markers]:
+    """Return points in float32 that pull in runs, and markers with normals all around, both signs of z among them."""
+    random = torch.Generator().manual_seed(num_points)
+
+    def drawn(scale: float, *shape: int) -> Vec:
+        return vec(scale * torch.randn(shape, generator=random) for _ in range(3))
+
+    start = torch.randint(num_points, (num_envs, 1), generator=random)
+    pulls = (torch.arange(num_points) - start) % num_points < share * num_points
+    strength = vec(part * pulls for part in drawn(1e-7, num_envs, num_points))
+    normal = torch.nn.functional.normalize(torch.stack(drawn(1.0, num_markers)), dim=0)
+    normal[:, 0] = torch.tensor([0.0, 0.0, -1.0])
+    markers = Markers(drawn(0.03, num_markers), vec(normal.unbind()), torch.tensor(FALLOFF), None)
+    return Pull(drawn(0.03, num_envs, num_points), strength), markers
+
+
+def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
+    pos, strength, marker, normal = ([part.double() for part in planes] for planes in (*pull, markers.pos, markers.normal))
+    exact = Markers(vec(marker), vec(normal), markers.falloff.double(), None)
+    return torch.stack(_summed(Pull(vec(pos), vec(strength)), exact))
+
+
+def main() -> None:
+    """Print the results of all cases, as a process that interprets kernels."""
+    from tgdsl.sensors.elastomer.point_sum_kernel import kernel, launch
+
+    def run(pull: Pull, markers: Markers) -> torch.Tensor:
+        return launch(kernel, *pull, markers.pos, markers.normal, markers.falloff)
+
+    found = {}
+    for name, case in CASES.items():
+        pull, markers = given(*case)
+        expected = in_double(pull, markers)
+        found[name] = float((run(pull, markers) - expected).abs().max() / expected.abs().max().clamp(min=1e-12))
+
+    pull, markers = given(3, 20, 10, 0.5)
+    wide = Pull(*(vec(torch.stack([0 * part, part], dim=1)[:, 1] for part in planes) for planes in pull))
+    found["rows apart"] = float((run(wide, markers) - run(pull, markers)).abs().max())
+
+    pull.pos[1][0] = torch.nan  # a pose
+    pull.strength[2][1, 13] = torch.nan
+    for part in pull.strength:
+        part[0] = 0
+    isnan = run(pull, markers).isnan()
+    found["not a number"] = [
+        isnan[:, 0].all().item(),
+        isnan[:2, 1].any().item(),
+        isnan[2, 1].all().item(),
+        isnan[:, 2].any().item(),
+    ]
+    found["no environment"] = list(run(*given(0, 20, 10, 0.5)).shape)
+    print(json.dumps(found))
+
+
+@pytest.fixture(scope="module")
+def found() -> dict:
+    environment = os.environ | {"TRITON_INTERPRET": "1"}
+    done = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_kernel_is_the_sum(found, name):
+    assert found[name] < TOLERANCE
+
+
+def test_rows_may_lie_apart(found):
+    """As those of one link of several do."""
+    assert found["rows apart"] == 0
+
+
+def test_not_a_number_comes_out(found):
+    """Of a pose, though nothing pulls; of a strength in its own component; and of no other environment."""
+    assert found["not a number"] == [True, False, True, False]
+
+
+def test_no_environment_is_nothing(found):
+    assert found["no environment"] == [3, 0, 10]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,380 @@
+"""The sharing out of `footprint` as one Triton kernel, for a GPU in float32 without derivatives.
+
+A program takes one body in a block of environments. Its lanes hold contacts, and the taxels come one after the other: sums over
+taxels need no exchange between lanes. A pass over the taxels sums the moments of the arms x_j − x_c; the mean and covariance of
+the levers g follow from those, as g is linear in the arm. Groups of contacts that are all empty are passed over.
+
+Covariances are differences of moments about the contact: where few taxels are in reach, all of them on one side of it, float32
+keeps fewer digits than in the torch code, and forces differ by up to 3·10⁻⁵ of the largest.
+
+Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.library import triton_op, wrap_triton
+
+ENVS = 8
+"""Environments of a program, which is one warp: a lane for each of their contacts of a group."""
+GROUP = 4
+"""Contacts of a body that are looked at together; `_each` counts on four."""
+TILE = 4
+"""Taxels whose forces are written together."""
+FEW_STEPS = 12
+"""Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
+UNROLL = tl.constexpr(4)
+"""Taxels of a pass that are worked on at a time."""
+LIMIT = tl.constexpr(64.0)
+"""More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
+LOG2_E = tl.constexpr(1.4426950408889634)
+NO_FORCE = tl.constexpr(1e-12)
+DAMPING = tl.constexpr(0.1)
+"""As in `footprint`, of which a kernel can see constants of its own file alone."""
+
+
+@triton_op("tgdsl::shared_forces", mutates_args={})
+def shared_forces(
+    pos: Tensor,
+    weight: Tensor,
+    point: Sequence[Tensor],
+    force: Sequence[Tensor],
+    torque: Sequence[Tensor],
+    radius: Tensor,
+    levenberg: Tensor,
+    first: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the force on each taxel, (3, env, taxel) [N], and two vectors of each body, (6, env, body).
+
+    These are the sum of its taxels' forces [N], and what they leave of the moment [N·m].
+
+    Args:
+        pos: Taxel positions in their body's frame, (taxel, 3) [m]; inactive ones are far away.
+        weight: Depth of each probe over its radius, and `UNREACHED`, (env, taxel) [1].
+        point: Contact points, three planes (env, body, contact) [m].
+        force: Forces on the body [N].
+        torque: Torques on the body at the contact points [N·m].
+        radius: Radius of a footprint, (body,) [m].
+        levenberg: Least curvature of each step towards the moment [1].
+        first: First taxel of each body, and the number of all: (body + 1,).
+    """
+    return launch(wrap_triton(kernel), pos, weight, point, force, torque, radius, levenberg, first)
+
+
+def launch(
+    kernel: Any,
+    pos: Tensor,
+    weight: Tensor,
+    point: Sequence[Tensor],
+    force: Sequence[Tensor],
+    torque: Sequence[Tensor],
+    radius: Tensor,
+    levenberg: Tensor,
+    first: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Run the kernel, plain or wrapped, on the arguments of `shared_forces`."""
+    num_envs, num_bodies, num_contacts = point[0].shape
+    num_taxels = weight.shape[1]
+    shared = weight.new_empty((3, num_envs, num_taxels))
+    sums = weight.new_empty((6, num_envs, num_bodies))
+    planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque)]
+    kernel[(triton.cdiv(num_envs, ENVS), num_bodies)](
+        *planes, radius, levenberg, first, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+        STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
+    )  # fmt: skip
+    return shared, sums
+
+
+@triton.jit
+def kernel(
+    pos, weight, point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z,
+    radius, levenberg, first, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
+):  # fmt: skip
+    """Find β of one body in a block of environments, and share out its contacts."""
+    body = tl.program_id(1)
+    env = tl.program_id(0) * ENVS + tl.arange(0, ENVS).to(tl.int64)
+    is_env = env < num_envs
+    all_envs = tl.full((), 0, tl.int64) + num_envs
+    row = env * num_bodies + body
+    first_taxel = tl.load(first + body)
+    num_own = tl.load(first + body + 1) - first_taxel
+    pos += 3 * first_taxel
+    weights = weight + first_taxel + tl.where(is_env, env, 0) * num_taxels
+    planes = (point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z)
+    inverse = 1.0 / tl.load(radius + body)
+    IS_LONG: tl.constexpr = STEPS > FEW
+
+    zero = tl.zeros((ENVS,), tl.float32)
+    tilt = (zero, zero, zero)
+    for step in range(STEPS):
+        total = zero + NO_FORCE
+        excess = (zero, zero, zero)
+        spread = (zero, zero, zero, zero, zero, zero)
+        for start in range(0, num_contacts, GROUP):
+            point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
+            if is_any:
+                strength, way = _direction(force)
+                slope = _slope(way, tilt, inverse)
+                captured, norm, top, mean, covariance = _moments(pos, weights, num_own, point, slope, inverse, IS_LONG)
+                load = captured * strength
+                total += tl.sum(load, axis=1)
+                excess = _add3(excess, _unmet(captured, mean, force, torque))
+                spread = _add6(spread, _of_levers(load * inverse * inverse, covariance, way))
+        least = tl.load(levenberg + step)
+        spread = _scale6(1.0 / total, spread)
+        s = _solve(spread, least, _scale3(inverse / total, excess))
+        s = _solve(spread, least, _times(spread, s))
+        size = _dot(s, _times(spread, s)) + DAMPING * _dot(s, s)
+        tilt = _add3(tilt, _scale3(-tl.rsqrt(1.0 + size), s))
+
+    carried, unmet = (zero, zero, zero), (zero, zero, zero)
+    for start in range(0, tl.maximum(num_contacts, 1), GROUP):
+        point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
+        if is_any | (start == 0):
+            strength, way = _direction(force)
+            slope = _slope(way, tilt, inverse)
+            captured, norm, top, mean, covariance = _moments(pos, weights, num_own, point, slope, inverse, IS_LONG)
+            unmet = _add3(unmet, _unmet(captured, mean, force, torque))
+            each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
+            carried = _add3(carried, _summed(_scale3(norm, each)))
+            for taxel in range(0, num_own, TILE):
+                own = taxel + tl.arange(0, TILE)
+                is_own = is_env[:, None] & (own < num_own)[None, :]
+                x, y, z = _tile(pos, weights, own, num_own, is_own, point, slope, top, inverse, each)
+                out = shared + first_taxel + env[:, None] * num_taxels + own[None, :]
+                _accumulate(out, x, is_own, start)
+                _accumulate(out + all_envs * num_taxels, y, is_own, start)
+                _accumulate(out + 2 * all_envs * num_taxels, z, is_own, start)
+            tl.debug_barrier()
+    out = sums + row
+    plane = all_envs * num_bodies
+    tl.store(out, carried[0], is_env)
+    tl.store(out + plane, carried[1], is_env)
+    tl.store(out + 2 * plane, carried[2], is_env)
+    tl.store(out + 3 * plane, -unmet[0], is_env)
+    tl.store(out + 4 * plane, -unmet[1], is_env)
+    tl.store(out + 5 * plane, -unmet[2], is_env)
+
+
+@triton.jit
+def _contacts(planes, row, is_env, start, num_contacts, GROUP: tl.constexpr):
+    """Return points, forces and torques of a group of contacts, (env, contact), and whether there is any."""
+    contact = start + tl.arange(0, GROUP)
+    at = row[:, None] * num_contacts + contact[None, :]
+    is_contact = is_env[:, None] & (contact < num_contacts)[None, :]
+    px, py, pz = _load(planes[0] + at, is_contact), _load(planes[1] + at, is_contact), _load(planes[2] + at, is_contact)
+    fx, fy, fz = _load(planes[3] + at, is_contact), _load(planes[4] + at, is_contact), _load(planes[5] + at, is_contact)
+    tx, ty, tz = _load(planes[6] + at, is_contact), _load(planes[7] + at, is_contact), _load(planes[8] + at, is_contact)
+    acts = (fx != 0) | (fy != 0) | (fz != 0) | (tx != 0) | (ty != 0) | (tz != 0)
+    is_strange = (px != px) | (py != py) | (pz != pz)
+    is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
+    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), is_any
+
+
+@triton.jit
+def _load(at, is_there):
+    """Return what is there, else 0."""
+    return tl.load(at, is_there, 0.0)
+
+
+@triton.jit
+def _direction(force):
+    """Return the strength of forces, and their direction, which fades to zero with them."""
+    strength = tl.sqrt(_dot(force, force) + NO_FORCE * NO_FORCE)
+    return strength, _scale3(1.0 / strength, force)
+
+
+@triton.jit
+def _slope(way, tilt, inverse):
+    """Return a of β · g = a · (x_j − x_c) / ln 2, (env, contact) [1/m]: it is f̂ × β / r_f."""
+    x, y, z = tilt[0][:, None], tilt[1][:, None], tilt[2][:, None]
+    scale = inverse * LOG2_E
+    a = _cross(way, (x, y, z))
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+@triton.jit
+def _arm(x, y, z, point):
+    """Return x_j − x_c [m]."""
+    return x - point[0], y - point[1], z - point[2]
+
+
+@triton.jit
+def _pull(arm, weight, slope, top, inverse):
+    """Return 1 − s², not below 0, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels."""
+    near = tl.maximum(1.0 - inverse * inverse * _dot(arm, arm), 0.0, propagate_nan=tl.PropagateNan.ALL)
+    exponent = tl.minimum(_dot(slope, arm) - top, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
+    return near, weight * near * near * tl.exp2(exponent)
+
+
+@triton.jit
+def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr):
+    """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
+    zero = tl.zeros_like(point[0])
+    top = zero
+    if IS_LONG:
+        top += _highest(pos, weights, num_own, point, slope, inverse)
+    nearest, total = zero, zero
+    x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
+        at = pos + 3 * taxel
+        arm = _arm(tl.load(at), tl.load(at + 1), tl.load(at + 2), point)
+        weight = tl.load(weights + taxel)[:, None]
+        near, part = _pull(arm, weight, slope, top, inverse)
+        nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
+        px, py, pz = part * arm[0], part * arm[1], part * arm[2]
+        total += part
+        x, y, z = x + px, y + py, z + pz
+        xx, xy, xz = xx + px * arm[0], xy + px * arm[1], xz + px * arm[2]
+        yy, yz, zz = yy + py * arm[1], yz + py * arm[2], zz + pz * arm[2]
+    near = tl.minimum(nearest / 0.75, 1.0, propagate_nan=tl.PropagateNan.ALL)
+    captured = near * near * (3.0 - 2.0 * near)
+    norm = tl.where(total == 0, 0.0, 1.0 / total)
+    x, y, z = norm * x, norm * y, norm * z
+    spread = (
+        norm * xx - x * x, norm * xy - x * y, norm * xz - x * z,
+        norm * yy - y * y, norm * yz - y * z, norm * zz - z * z,
+    )  # fmt: skip
+    return captured, total, top, (x, y, z), spread
+
+
+@triton.jit
+def _tile(pos, weights, own, num_own, is_own, point, slope, top, inverse, force):
+    """Return Σ_c share_cj f_c of a tile of taxels, (env, taxel) [N]."""
+    at, is_taxel = pos + 3 * own, own < num_own
+    x, y, z = _load(at, is_taxel), _load(at + 1, is_taxel), _load(at + 2, is_taxel)
+    arm = _arm(x[None, :, None], y[None, :, None], z[None, :, None], _beside(point))
+    weight = _load(weights[:, None] + own[None, :], is_own)
+    _near, part = _pull(arm, weight[:, :, None], _beside(slope), top[:, None, :], inverse)
+    part = _each(part)
+    return _weighted(part, _each(force[0])), _weighted(part, _each(force[1])), _weighted(part, _each(force[2]))
+
+
+@triton.jit
+def _each(a):
+    """Return the four contacts' values, each (env, …), of (env, …, contact)."""
+    even, odd = tl.split(tl.reshape(a, a.shape[:-1] + [2, 2]))
+    a0, a2 = tl.split(even)
+    a1, a3 = tl.split(odd)
+    return a0, a1, a2, a3
+
+
+@triton.jit
+def _weighted(part, force):
+    """Return Σ_c part_c f_c, (env, taxel), of four parts (env, taxel) and four forces (env,)."""
+    return part[0] * force[0][:, None] + part[1] * force[1][:, None] + part[2] * force[2][:, None] + part[3] * force[3][:, None]
+
+
+@triton.jit
+def _highest(pos, weights, num_own, point, slope, inverse):
+    """Return the largest exponent of 2 among the taxels in reach, (env, contact)."""
+    top = tl.full(point[0].shape, float("-inf"), tl.float32)
+    for taxel in range(num_own):
+        at = pos + 3 * taxel
+        arm = _arm(tl.load(at), tl.load(at + 1), tl.load(at + 2), point)
+        is_reached = inverse * inverse * _dot(arm, arm) < 1.0
+        top = tl.maximum(top, tl.where(is_reached, _dot(slope, arm), float("-inf")))
+    return tl.where(top == float("-inf"), 0.0, top)
+
+
+@triton.jit
+def _summed(a):
+    """Return the sum over contacts of (env, contact) planes."""
+    return tl.sum(a[0], axis=1), tl.sum(a[1], axis=1), tl.sum(a[2], axis=1)
+
+
+@triton.jit
+def _unmet(captured, mean, force, torque):
+    """Return Σ_c γ_c (Σ_j λ_cj (x_j − x_c) × f_c − τ_c), (env,) [N·m]."""
+    x, y, z = _cross(mean, force)
+    return _summed(_scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
+
+
+@triton.jit
+def _of_levers(load, spread, way):
+    """Return Σ_c load_c [f̂]ₓ C [f̂]ₓᵀ, (env,): the covariance of x × f̂, from that of x."""
+    xx, xy, xz, yy, yz, zz = spread
+    x, y, z = way
+    # Row by row the columns of A = C [f̂]ₓᵀ: covariances of x and x × f̂.
+    ax = (xy * z - xz * y, xz * x - xx * z, xx * y - xy * x)
+    ay = (yy * z - yz * y, yz * x - xy * z, xy * y - yy * x)
+    az = (yz * z - zz * y, zz * x - xz * z, xz * y - yz * x)
+    return (
+        tl.sum(load * (ay[0] * z - az[0] * y), axis=1),
+        tl.sum(load * (ay[1] * z - az[1] * y), axis=1),
+        tl.sum(load * (ay[2] * z - az[2] * y), axis=1),
+        tl.sum(load * (az[1] * x - ax[1] * z), axis=1),
+        tl.sum(load * (az[2] * x - ax[2] * z), axis=1),
+        tl.sum(load * (ax[2] * y - ay[2] * x), axis=1),
+    )
+
+
+@triton.jit
+def _solve(matrix, least, right):
+    """Return (A + ε)⁻¹ b as `footprint` does."""
+    xx, xy, xz, yy, yz, zz = matrix
+    first = xx + least
+    by_x, bz_x = xy / first, xz / first
+    second = tl.maximum(yy + least - by_x * xy, least / 2)
+    cross = yz - by_x * xz
+    bz_y = cross / second
+    third = tl.maximum(zz + least - bz_x * xz - bz_y * cross, least / 2)
+    y = right[1] - by_x * right[0]
+    z = (right[2] - bz_x * right[0] - bz_y * y) / third
+    y = y / second - bz_y * z
+    return right[0] / first - by_x * y - bz_x * z, y, z
+
+
+@triton.jit
+def _times(matrix, right):
+    """Return A b of a symmetric A, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    return _dot((xx, xy, xz), right), _dot((xy, yy, yz), right), _dot((xz, yz, zz), right)
+
+
+@triton.jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def _add3(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@triton.jit
+def _add6(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@triton.jit
+def _scale3(factor, a):
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@triton.jit
+def _scale6(factor, a):
+    return factor * a[0], factor * a[1], factor * a[2], factor * a[3], factor * a[4], factor * a[5]
+
+
+@triton.jit
+def _beside(a):
+    """Return (env, contact) planes as (env, 1, contact)."""
+    return a[0][:, None, :], a[1][:, None, :], a[2][:, None, :]
+
+
+@triton.jit
+def _accumulate(out, value, is_there, start):
+    """Store the first contacts' part, and add that of further ones."""
+    tl.store(out, value + tl.load(out, is_there & (start > 0), 0.0), is_there)
