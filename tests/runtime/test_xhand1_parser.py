@@ -32,7 +32,8 @@ def damaged(draw):
     return bytes(raw)
 
 
-PIECES = st.one_of(FRAMES, FRAMES, NESTED, GARBAGE, damaged(), st.just(BIG))
+SMALL_PIECES = st.one_of(FRAMES, FRAMES, NESTED, GARBAGE, damaged())
+PIECES = st.one_of(SMALL_PIECES, SMALL_PIECES, SMALL_PIECES, SMALL_PIECES, SMALL_PIECES, st.just(BIG))
 STREAMS = st.lists(PIECES, max_size=8).map(b"".join)
 CUTS = st.lists(st.integers(0, 3000), max_size=8)
 
@@ -61,7 +62,7 @@ def test_any_stream_cut_anywhere_reads_as_a_whole(stream, cuts):
 
 
 @pytest.mark.slow
-@given(st.lists(PIECES, min_size=1, max_size=8), st.integers(0, 2**32))
+@given(st.lists(SMALL_PIECES, min_size=1, max_size=8), st.integers(0, 2**32))
 @settings(max_examples=5_000, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_hundred_thousand_streams_merged_mutated_and_cut(pieces, seed):
     """Twenty streams of the same pieces each."""
@@ -71,7 +72,7 @@ def test_a_hundred_thousand_streams_merged_mutated_and_cut(pieces, seed):
         for _ in range(random.randint(0, 3)):
             at = random.randint(0, len(stream))
             stream[at : at + random.randint(0, 4)] = random.randbytes(random.randint(0, 4))
-        agrees(bytes(stream), random.choices(range(3000), k=random.randint(0, 5)))
+        agrees(bytes(stream), random.choices(range(300), k=random.randint(0, 5)))
 
 
 @given(st.lists(FRAMES, max_size=20), CUTS)

@@ -10,6 +10,7 @@ from tgdsl.testing import KindConformance
 class TestContact(KindConformance):
     kind = CONTACT
     is_differentiable = False
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
 class TestContactWithHysteresis(KindConformance):
