@@ -90,7 +90,7 @@ def test_a_million_points_at_known_distances(shape, size):
         length = torch.stack(gradient).norm(dim=0)
         assert (length - 1).abs().max() < 1e-5
     is_clear = (t > 1e-6) | (t < -1e-6) & (-t < 0.9 * depth)
-    if shape == "ellipsoid":  # near a plane of symmetry the sign of one small component is fixed: see `TIE`
+    if shape == "ellipsoid":  # near a plane of symmetry the sign of one small component is fixed: see `planes.tie`
         is_clear &= (np.abs(surface + t[:, None] * normal) > 1e-7).all(axis=1)
     direction = torch.stack(SHAPES[shape](*as_planes(surface + t[:, None] * normal, size))[1], dim=-1).numpy()
     np.testing.assert_allclose(direction[is_clear], normal[is_clear], atol=1e-8)

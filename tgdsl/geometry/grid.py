@@ -2,7 +2,7 @@
 
 A point outside the grid reads the value at the nearest point of the grid's box plus the way there. By the triangle
 inequality that is never less than the true distance, nor less than the way to the box: far points read far. A point that is
-not a number reads NaN and has a fixed gradient; one at infinity counts as `FAR` away from the box along that axis.
+not a number reads NaN and has a fixed gradient; one at infinity counts as `far` away from the box along that axis.
 
 Shapes: `node` nodes of all grids; `x`, `y`, `z` nodes of one along the axes, two or more each; `*point` broadcasts with points.
 """
@@ -16,10 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.geometry.planes import TIE, Vec, length_and_direction, split, vec
-
-FAR = 1e15
-"""The farthest that a point counts as outside along an axis [m]: its square is still a float32."""
+from tgdsl.geometry.planes import Vec, length_and_direction, split, tie, vec
 
 Count = int | Int[Tensor, "*point"]
 Pair = tuple[Tensor, Tensor]
@@ -97,14 +94,14 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     """Interpolate between the nodes `first`, `first` + 1, … counted from the cell's lower corner."""
     place = [(part - start) / grid.cell for part, start in zip(point, grid.origin, strict=True)]
     inside = [within(part, num - 1) for part, num in zip(place, grid.num, strict=True)]
-    # What is within TIE of the next cell counts as in it, so that a point at rest on a face of cells keeps its gradient.
+    # What is within `tie` of the next cell counts as in it, so that a point at rest on a face of cells keeps its gradient.
     # What is not a number becomes an arbitrary integer: only the integer's own clamp makes it an index.
-    tie = TIE / grid.cell
-    lower = vec(within((part + tie).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
+    slack = tie() / grid.cell
+    lower = vec(within((part + slack).floor().long(), num - 2) for part, num in zip(inside, grid.num, strict=True))
     along_x, along_y, along_z = (weights(part - corner) for part, corner in zip(inside, lower, strict=True))
     value, *slopes = _sum_over_nodes(grid, lower, (along_x, along_y, along_z), first)
     way, direction = length_and_direction(
-        vec(((part - near) * grid.cell).clamp(-FAR, FAR) for part, near in zip(place, inside, strict=True))
+        vec(((part - near) * grid.cell).clamp(-far(), far()) for part, near in zip(place, inside, strict=True))
     )
     is_far = way > 0
     gradient = (
@@ -114,6 +111,11 @@ def _interpolate(point: Vec, grid: Grid, weights: Weights, first: int) -> tuple[
     distance = value + way
     _, gradient = length_and_direction(vec(torch.where(distance.isnan(), 0.0, part) for part in gradient))
     return distance, gradient
+
+
+def far() -> float:
+    """Return how far [m] a point counts as outside along an axis at most: the square of that is still a float32."""
+    return 1e15
 
 
 def within(place: Tensor, last: Count) -> Tensor:

@@ -14,11 +14,21 @@ from torch import Tensor
 Vec = tuple[Tensor, Tensor, Tensor]
 Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
-TINY = 1e-30
-"""Squared lengths up to this [m²] count as zero: it keeps float32 clear of subnormal numbers."""
-TIE = 1e-7
-"""Lengths that differ by no more than this [m] count as equal, and the first among equals wins: so what is nearest, and which
-way is out, does not alternate with the last digits of a pose at rest. Float32 resolves a few centimetres not much better."""
+# Functions, not a module's floats: a compiler for dynamic shapes hands those over anew at each call.
+
+
+def tie() -> float:
+    """Return by how much [m] lengths may differ and count as equal, of which the first wins.
+
+    So what is nearest, and which way is out, does not alternate with the last digits of a pose at rest. Float32 resolves a few
+    centimetres not much better.
+    """
+    return 1e-7
+
+
+def tiny() -> float:
+    """Return up to where squared lengths [m²] count as zero: the derivative of a reciprocal root is a float32 down to there."""
+    return 1e-24
 
 
 def split(stacked: Tensor) -> Vec:
@@ -108,21 +118,27 @@ def rotation(quat: Tensor) -> Rot:
 
 
 def length_and_direction(a: Vec, fixed: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> tuple[Tensor, Vec]:
-    """Return |a| and a/|a|; where |a| ≤ `TIE` the direction is a fixed unit vector. Derivatives are finite everywhere."""
-    length = safe_sqrt(dot(a, a))
-    is_null = length <= TIE
-    inverse = 1.0 / torch.where(is_null, 1.0, length)
+    """Return |a| and a/|a|; where |a| ≤ `tie` the direction is a fixed unit vector. Derivatives are finite everywhere."""
+    length, inverse = safe_roots(dot(a, a))
+    is_null = length <= tie()
     x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, fixed, strict=True))
     return length, (x, y, z)
 
 
 def safe_sqrt(squared: Tensor) -> Tensor:
     """Return the square root of a squared length [m²], with derivative 0 rather than infinite where it vanishes."""
-    is_null = squared <= TINY
-    return torch.where(is_null, 0.0, torch.sqrt(torch.where(is_null, 1.0, squared)))
+    return safe_roots(squared)[0]
+
+
+def safe_roots(squared: Tensor) -> tuple[Tensor, Tensor]:
+    """Return `safe_sqrt`, and one over it; where that vanishes, 1."""
+    is_null = squared <= tiny()
+    inverse = torch.rsqrt(torch.where(is_null, 1.0, squared))
+    return torch.where(is_null, 0.0, squared * inverse), inverse
 
 
 def power(depth: Tensor, exponent: Tensor) -> Tensor:
-    """Return d^α of depths d ≥ 0; where d = 0 its derivatives are 0 rather than infinite, even for α < 1."""
+    """Return d^α of depths d ≥ 0, to α |log₂ d| roundings; where d = 0 its derivatives are 0, not infinite, even for α < 1."""
     is_none = depth <= 0
-    return torch.where(is_none, torch.zeros_like(depth), torch.where(is_none, 1.0, depth) ** exponent)
+    logarithm = torch.log2(torch.where(is_none, 1.0, depth))  # a general power takes ten times as many instructions
+    return torch.where(is_none, torch.zeros_like(depth), torch.exp2(exponent * logarithm))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 TIE = 1e-7
-"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins; see `planes.TIE`."""
+"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins; see `planes.tie`."""
 
 
 @dataclass(frozen=True, eq=False)

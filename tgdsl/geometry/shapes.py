@@ -3,7 +3,7 @@
 Every function takes a point in the geom's frame [m] and the geom's size as MuJoCo defines it [m] (tensors that broadcast
 with the point), and returns the distance [m] and the outward gradient. Both are exact, in every place: at centres, on
 axes, edges and corners, where the nearest surface point is not unique, one of the candidates is taken, always the same; what is
-within `TIE` of such a place counts as in it.
+within `planes.tie()` of such a place counts as in it.
 Derivatives of the distance are the gradient; all are finite.
 """
 
@@ -15,7 +15,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from tgdsl.geometry.planes import TIE, Vec, length_and_direction, safe_sqrt
+from tgdsl.geometry.planes import Vec, length_and_direction, safe_roots, tie
 
 Shape = Callable[[Vec, Vec], tuple[Tensor, Vec]]
 
@@ -46,14 +46,13 @@ def capsule(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
 def box(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     """Box of half-extents `size`."""
     qx, qy, qz = (part.abs() - half for part, half in zip(point, size, strict=True))
-    sx, sy, sz = (torch.where(part < -TIE, -1.0, 1.0).to(part.dtype) for part in point)
+    sx, sy, sz = (torch.where(part < -tie(), -1.0, 1.0).to(part.dtype) for part in point)
     wx, wy, wz = qx.clamp(min=0), qy.clamp(min=0), qz.clamp(min=0)
-    outside = safe_sqrt(wx * wx + wy * wy + wz * wz)
-    is_outside = outside > TIE
+    outside, inverse = safe_roots(wx * wx + wy * wy + wz * wz)
+    is_outside = outside > tie()
     inside = torch.maximum(torch.maximum(qx, qy), qz)
-    is_x = qx >= torch.maximum(qy, qz) - TIE
-    is_y = ~is_x & (qy >= qz - TIE)
-    inverse = 1.0 / torch.where(is_outside, outside, 1.0)
+    is_x = qx >= torch.maximum(qy, qz) - tie()
+    is_y = ~is_x & (qy >= qz - tie())
     gradient = (
         sx * torch.where(is_outside, wx * inverse, is_x.to(sx.dtype)),
         sy * torch.where(is_outside, wy * inverse, is_y.to(sy.dtype)),
@@ -67,12 +66,11 @@ def cylinder(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     x, y, z = point
     radial, (ux, uy, _) = length_and_direction((x, y, torch.zeros_like(x)))
     qr, qz = radial - size[0], z.abs() - size[1]
-    sz = torch.where(z < -TIE, -1.0, 1.0).to(z.dtype)
+    sz = torch.where(z < -tie(), -1.0, 1.0).to(z.dtype)
     wr, wz = qr.clamp(min=0), qz.clamp(min=0)
-    outside = safe_sqrt(wr * wr + wz * wz)
-    is_outside = outside > TIE
-    inverse = 1.0 / torch.where(is_outside, outside, 1.0)
-    is_wall = qr >= qz - TIE
+    outside, inverse = safe_roots(wr * wr + wz * wz)
+    is_outside = outside > tie()
+    is_wall = qr >= qz - tie()
     along_radius = torch.where(is_outside, wr * inverse, is_wall.to(wr.dtype))
     along_axis = torch.where(is_outside, wz * inverse, (~is_wall).to(wz.dtype))
     distance = outside + torch.maximum(qr, qz).clamp(max=0)
@@ -101,7 +99,7 @@ def ellipsoid(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     u = _newton(u, scaled, ratio, offset)  # with derivatives: by the implicit function theorem one step holds them all
     normal = [y / (u + f) for y, f in zip(scaled, offset, strict=True)]
     length = torch.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
-    x, y, z = (torch.where(part < -TIE, -n, n) / length for part, n in zip(point, normal, strict=True))
+    x, y, z = (torch.where(part < -tie(), -n, n) / length for part, n in zip(point, normal, strict=True))
     return least * (u - 1.0) * length, (x, y, z)
 
 

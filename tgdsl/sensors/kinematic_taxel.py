@@ -44,9 +44,6 @@ from tgdsl.layout import Layout
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import FORCE
 
-NO_FORCE = 1e-9
-"""Normal force of a body's taxels [N] up to which there is nothing to balance."""
-
 
 class KinematicTaxelSpec(ContactProbeSpec):
     """Force and torque of each taxel from depth, normal and velocity."""
@@ -113,7 +110,7 @@ def reference(
         for b in range(len(layout.bodies)):
             own, at = layout.body_id == b, touch.contacts.body == b
             wanted = np.sum(touch.contacts.force[at] * touch.contacts.normal[at])
-            factor = wanted / pressed[own].sum() if pressed[own].sum() > NO_FORCE else 0.0
+            factor = wanted / pressed[own].sum() if pressed[own].sum() > no_force() else 0.0
             forces[own], torques[own] = factor * forces[own], factor * torques[own]
     return np.concatenate([{"force": forces, "torque": torques}[name] for name in _ordered(spec)], axis=1), {}
 
@@ -178,6 +175,11 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return readings, {}
 
 
+def no_force() -> float:
+    """Return up to which normal force of a body's taxels [N] there is nothing to balance."""
+    return 1e-9
+
+
 def _in_cone(shear: planes.Vec, pressed: Tensor, friction: Tensor | None) -> planes.Vec:
     """Return tangential forces [N], scaled back to the friction cone of the normal forces where they leave it."""
     if friction is None:
@@ -193,8 +195,8 @@ def _balance(pressed: Tensor, felt: Felt, constants: Constants) -> Tensor:
     assert contacts is not None
     wanted = planes.dot(contacts.force, contacts.normal).sum(dim=-1)
     total = pressed @ constants["member"]
-    is_pressed = total > NO_FORCE
+    is_pressed = total > no_force()
     return torch.where(is_pressed, wanted / torch.where(is_pressed, total, 1.0), 0.0)[:, constants["body"]]
 
 
-KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference, knobs=FORCE)
+KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference, knobs=FORCE, is_pointwise=True)

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.geometry import planes, reference
-from tgdsl.geometry.planes import TINY, Vec
+from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.query import Felt
 from tgdsl.geometry.reference import Touch
 
@@ -67,7 +67,7 @@ def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Ten
         if slides is not None:
             dragged = planes.where(slides, planes.add(anchor, planes.rotate(rotation, slid)), anchor)
         depth = law.reach - distance.value
-        is_taken = is_free & (depth > torch.where(holder > 0, deepest + planes.TIE, deepest))
+        is_taken = is_free & (depth > torch.where(holder > 0, deepest + planes.tie(), deepest))
         taken = planes.where(is_held, dragged, planes.where(is_taken, planes.add(planes.rotate(rotation, pos), offset), taken))
         holder = torch.where(is_held | is_taken, float(k), holder)
         deepest = torch.maximum(deepest, depth)
@@ -77,7 +77,7 @@ def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Ten
 def capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
     """Return a vector scaled back to a length, and where it had to be; derivatives are finite everywhere."""
     square = planes.dot(stretch, stretch)
-    slides = square > torch.clamp(limit * limit, min=TINY)
+    slides = square > torch.clamp(limit * limit, min=planes.tiny())
     factor = torch.where(slides, limit / torch.sqrt(torch.where(slides, square, 1.0)), 1.0)
     return planes.scale(factor, stretch), slides
 

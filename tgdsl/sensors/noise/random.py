@@ -38,8 +38,6 @@ READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 PER_STEP = frozenset({READING, RADIUS, JITTER})
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
-ANGLE = 3.141592653589793 / 2048
-"""Step of a normal pair's angle [rad]."""
 PURPOSES = tuple(0x3C6EF372 + 0x1B873593 * i % 2**30 for i in range(12))
 """A constant for each purpose and half of a key."""
 
@@ -101,7 +99,7 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     """
     share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
     radius = torch.sqrt(-2.0 * torch.log(share))
-    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * ANGLE
+    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (3.141592653589793 / 2048)
     square = angle * angle
     sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square * (1 / 5040))))
     cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square * (1 / 40320))))
