@@ -137,8 +137,8 @@ def _steps(rows: Tensor) -> tuple[int, int]:
 @triton.jit
 def _along(place, num):
     """Return cell, place in it and whether that is inside, along an axis of `num` nodes; as `field_moments` has them."""
-    inner = tl.clamp(place, 0.0, (num - 1).to(tl.float32), propagate_nan=tl.PropagateNan.ALL)
-    lower = tl.minimum(tl.floor(inner), (num - 2).to(tl.float32))
+    inner = tl.clamp(place, 0.0, tl.cast(num - 1, tl.float32), propagate_nan=tl.PropagateNan.ALL)
+    lower = tl.minimum(tl.floor(inner), tl.cast(num - 2, tl.float32))
     return lower.to(tl.int32), inner - lower, (inner > 0) & (inner < num - 1)
 
 

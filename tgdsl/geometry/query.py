@@ -1,7 +1,7 @@
 """The question every contact sensor asks: how deep is a probe in which object, which way is out, how does it move.
 
 Two steps: `measure` finds the distance of every probe to every object, once, and `feel` makes of it what one sensor feels, of
-which there may be several with different gates, objects and needs.
+which there may be several with different gates, objects and needs. `search` does both where a GPU's kernel can.
 
 Shapes: `env` environments, `pair` (link, object) pairs, `taxel` probes, `geom` geoms of an object, `case` 1, or `env` if the
 object differs between environments. A pair's planes are small, a taxel's are not, so everything that depends on the pair alone
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.fusion import takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
 from tgdsl.geometry.contacts import Contacts
@@ -213,7 +214,7 @@ def relate(
         dtype: Dtype of the result.
         linvel: World velocities of the bodies' frame origins [m/s], if motion is wanted.
         angvel: World angular velocities [rad/s], if motion is wanted.
-        gate: Handed through.
+        gate: 0 where a pair may be felt, −∞ where it may not; None if nothing is gated.
 
     Returns:
         The pairs, in `dtype`.
@@ -229,11 +230,12 @@ def relate(
         parts += planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
         parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
         parts += planes.rotate_back(link_rotation, turn)
+    is_moving = len(parts) > 12
+    parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
     # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
     parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
-    is_moving = len(parts) > 12
     motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
-    return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, gate)
+    return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])
 
 
 def measure(pairs: Pairs, probes: Probes, objects: Sequence[FeltObject]) -> tuple[Near, ...]:
@@ -278,9 +280,9 @@ def feel(
     frames: dict[str, Frame] = {}
     for target, radius in zip(near, reach, strict=True):
         if pairs.gate is not None:
-            radius = radius + pairs.gate[:, target.pairs][:, target.pair]
+            radius = radius + at_probes(pairs.gate, target.pairs, target.pair)
         reached = radius - target.distance
-        is_deeper = reached > torch.where(depth > 0, depth + planes.TIE, 0.0)
+        is_deeper = reached > torch.where(depth > 0, depth + planes.tie(), 0.0)
         if with_normal:
             normal = planes.where(is_deeper, target.gradient, normal)
         if with_motion and pairs.motion is not None:
@@ -290,7 +292,7 @@ def feel(
             value = torch.where(radius > -torch.inf, target.distance, torch.inf)
             distances[target.name] = Distance(value, target.gradient)
         if "frame" in needs:
-            rotation = planes.rot(part[:, target.pairs][:, target.pair] for part in pairs.rotation)
+            rotation = planes.rot(at_probes(part, target.pairs, target.pair) for part in pairs.rotation)
             frames[target.name] = Frame(rotation, gathered(pairs.offset, target.pairs, target.pair))
         depth = torch.maximum(depth, reached)
     velocity = planes.add(linear, planes.cross(angular, probes.pos)) if with_motion else None
@@ -309,12 +311,53 @@ def feel(
     )
 
 
+def search(
+    pairs: Pairs,
+    probes: Probes,
+    which: Sequence[int],
+    objects: Sequence[FeltObject],
+    reach: Float[Tensor, "object *env taxel"],
+    needs: Collection[str],
+    contacts: Contacts | None = None,
+) -> Felt | None:
+    """Return what `feel` would of several geoms, found by one kernel; None where there is no such kernel.
+
+    Args:
+        pairs: Relative poses of all pairs of the plan.
+        probes: The probes.
+        which: Indices of the objects that are felt, the first of equals first.
+        objects: The query's objects, in the order of `probes.pair`.
+        reach: As `feel` has it.
+        needs: As `feel` has them.
+        contacts: Handed through.
+    """
+    felt = [objects[index] for index in which]
+    motion = () if pairs.motion is None else (*pairs.motion.linear, *pairs.motion.angular)
+    of_objects = [part for target in felt for part in (target.size, target.pos, target.rotation)]
+    if not takes_kernel(*pairs.offset, *pairs.rotation, *motion, *probes.pos, reach, *of_objects):
+        return None
+    from tgdsl.geometry.deepest_kernel import deepest, is_searchable
+
+    if not is_searchable(felt, [need for need in needs if need != "contacts"]):
+        return None
+    found = deepest(pairs, probes, which, objects, reach)
+    velocity = angular = None
+    if "motion" in needs and pairs.motion is not None:
+        own, is_met = found.pair.clamp(min=0).long(), found.pair >= 0
+        x, y, z, u, v, w = (torch.where(is_met, part.gather(1, own), 0.0) for part in motion)
+        velocity, angular = planes.add((x, y, z), planes.cross((u, v, w), probes.pos)), (u, v, w)
+    normal = found.normal if "normal" in needs else None
+    return Felt(found.depth, normal, velocity, angular, {}, {}, contacts, {}, {}, {}, {})
+
+
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
     """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
     frames = []
     for g in range(len(target.shapes)):
         rotation, offset = _link_in_geom(pairs, own, target, g)
-        frames.append(Frame(planes.rot(part[:, pair] for part in rotation), planes.vec(part[:, pair] for part in offset)))
+        every = slice(None)
+        turn, shift = ([at_probes(part, every, pair) for part in parts] for parts in (rotation, offset))
+        frames.append(Frame(planes.rot(turn), planes.vec(shift)))
     return _union(probes.pos, frames, target)
 
 
@@ -344,7 +387,7 @@ def _union(point: Vec, frames: Sequence[Frame | None], target: FeltObject) -> tu
         if least is None or outward is None:
             least, outward = distance, gradient
         else:
-            outward = planes.where(distance < least - planes.TIE, gradient, outward)
+            outward = planes.where(distance < least - planes.tie(), gradient, outward)
             least = torch.minimum(least, distance)
     assert least is not None and outward is not None
     return least, outward
@@ -373,4 +416,10 @@ def _link_in_geom(pairs: Pairs, own: slice, target: FeltObject, g: int) -> tuple
 
 def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
     """Return a vector of the pairs (env, pair) for each probe: those of an object, and which of them each probe's is."""
-    return planes.vec(part[:, own][:, pair] for part in vector)
+    return planes.vec(at_probes(part, own, pair) for part in vector)
+
+
+def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " taxel"]) -> Float[Tensor, "env taxel"]:
+    """Return a plane of the pairs for each probe; where an object has one pair alone, nothing is looked up."""
+    part = part[:, own]
+    return part.expand(-1, pair.shape[0]) if part.shape[1] == 1 else part[:, pair]

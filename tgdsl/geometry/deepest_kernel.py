@@ -1,0 +1,324 @@
+"""Which geom of all objects each probe is deepest in, on a GPU, in one kernel: one pass over the geoms, primitives only.
+
+It is what `query.measure` and `query.feel` find of objects made of planes, spheres, capsules, cylinders and boxes. The pass
+needs distances alone: which way is out is found at its end, of the winner. A program is one warp: an object that none of its
+probes can meet is passed over, by where it is and how large, and so is a geom with a frame of its own.
+
+Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects, `geom` geoms of all of these, `case` 1, or
+`env` if an object differs between environments, `row` columns of a geom.
+"""
+
+# What a kernel's types are only Triton's compiler knows.
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.library import triton_op, wrap_triton
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.geometry.query import FeltObject, Pairs, Probes
+from tgdsl.geometry.shapes_kernel import (
+    SHAPES,
+    TIE,
+    chosen,
+    distance_to,
+    dot,
+    gradient_of,
+    is_any,
+    length,
+    loaded,
+    rotate,
+    rotate_back,
+)
+
+BLOCK = 64
+"""Probes of a program, which is one warp: two for each of its lanes."""
+THRESHOLD = 5
+"""Geoms from which on the kernel is used: it takes 0.05 ms for 1.6 million probes however few there are."""
+EVERYWHERE = 3e38
+"""Bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞."""
+SPHERE = SHAPES.index("sphere")
+MARGIN = 1e-6
+"""By how much farther than its reach a geom is passed over [m]: ten times `TIE`, and the rounding of float32."""
+
+POS, ROTATION, BOUND, KIND, ROW = tl.constexpr(3), tl.constexpr(6), tl.constexpr(15), tl.constexpr(16), tl.constexpr(17)
+"""Columns of the geoms' table, which begins with the size, and their number."""
+
+
+class Deepest(NamedTuple):
+    """What each probe is deepest in, the first among equals.
+
+    Attributes:
+        depth: Penetration depth max(0, radius − distance) [m]; not-a-number where a pose is.
+        normal: Unit normal out of the object, in the link's frame, planes (env, taxel); zero where nothing is reached.
+        pair: Index of the winner's pair among all pairs; −1 where nothing is reached.
+    """
+
+    depth: Float[Tensor, "env taxel"]
+    normal: Vec
+    pair: Int[Tensor, "env taxel"]
+
+
+def is_searchable(objects: Sequence[FeltObject], needs: Collection[str]) -> bool:
+    """Return whether the kernel can answer: only primitives but ellipsoids, more than a geom, nothing but normal and motion."""
+    shapes = [shape for target in objects for shape in target.shapes]
+    is_known = all(shape in SHAPES for shape in shapes) and all(need in ("normal", "motion") for need in needs)
+    return is_known and len(shapes) >= THRESHOLD
+
+
+def deepest(
+    pairs: Pairs, probes: Probes, which: Sequence[int], objects: Sequence[FeltObject], reach: Float[Tensor, "object *env taxel"]
+) -> Deepest:
+    """Return what the probes are deepest in.
+
+    Args:
+        pairs: Relative poses of all pairs of the plan; the gate holds.
+        probes: The probes.
+        which: Indices of the objects that are felt, the first of equals first.
+        objects: The query's objects, in the order of `probes.pair`.
+        reach: Radius of each probe towards each of those felt [m]; −∞ where the probe is inactive or the pair cannot meet.
+    """
+    felt = [objects[index] for index in which]
+    depth, normal, winner = _deepest(
+        [*pairs.rotation, *pairs.offset], list(probes.pos), _pairs(probes, which, felt), reach, pairs.gate, *_tables(felt)
+    )  # fmt: skip
+    return Deepest(depth, planes.vec(normal.unbind()), winner)
+
+
+# Tables are made of many small arrays at each call, so of as few operations as can be: each is a kernel of a microsecond.
+
+
+def _pairs(probes: Probes, which: Sequence[int], felt: Sequence[FeltObject]) -> Int[Tensor, "object taxel"]:
+    """Return the index of each probe's pair with each felt object among all pairs."""
+    first, step = felt[0].first_pair, felt[0].num_pairs
+    if list(which) == list(range(len(probes.pair))) and all(o.first_pair == first + step * i for i, o in enumerate(felt)):
+        return (probes.pair + step * torch.arange(len(felt), device=probes.pair.device)[:, None] + first).int()
+    return torch.stack([probes.pair[index] + target.first_pair for index, target in zip(which, felt, strict=True)]).int()
+
+
+def _tables(objects: Sequence[FeltObject]) -> tuple[Tensor, Tensor]:
+    """Return bound and number of geoms of each object (case, object, 2), and size … kind of each geom (case, geom, row).
+
+    A bound is the radius of a sphere that holds it, about its frame's origin [m]; −∞ if it is absent. A kind is negative if the
+    geom has a frame of its own.
+    """
+    parts = [part for target in objects for part in (target.size, target.pos, target.rotation, target.is_absent)]
+    num_cases = next((part.shape[0] for part in parts if part is not None and part.shape[0] != 1), 1)
+    counts = [len(target.shapes) for target in objects]
+    each = [geom for target in objects for geom in zip(target.shapes, target.is_centred, strict=True)]
+    shape = _filled(parts[0], [float(SHAPES.index(shape)) for shape, _ in each])
+    is_centred = _filled(parts[0], [float(is_centred) for _, is_centred in each]) > 0
+    size, pos, rotation = (
+        _side_by_side([getattr(target, name).expand(num_cases, -1, -1) for target in objects])
+        for name in ("size", "pos", "rotation")
+    )
+    x, y, z = planes.split(size)
+    y = torch.where(shape == SPHERE, 0.0, y)
+    squared = x * x + y * y + torch.where(shape == SHAPES.index("box"), z * z, 0.0)
+    bound = torch.where(shape <= SHAPES.index("capsule"), x + y, planes.safe_sqrt(squared))
+    bound = torch.where(shape == SHAPES.index("plane"), EVERYWHERE, bound + MARGIN)
+    if any(target.is_absent is not None for target in objects):
+        masks = [target.size[..., 0] < -1 if target.is_absent is None else target.is_absent for target in objects]
+        bound = torch.where(_side_by_side([mask.expand(num_cases, -1) for mask in masks]), -torch.inf, bound)
+    kind = torch.where(shape > SPHERE, shape - 1, shape)  # a sphere is a capsule without a length
+    kind = torch.where(is_centred, kind, -kind).expand(num_cases, -1)
+    geoms = torch.cat([torch.stack([x, y, z], dim=-1), pos, rotation, bound[..., None], kind[..., None]], dim=-1)
+    held = torch.where(is_centred, bound, bound + planes.safe_sqrt(planes.dot(planes.split(pos), planes.split(pos))))
+    if len(set(counts)) == 1:
+        held = held.unflatten(1, (len(objects), counts[0])).amax(dim=2)
+    else:
+        held = torch.stack([own.amax(dim=1) for own in held.split(counts, dim=1)], dim=1)
+    return torch.stack([held, _filled(held, [float(count) for count in counts]).expand(num_cases, -1)], dim=-1), geoms
+
+
+def _filled(like: Tensor, values: Sequence[float]) -> Float[Tensor, "1 value"]:
+    """Return numbers as a tensor, without a copy from the host."""
+    runs = [(value, len(list(run))) for value, run in groupby(values)]
+    return torch.cat([like.new_full((1, count), value) for value, count in runs], dim=1)
+
+
+@torch.library.custom_op("tgdsl::side_by_side", mutates_args=())
+def _side_by_side(parts: list[Tensor]) -> Tensor:
+    """Return torch.cat(parts, dim=1), by one kernel: a compiler would make one of each part."""
+    return torch.cat(parts, dim=1)
+
+
+@_side_by_side.register_fake
+def _(parts: list[Tensor]) -> Tensor:
+    return torch.cat(parts, dim=1)
+
+
+@triton_op("tgdsl::deepest", mutates_args={})
+def _deepest(
+    pose: list[Tensor], pos: list[Tensor], pair: Tensor, reach: Tensor, gate: Tensor | None, spheres: Tensor, geoms: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    return launch(wrap_triton(kernel), pose, pos, pair, reach, gate, spheres, geoms)
+
+
+def launch(
+    kernel: Any,
+    pose: list[Float[Tensor, "env pair"]],
+    pos: list[Float[Tensor, " taxel"]],
+    pair: Int[Tensor, "object taxel"],
+    reach: Float[Tensor, "object *env taxel"],
+    gate: Float[Tensor, "env pair"] | None,
+    spheres: Float[Tensor, "case object 2"],
+    geoms: Float[Tensor, "case geom row"],
+) -> tuple[Float[Tensor, "env taxel"], Float[Tensor, "3 env taxel"], Int[Tensor, "env taxel"]]:
+    """Run the kernel, plain or wrapped, and return what `Deepest` holds.
+
+    Args:
+        kernel: The kernel.
+        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
+            that lie in memory alike.
+        pos: Positions of the probes in their links' frames [m].
+        pair: Index of each probe's pair among all.
+        reach: As `deepest` has it.
+        gate: 0 where a pair may be felt, −∞ where it may not.
+        spheres: The objects, see `_tables`.
+        geoms: Their geoms, likewise.
+    """
+    num_envs, (num_objects, num_taxels) = pose[0].shape[0], pair.shape
+    depth = pose[0].new_empty((num_envs, num_taxels))
+    normal = pose[0].new_empty((3, num_envs, num_taxels))
+    winner = torch.empty_like(depth, dtype=torch.int32)
+    num_points = num_envs * num_taxels
+    tables = [table.contiguous() for table in (reach, spheres, geoms)]
+    own = tables[0].stride()
+    kernel[(triton.cdiv(num_points, BLOCK),)](
+        depth, normal, winner, *pose, *pos, pair, *tables, pose[0] if gate is None else gate, num_points, num_objects,
+        *pose[0].stride(), *(gate if gate is not None else pose[0]).stride(), own[0],
+        own[1] if reach.ndim == 3 and reach.shape[1] != 1 else 0,
+        *(table.stride(0) if table.shape[0] != 1 else 0 for table in tables[1:]),
+        NUM_TAXELS=num_taxels, IS_GATED=gate is not None, IS_ONE=geoms.shape[0] == 1, BLOCK=BLOCK, num_warps=1,
+    )  # fmt: skip
+    return depth, normal, winner
+
+
+@triton.jit
+def kernel(
+    depth_out, normal_out, pair_out, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, x_in, y_in, z_in,
+    pairs, reach, spheres, geoms, gates, num_points, num_objects, pose_env, pose_pair, gate_env, gate_pair,
+    reach_object, reach_env, sphere_env, geom_env,
+    NUM_TAXELS: tl.constexpr, IS_GATED: tl.constexpr, IS_ONE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Find what `BLOCK` probes are deepest in, counted through all environments; see `launch`."""
+    start = tl.program_id(0).to(tl.int64) * BLOCK
+    is_probe = start + tl.arange(0, BLOCK) < num_points
+    # All but the program's first environment is counted from it, in 32 bits. Lanes beyond the last probe work on that one.
+    first_env = start // NUM_TAXELS
+    place = tl.minimum(start + tl.arange(0, BLOCK), num_points - 1) - first_env * NUM_TAXELS
+    env, taxel = place.to(tl.int32) // NUM_TAXELS, place.to(tl.int32) % NUM_TAXELS
+    base = first_env * pose_env
+    xx, xy, xz, yx, yy, yz = xx + base, xy + base, xz + base, yx + base, yy + base, yz + base
+    zx, zy, zz, ox, oy, oz = zx + base, zy + base, zz + base, ox + base, oy + base, oz + base
+    turns = (xx, xy, xz, yx, yy, yz, zx, zy, zz)
+    pose = env * pose_env
+    gates = gates + first_env * gate_env
+    radii = reach + first_env * reach_env + (env * reach_env + taxel)
+    own_pair = pairs + taxel
+    bounds, sizes = spheres, geoms
+    if not IS_ONE:
+        bounds += first_env * sphere_env + env * sphere_env
+        sizes += first_env * geom_env + env * geom_env
+
+    x, y, z = tl.load(x_in + taxel), tl.load(y_in + taxel), tl.load(z_in + taxel)
+    arm = tl.max(length(x, y, z), axis=0)
+    depth = tl.zeros((BLOCK,), tl.float32)
+    winner = tl.full((BLOCK,), -1, tl.int32)
+    met = tl.full((BLOCK,), -1, tl.int32)
+    first = tl.full((), 0, tl.int32)
+    for _ in range(num_objects):
+        last = first + tl.load(spheres + 1).to(tl.int32)
+        pair = tl.load(own_pair)
+        at = pose + pair * pose_pair
+        radius = tl.load(radii)
+        if IS_GATED:
+            radius += tl.load(gates + (env * gate_env + pair * gate_pair))
+        shift = (tl.load(ox + at), tl.load(oy + at), tl.load(oz + at))
+        # If an orientation is not a number, no part of the rotation is, and its object is never passed over.
+        strange = 0.0 * tl.load(xy + at)
+        if _is_any_within(dot(shift, shift) + strange, tl.load(bounds) + arm + radius):
+            px, py, pz = rotate(_pose(turns, at), (x, y, z))
+            px, py, pz = px + shift[0], py + shift[1], pz + shift[2]
+            least = tl.full((BLOCK,), float("inf"), tl.float32)
+            nearest = winner
+            row, kinds = sizes + first * ROW, geoms + first * ROW + KIND
+            for g in range(first, last):
+                kind = tl.load(kinds)
+                bound = tl.load(row + BOUND)
+                point = (px, py, pz)
+                is_met = tl.full((), 1, tl.int1)
+                if kind < 0:
+                    point = _from(point, row + POS)
+                    is_met = _is_any_within(dot(point, point), bound + radius)
+                    if is_met:
+                        point = rotate_back(loaded(row + ROTATION), point)
+                if is_met:
+                    distance = tl.where(bound < 0, float("inf"), distance_to(tl.abs(kind), row, point))
+                    nearest = tl.where(distance < least - TIE, g, nearest)
+                    least = tl.minimum(least, distance, propagate_nan=tl.PropagateNan.ALL)
+                row += ROW
+                kinds += ROW
+            reached = radius - least
+            is_deeper = reached > tl.where(depth > 0, depth + TIE, 0.0)
+            winner = tl.where(is_deeper, nearest, winner)
+            met = tl.where(is_deeper, pair, met)
+            depth = tl.maximum(depth, reached, propagate_nan=tl.PropagateNan.ALL)
+        first = last
+        own_pair += NUM_TAXELS
+        radii += reach_object
+        spheres += 2
+        bounds += 2
+
+    out = start + tl.arange(0, BLOCK)
+    tl.store(depth_out + out, depth, is_probe)
+    tl.store(pair_out + out, met, is_probe)
+    normal = (tl.zeros_like(depth), tl.zeros_like(depth), tl.zeros_like(depth))
+    if is_any(met >= 0):
+        at = pose + tl.maximum(met, 0) * pose_pair
+        rotation = _pose(turns, at)
+        px, py, pz = rotate(rotation, (x, y, z))
+        point = (px + tl.load(ox + at), py + tl.load(oy + at), pz + tl.load(oz + at))
+        row = tl.maximum(winner, 0) * ROW
+        kind = tl.load(geoms + row + KIND)
+        turn = loaded(sizes + row + ROTATION)
+        local = chosen(kind < 0, rotate_back(turn, _from(point, sizes + row + POS)), point)
+        outward = gradient_of(tl.abs(kind), sizes + row, local)
+        outward = chosen(kind < 0, rotate(turn, outward), outward)
+        normal = chosen(met >= 0, rotate_back(rotation, outward), normal)
+    plane = tl.cast(num_points, tl.int64)
+    tl.store(normal_out + out, normal[0], is_probe)
+    tl.store(normal_out + plane + out, normal[1], is_probe)
+    tl.store(normal_out + 2 * plane + out, normal[2], is_probe)
+
+
+@triton.jit
+def _is_any_within(squared, limit):
+    """Return whether any squared distance is within its limit's, or not a number; nothing is within a negative limit."""
+    return is_any((squared > limit * tl.abs(limit)) == 0)
+
+
+@triton.jit
+def _from(point, at):
+    """Return a point less the one that is in memory there."""
+    return point[0] - tl.load(at), point[1] - tl.load(at + 1), point[2] - tl.load(at + 2)
+
+
+@triton.jit
+def _pose(turns, at):
+    """Return a rotation whose parts are in nine planes."""
+    x = (tl.load(turns[0] + at), tl.load(turns[1] + at), tl.load(turns[2] + at))
+    y = (tl.load(turns[3] + at), tl.load(turns[4] + at), tl.load(turns[5] + at))
+    z = (tl.load(turns[6] + at), tl.load(turns[7] + at), tl.load(turns[8] + at))
+    return x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2]
