@@ -53,7 +53,7 @@ class Compile:
         out.parent.mkdir(parents=True, exist_ok=True)
         size = save_plan(plan, out)
         layout = plan.layout()
-        sensors = ", ".join(f"{s.name} ({s.kind}, {plan.queries[s.query].num_taxels})" for s in plan.sensors)
+        sensors = ", ".join(f"{s.name} ({s.kind}, {s.rows[1] - s.rows[0]})" for s in plan.sensors)
         print(f"{layout.num_taxels} taxels on {len(layout.links)} links at resolution {plan.origin.resolution}")
         print(f"sensors: {sensors}")
         print(f"{out}: {size} bytes in {time.perf_counter() - start:.1f} s")

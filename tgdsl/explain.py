@@ -116,7 +116,7 @@ def _links(touch: TactileModule) -> list[str]:
 
 
 def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
-    taxels = touch.plan.queries[sensor.query].num_taxels
+    taxels = sensor.rows[1] - sensor.rows[0]
     lines = [f"{sensor.name}: {sensor.kind}, {taxels} taxels, query {sensor.query}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))

@@ -46,7 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 6
+FORMAT = 7
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -256,6 +256,8 @@ class PlannedSensor:
         kind: Its kind.
         query: Number of its query.
         answer: Which of that one's answers.
+        joined: The sensors that are computed as one, in the order of the answer's rows; empty if it is alone.
+        rows: Which of the answer's rows are its own: the first, and one beyond the last.
         folder: Where its constants are.
         constants: Their names.
         state: What it carries from one call to the next: the kind's own, `noise/…` and `sample/…`.
@@ -271,6 +273,8 @@ class PlannedSensor:
     kind: str
     query: int
     answer: int
+    joined: tuple[str, ...]
+    rows: tuple[int, int]
     folder: str
     constants: tuple[str, ...]
     state: Mapping[str, PlannedMemory]
@@ -427,7 +431,7 @@ class Plan:
 
     def layout_of(self, sensor: PlannedSensor) -> Layout:
         """Return the taxels of one sensor."""
-        return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"])
+        return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"][slice(*sensor.rows)])
 
     def sensor_of(self, reading: str) -> PlannedSensor:
         """Return the sensor that a reading is of."""

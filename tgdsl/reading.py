@@ -5,17 +5,42 @@ Shapes: `env` environments, `row` taxels or bodies, `channel` numbers per row.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.fusion import stored
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.plan import PlannedSensor
 from tgdsl.sensors import Kind
+from tgdsl.sensors.base import Constants
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
 
 Tensors = dict[str, Tensor]
+
+
+def joined_signal(
+    kind: Kind, sensors: Sequence[PlannedSensor], felt: Felt, probes: Probes, constants: Sequence[Constants]
+) -> Float[Tensor, "env channel taxel"]:
+    """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
+
+    Args:
+        kind: Their kind.
+        sensors: The sensors.
+        felt: What the probes of all of them feel.
+        probes: The probes.
+        constants: What was folded for each of them: scalars.
+    """
+    of_taxels: Tensors = {}
+    if names := tuple(constants[0]):
+        counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
+        rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
+        of_taxels = dict(zip(names, stored(torch.stack(rows)).unbind(), strict=True))
+    found, _ = kind.forward(felt, probes, of_taxels, {})
+    return _stacked(found, sensors[0])
 
 
 def read(
@@ -27,8 +52,9 @@ def read(
     knobs: Tensors,
     memory: Tensors,
     now: Now | None,
-) -> tuple[dict[str, Float[Tensor, "env row channel"]], Tensors]:
-    """Return a sensor's readings by name, and its new memory.
+    joined: Float[Tensor, "env channel row"] | None = None,
+) -> tuple[Tensors, Tensors]:
+    """Return a sensor's readings by name (env, row, channel), and its new memory.
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them anew for each number of the noise.
@@ -42,14 +68,16 @@ def read(
         knobs: Values of its noise, see `stages.knob_values`.
         memory: What it remembers, by name.
         now: When it is read; None if it does not matter.
+        joined: Its signal, if that was computed with others'.
     """
     terms = () if sensor.noise is None else sensor.noise.terms
-    gain = stages.gain(knobs, now, felt.depth) if "gain" in terms and now is not None else None
+    like = felt.depth if joined is None else joined[:, 0]
+    gain = stages.gain(knobs, now, like) if "gain" in terms and now is not None else None
     if gain is not None and kind.gains_depth:
         felt = felt._replace(depth=gain * felt.depth)
-    found, new = kind.forward(felt, probes, constants, _own(memory))
-    planes, new = [found[name] for name in sensor.signal], dict(new)
-    signal = clean = torch.stack(planes, dim=1)
+    found, new = ({}, {}) if joined is not None else kind.forward(felt, probes, constants, _own(memory))
+    new = dict(new)
+    signal = clean = _stacked(found, sensor) if joined is None else joined
     if gain is not None and not kind.gains_depth:
         signal = gain[:, None] * clean
     if terms:
@@ -74,6 +102,11 @@ def read(
     if sensor.period > 0 and now is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], sensor.period, now)
     return readings, new
+
+
+def _stacked(found: Mapping[str, Tensor], sensor: PlannedSensor) -> Float[Tensor, "env channel row"]:
+    """Return the planes that a kind found as one signal."""
+    return found["signal"] if "signal" in found else torch.stack([found[name] for name in sensor.signal], dim=1)
 
 
 def _own(memory: Tensors) -> Tensors:

@@ -58,7 +58,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
     layout = resolved.layout.take(taxels)
     clean = kind.lower(spec, layout, resolved.surface_of)
     if spec.readout == "clean":
-        return [DraftSensor(name, kind.name, spec, taxels, clean, f"sensors/{name}", (name,), None)]
+        return [DraftSensor(name, kind.name, spec, taxels, clean, f"sensors/{name}", (name,), None, kind.is_pointwise)]
     knobs = knobs_of(loaded, resolved, name, layout, kind)
     loaded.raise_problems()
     noisy = measured_spec(spec, knobs)
@@ -70,11 +70,13 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
         lowered = clean = dataclasses.replace(clean, moments=request)
     apart = noise is not None and (noise.radius > 0 or kind.decide is not None or kind.gains_depth)
     readings = (name, f"{name}/clean") if both and not apart else (name,)
-    ways = [DraftSensor(name, kind.name, spec, taxels, lowered, f"sensors/{name}", readings, noise)]
+    folder = f"sensors/{name}"
+    ways = [DraftSensor(name, kind.name, spec, taxels, lowered, folder, readings, noise, kind.is_pointwise)]
     if both and apart:
-        folder = f"sensors/{name}" if lowered is clean else f"sensors/{name}/clean"
+        own = folder if lowered is clean else f"{folder}/clean"
         without = dataclasses.replace(clean, reports={})
-        ways.append(DraftSensor(f"{name}/clean", kind.name, spec, taxels, without, folder, (f"{name}/clean",), None))
+        again = f"{name}/clean"
+        ways.append(DraftSensor(again, kind.name, spec, taxels, without, own, (again,), None, kind.is_pointwise))
     return ways
 
 
@@ -95,6 +97,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     _settle_moments(loaded, work)
     _settle_points(loaded, resolved, work)
     loaded.raise_problems()
+    passes.join(work)
     queries, answer_of = passes.share(work)
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
@@ -229,6 +232,8 @@ def _sensor(
         kind=part.kind,
         query=place[0],
         answer=place[1],
+        joined=tuple(other.name for other in part.joined),
+        rows=_rows(part),
         folder=part.folder,
         constants=tuple(sorted(lowered.constants)),
         state=memory,
@@ -238,6 +243,12 @@ def _sensor(
         period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
         history=None if history is None else PlannedHistory(history.length, history.reduce),
     )
+
+
+def _rows(part: DraftSensor) -> tuple[int, int]:
+    """Return which rows of its answer a sensor has: the first, and one beyond the last."""
+    before = [len(other.taxels) for other in part.joined[: part.joined.index(part)]] if part.joined else []
+    return sum(before), sum(before) + len(part.taxels)
 
 
 def _noise(noise: LoweredNoise) -> PlannedNoise:

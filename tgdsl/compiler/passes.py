@@ -1,8 +1,8 @@
 """The passes from lowered sensors to packed arrays: prune, share, fold, pack.
 
-`prune` drops pairs that can never meet, `share` lets sensors with the same probes share one query, and those with the same
-objects and gate one answer, `fold` turns geom poses and inactive probes into constants, `pack` numbers bodies and pairs and
-writes the index tables.
+`prune` drops pairs that can never meet, `join` has sensors of one kind on different taxels computed as one, `share` lets
+sensors with the same probes share one query, and those with the same objects and gate one answer, `fold` turns geom poses and
+inactive probes into constants, `pack` numbers bodies and pairs and writes the index tables.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest, ProbeSpec
 from tgdsl.sensors.noise.lower import LoweredNoise
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class DraftSensor:
     """One way to read a sensor, lowered.
 
@@ -34,6 +34,8 @@ class DraftSensor:
         taxels: Its taxels, rows of the layout.
         lowered: What its kind says of it.
         folder: Where its constants are.
+        is_pointwise: Whether each row of what it reads is of one taxel alone.
+        joined: The sensors that are computed as one, itself among them; set by `join`, and empty if it is alone.
         readings: Names of its readings, reports left out.
         noise: Its imperfections.
     """
@@ -46,6 +48,13 @@ class DraftSensor:
     folder: str
     readings: tuple[str, ...]
     noise: LoweredNoise | None
+    is_pointwise: bool = False
+    joined: tuple[DraftSensor, ...] = field(default=())
+
+    @property
+    def probes(self) -> np.ndarray:
+        """Taxels of its query: its own, or those of all that are joined, one sensor after the other."""
+        return np.concatenate([sensor.taxels for sensor in self.joined or (self,)])
 
     @property
     def sensor(self) -> str:
@@ -170,15 +179,48 @@ def _order(pair: Pair) -> tuple[str, str]:
     return pair.object, pair.link
 
 
+def join(work: Draft) -> None:
+    """Set which sensors are computed as one: those of one kind on different taxels, such as one on each finger.
+
+    Their parameters may differ. No probe is measured twice for it: of sensors that measure at the same taxels all are joined
+    with sensors on the same other taxels, or none is.
+    """
+    alike: dict[Hashable, list[DraftSensor]] = {}
+    for sensor in work.sensors:
+        alike.setdefault(_equation(work, sensor) or sensor.name, []).append(sensor)
+    partners: dict[bytes, set[bytes]] = {}
+    for sensors in alike.values():
+        for sensor in sensors:
+            if _is_measuring(reach_of(work, sensor), sensor.lowered.needs):
+                partners.setdefault(sensor.taxels.tobytes(), set()).add(b"".join(s.taxels.tobytes() for s in sensors))
+    for sensors in alike.values():
+        rows = np.concatenate([sensor.taxels for sensor in sensors])
+        is_apart = len(np.unique(rows)) == len(rows)
+        if len(sensors) > 1 and is_apart and all(len(partners[sensor.taxels.tobytes()]) == 1 for sensor in sensors):
+            for sensor in sensors:
+                sensor.joined = tuple(sensors)
+
+
+def _equation(work: Draft, sensor: DraftSensor) -> Hashable | None:
+    """Return what sensors that can be computed as one have in common; None of one that never can."""
+    lowered = sensor.lowered
+    has_own = lowered.state or lowered.reports or sensor.radius_noise or any(c.ndim for c in lowered.constants.values())
+    if not sensor.is_pointwise or has_own or not _is_measuring(reach_of(work, sensor), lowered.needs):
+        return None
+    constants, is_clean = tuple(sorted(lowered.constants)), sensor.name != sensor.sensor
+    return sensor.kind, is_clean, sensor.feels, sensor.is_gated, lowered.needs, lowered.channels, constants
+
+
 def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
     """Return the distinct queries, and which of them, and which answer of it, each sensor uses."""
     queries: dict[bytes, DraftQuery] = {}
     answers: dict[tuple[Hashable, ...], DraftAnswer] = {}
     answer_of: dict[str, tuple[int, int]] = {}
     for sensor in work.sensors:
-        probes, radius = sensor.taxels.tobytes(), reach_of(work, sensor)
+        probes = sensor.probes.tobytes()
+        radius = np.concatenate([reach_of(work, other) for other in sensor.joined or (sensor,)])
         wanted = sensor.lowered.moments, sensor.lowered.points, sensor.name if sensor.radius_noise > 0 else ""
-        query = queries.setdefault(probes, DraftQuery(sensor.taxels))
+        query = queries.setdefault(probes, DraftQuery(sensor.probes))
         key = probes, sensor.feels, sensor.is_gated, radius.tobytes(), *wanted
         if key not in answers:
             answers[key] = DraftAnswer(sensor.feels, sensor.is_gated, radius, *wanted)

@@ -186,13 +186,16 @@ class Kind:
         spec: Its pydantic model; `kind` is a `Literal` with the kind's name.
         lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels. May raise `LowerError`.
         forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel) or, of what has
-            a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old.
+            a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old. Where
+            the signal is one tensor (env, channel, row) already it is there too, as "signal".
         reference: `(spec, layout, touch, state) → (reading (row, channel), new state)` for one environment, in NumPy.
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
             `forward` returns is then the signal, which noise disturbs first.
         knobs: Names of the noise knobs that it has.
         gains_depth: Whether a taxel's gain is of the depth that `forward` gets rather than of the reading.
         idle_knobs: Those of its knobs that change nothing in what it reads.
+        is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
+            computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
     """
 
     spec: type[ProbeSpec]
@@ -203,6 +206,7 @@ class Kind:
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()
+    is_pointwise: bool = False
 
     @property
     def name(self) -> str:

@@ -51,4 +51,4 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return {"depth": felt.depth}, {}
 
 
-CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference, knobs=TAXEL)
+CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference, knobs=TAXEL, is_pointwise=True)

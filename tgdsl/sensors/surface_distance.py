@@ -76,4 +76,6 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     return readings, {}
 
 
-SURFACE_DISTANCE = Kind(SurfaceDistanceSpec, lower, forward, reference, knobs=PROBE, idle_knobs=frozenset({"radius_noise"}))
+SURFACE_DISTANCE = Kind(
+    SurfaceDistanceSpec, lower, forward, reference, knobs=PROBE, idle_knobs=frozenset({"radius_noise"}), is_pointwise=True
+)

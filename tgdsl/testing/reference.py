@@ -40,7 +40,7 @@ class ReferenceModule:
         self.spec = spec
         self.sensor = plan.sensors[0]
         self.layout = plan.layout_of(self.sensor)
-        reach = plan.arrays[f"queries/{self.sensor.query}/{self.sensor.answer}/reach"]
+        reach = plan.arrays[f"queries/{self.sensor.query}/{self.sensor.answer}/reach"][:, slice(*self.sensor.rows)]
         self.radius = reach.max(axis=0, initial=-np.inf)
         self.memory: dict[int, dict[str, np.ndarray]] = {}
         self.tables: dict[tuple[int, int], MomentTable] = {}
