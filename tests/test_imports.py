@@ -27,7 +27,7 @@ FLOORS = {
         "explain",
     },
     2: {"sensors", "observations", "layout", "plan"},
-    1: {"geometry", "units", "fields", "fusion", "regions", "errors"},
+    1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}
 EXEMPT = {

@@ -185,6 +185,11 @@ def test_state_works_under_inference_mode_and_after_it(touch):
     assert touch.num_envs == 2
 
 
+def test_a_cpu_has_no_graphs(touch):
+    with pytest.raises(TgdslError, match="`graph` needs a module on a GPU, this one is on cpu"):
+        touch.compile(graph=True)
+
+
 def test_the_batch_of_a_module_with_state_is_fixed(touch, document):
     assert touch.num_envs is None and touch.has_state
     touch(touch.example_state(3))

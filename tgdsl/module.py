@@ -26,12 +26,13 @@ from tgdsl.felt_objects import FeltObjects
 from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.points import with_points
-from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes, feel, measure, relate
+from tgdsl.geometry.query import Felt, FeltObject, Near, Pairs, Probes, feel, measure, relate, search
+from tgdsl.graphed import Graphed
 from tgdsl.history import History, last_step
 from tgdsl.memory import Memory, store
 from tgdsl.moment_sources import moment_sources
 from tgdsl.plan import Inputs, Plan
-from tgdsl.reading import read
+from tgdsl.reading import joined_signal, read
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
@@ -98,6 +99,7 @@ class TactileModule(nn.Module):
             }
         )
         self._compiled: Callable[..., Any] | None = None
+        self._graphed: Graphed | None = None
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
 
@@ -170,7 +172,10 @@ class TactileModule(nn.Module):
         if held not in (None, num_envs):
             raise StateError(f"this module holds the state of {held} environments, the scene has {num_envs}")
         memory = self.memory.tensors(num_envs, state.dt, dtype, device)
-        found = (self._compiled or self.advance)(tensors, memory)
+        call = self._compiled or self.advance
+        if self._graphed is not None and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
+            call = self._graphed
+        found = call(tensors, memory)
         readings = {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
         return readings | {name: history.push(readings[name]) for name, history in self.histories.items()}  # type: ignore[operator]
 
@@ -197,13 +202,18 @@ class TactileModule(nn.Module):
         objects = {o: self._felt_objects.felt(self.plan.objects[o], self.constants, tensors) for o in measured}
         answers = [self._query(i, pairs, objects, tensors, nows, knobs) for i in range(len(self.plan.queries))]
         readings: dict[str, Tensor] = {}
+        joined: dict[tuple[str, ...], Tensor] = {}
         updated = self.memory.clock.after(memory, tensors.get("dt"))
         for sensor in self.plan.sensors:
             felt, probes = answers[sensor.query][sensor.answer]
             own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
             constants = self.constants.under(sensor.folder, sensor.constants)
-            kind = self._kinds[sensor.name]
-            found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name))
+            kind, signal = self._kinds[sensor.name], None
+            if sensor.joined:
+                if sensor.joined not in joined:
+                    joined[sensor.joined] = self._joined_signal(sensor.joined, felt, probes)
+                signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
+            found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name), signal)
             readings |= found
             updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         return readings, updated
@@ -293,19 +303,32 @@ class TactileModule(nn.Module):
         self.memory.clock.seed_with(seed, first_env)
         return self
 
-    def compile(self, **options: Any) -> TactileModule:
+    def compile(self, graph: bool = False, **options: Any) -> TactileModule:
         """Compile `advance` with `torch.compile` into fused kernels, in place; the first call then takes longer.
 
+        Kernels look at each index whether it is in range only where some index is given by the user: a variant's number.
+
         Args:
+            graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph: the host
+                then has little to do, and readings lie in the same memory at each call, so copy what is to be kept.
             **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`: one graph for every batch ≥ 2.
 
         Returns:
             The module.
+
+        Raises:
+            TgdslError: If graphs are wanted of a module that is not on a GPU.
         """
+        if graph and self.device.type != "cuda":
+            raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
         if self.device.type == "cpu" and not _has_cpp_compiler():
             warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
             return self
-        self._compiled = torch.compile(self.advance, **{"fullgraph": True, "dynamic": True, **options})
+        defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
+        if "variant" not in self.inputs.fields and not {"mode", "options", "backend"} & options.keys():
+            defaults["options"] = {"assert_indirect_indexing": False}
+        self._compiled = torch.compile(self.advance, **{**defaults, **options})
+        self._graphed = Graphed(self._compiled) if graph else None
         return self
 
     def example_state(
@@ -371,7 +394,8 @@ class TactileModule(nn.Module):
         query = self.plan.queries[i]
         x, y, z = self.constants[f"queries/{i}/pos"]
         probes = Probes((x, y, z), self.constants[f"queries/{i}/pair"])
-        near = measure(pairs, probes, [objects[index] for index in query.objects])
+        targets: list[FeltObject] = [objects[index] for index in query.objects]
+        near: tuple[Near, ...] | None = None
         answers = []
         for a, answer in enumerate(query.answers):
             own = pairs if answer.is_gated else pairs._replace(gate=None)
@@ -381,7 +405,10 @@ class TactileModule(nn.Module):
                 shift = stages.radius_shift(half_width, now, probes.pos[0])
                 reach = stages.shifted(reach[:, None], shift)
             found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
-            felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)
+            felt = search(own, probes, answer.objects, targets, reach, answer.needs, found)
+            if felt is None:
+                near = near if near is not None else measure(pairs, probes, targets)
+                felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)
             if answer.moments is not None:
                 path = f"queries/{i}/{a}/moments"
                 sources = moment_sources(self.plan, self.constants, path, answer.moments, tensors, shift)
@@ -392,6 +419,12 @@ class TactileModule(nn.Module):
                 felt = with_points(felt, own, met)
             answers.append((felt, probes))
         return answers
+
+    def _joined_signal(self, names: Sequence[str], felt: Felt, probes: Probes) -> Tensor:
+        by_name = {sensor.name: sensor for sensor in self.plan.sensors}
+        sensors = [by_name[name] for name in names]
+        constants = [self.constants.under(sensor.folder, sensor.constants) for sensor in sensors]
+        return joined_signal(self._kinds[names[0]], sensors, felt, probes, constants)
 
     def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:
         return contacts(tensors, self.constants[f"queries/{i}/bodies"], self.constants[f"queries/{i}/{a}/contacts"], self.dtype)
@@ -418,6 +451,13 @@ class TactileModule(nn.Module):
                 self._warned.add(sensor.sensor)
                 what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
                 warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
+        """Move or cast all tensors; a captured graph has read the old ones."""
+        super()._apply(fn, recurse)
+        if self._graphed is not None:
+            self._graphed.forget()
+        return self
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Have state that is loaded before the first call where the module is."""
