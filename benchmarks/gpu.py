@@ -11,8 +11,8 @@ nothing: it fills the compiler's cache, many cases at once. Every row is printed
 
 Per row: first the error, float32 on the device in three calls in a row against a float64 module, over the largest magnitude of
 each channel. Then medians: of a replayed CUDA graph that holds calls on so many sets of inputs, state and readings that
-together they exceed the GPU's L2 cache; and of a plain call, whose inputs and readings rotate too, but not its state. The copy
-ceiling is how long it takes to copy as many bytes as a call must move, in the same manner, by the faster of two kernels.
+together they exceed the GPU's L2 cache; and of a call from Python, plain or replaying a graph, whose inputs rotate too. The
+copy ceiling is how long it takes to copy as many bytes as a call must move, in the same manner, by the faster of two kernels.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, stat
 from torch import Tensor
 
 from tgdsl.artifact import load_plan
+from tgdsl.graphed import Graphed
 from tgdsl.module import Output, TactileModule
 from tgdsl.plan import Plan
 from tgdsl.state import SceneState
@@ -70,18 +71,21 @@ class Bench:
     def of(cls, case: Case, options: argparse.Namespace) -> Bench:
         """Load an artefact; code is compiled at its first call."""
         plan, device = load_plan(artefact(options.folder, case)), torch.empty(0, device=options.device).device
-        advance = TactileModule(plan).to(device).advance
-        return cls(case, plan, advance if options.eager else torch.compile(advance, fullgraph=True, dynamic=True), device)
+        touch = TactileModule(plan).to(device)
+        core = touch.advance if options.eager else touch.compile()._compiled
+        assert core is not None, "this machine cannot compile"
+        return cls(case, plan, core, device)
 
-    def module(self) -> TactileModule:
+    def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""
         touch = TactileModule(self.plan).to(self.device)
         touch._compiled = self.core
+        touch._graphed = Graphed(self.core) if graph and self.device.type == "cuda" else None
         return touch
 
     def states(self, num_envs: int, count: int, seed: int = 0) -> list[SceneState]:
         """Return random states on the CPU."""
-        return [state_of(TactileModule(self.plan), num_envs, seed + i) for i in range(count)]
+        return [state_of(TactileModule(self.plan), num_envs, seed + i, self.case.contacts) for i in range(count)]
 
 
 # Correctness ----------------------------------------------------------------------------------------------------------------
@@ -261,6 +265,7 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
         error_largest=float(error.max()),
         graph=graph,
         plain=plain_ms(touch, states, options.repeats, device),
+        replayed=plain_ms(bench.module(graph=True), states, options.repeats, device),
         copy=copy_ms(num_envs * size.moved, options.repeats, device),
         sets=len(sets),
         moved=num_envs * size.moved,

@@ -92,6 +92,7 @@ class Case:
         num_pads: Pads in a row, each with a sensor of its own; one object covers them all.
         num_objects: Cubes one on the other, all felt.
         points: Points that are sampled of each object; 0 for none.
+        contacts: Contacts of each pad and object, in the first of eight slots: a cube that rests has four.
         noise: "clean", "noisy" (the profile), "full" (`EVERY_KNOB`) or one of `KNOBS`.
         fields: What the sensor is given beside `KINDS`.
     """
@@ -103,6 +104,7 @@ class Case:
     num_pads: int = 1
     num_objects: int = 1
     points: int = 0
+    contacts: int = 4
     noise: str = "clean"
     fields: dict[str, Any] = field(default_factory=dict)
 
@@ -147,6 +149,7 @@ _SWEEPS = (
     Case("contact", "contact"),
     Case("distance", "surface_distance"),
     Case("link-contact", "link_contact"),
+    Case("force-8-contacts", "force_taxel", contacts=8),
     *(_kinematic(f"{n}-objects", num_objects=n) for n in (2, 4, 8, 16)),
     _kinematic("10-taxels", envs=(1_024,), num_taxels=10),
     *(_kinematic(f"{n}-taxels-noisy", envs=(1_024,), num_taxels=n, noise="noisy") for n in (10, 1_000, 10_000)),
@@ -229,8 +232,11 @@ def make_artefacts(folder: Path, cases: list[Case]) -> None:
 # States ---------------------------------------------------------------------------------------------------------------------
 
 
-def state_of(touch: TactileModule, num_envs: int, seed: int) -> SceneState:
-    """Return random float32 states on the module's device: the lowest cube rests on the pads or in them, ± 0.3 mm and 1°."""
+def state_of(touch: TactileModule, num_envs: int, seed: int, contacts: int = 4) -> SceneState:
+    """Return random float32 states on the module's device: the lowest cube rests on the pads or in them, ± 0.3 mm and 1°.
+
+    Of each pair `contacts` slots hold a contact.
+    """
     state = touch.example_state(num_envs, seed=seed, dtype=torch.float32, spread=0.0003)
     assert state.body_pos is not None and state.body_quat is not None
     state.body_quat[:] = 0.02 * state.body_quat
@@ -246,7 +252,11 @@ def state_of(touch: TactileModule, num_envs: int, seed: int) -> SceneState:
             state.body_pos[:, b, :2] *= 4
             state.body_pos[:, b] += torch.tensor([0.5 * PITCH * (num_pads - 1), 0.0, height])
     if state.contact_pos is not None:
+        assert state.contact_force is not None and state.contact_torque is not None and state.contact_normal is not None
         state.contact_pos = _on_pads(touch, state.contact_pos, seed)
+        used = torch.arange(8, device=state.contact_pos.device)[:, None] < contacts
+        for vectors in (state.contact_force, state.contact_torque, state.contact_normal, state.contact_pos):
+            vectors.copy_(torch.where(used, vectors[:, :, [0, 1, 3, 4, 6, 7, 0, 1]], 0.0))  # the third and sixth are empty
     return state
 
 

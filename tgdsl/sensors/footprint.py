@@ -41,16 +41,28 @@ from tgdsl.fusion import takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 
-UNREACHED = 1e-3
-"""Weight of a taxel that the object does not reach, in units of a probe's radius of depth: there is always someone to carry."""
 LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
-DAMPING = 0.1
-"""What a step of β counts beside its effect on the shares [1]: it bounds steps where taxels of hardly any share decide."""
 FAR = 1e3
 """Where a kernel that does not know of inactive taxels has them [m]: beyond all contacts' reach."""
-NO_FORCE = 1e-12
-"""Force [N] below which a direction fades to zero."""
+
+
+def unreached() -> float:
+    """Return the weight of a taxel that the object does not reach [probe's radius of depth]: someone must carry the load."""
+    return 1e-3
+
+
+def damping() -> float:
+    """Return what a step of β counts beside its effect on the shares [1].
+
+    It bounds steps where taxels of hardly any share decide.
+    """
+    return 0.1
+
+
+def no_force() -> float:
+    """Return the force [N] below which a direction fades to zero."""
+    return 1e-12
 
 
 class Footprint(NamedTuple):
@@ -90,13 +102,13 @@ def footprint(
     """
     arm = planes.vec((to[..., None, :] - at[..., None]) / radius[..., None, None] for to, at in zip(pos, point, strict=True))
     apart = torch.where(is_active[..., None, :], planes.dot(arm, arm), 4.0)
-    weight = (depth[..., None, :] + UNREACHED) * (1 - apart).clamp(min=0) ** 2
+    weight = (depth[..., None, :] + unreached()) * (1 - apart).clamp(min=0) ** 2
     near = ((1 - apart.amin(dim=-1)) / 0.75).clamp(0, 1)
     captured = near * near * (3 - 2 * near)
-    strength = torch.sqrt(planes.dot(force, force) + NO_FORCE**2)
+    strength = torch.sqrt(planes.dot(force, force) + no_force() ** 2)
     lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
     load = captured * strength
-    total = load.sum(dim=-1) + NO_FORCE
+    total = load.sum(dim=-1) + no_force()
     wanted = planes.vec((captured * part).sum(dim=-1) / (radius * total) for part in torque)
     share = _tilted(weight, lever, _tilt(weight, lever, load / total[..., None], wanted, levenberg))
     left = planes.vec(
@@ -129,11 +141,13 @@ class Shared(NamedTuple):
         force: Force on each taxel, Σ_c γ_c λ_cj f_c [N], planes (env, taxel).
         carried: Their sum over each body's taxels [N], planes (env, body).
         residual: What they leave of the moment [N·m], likewise.
+        stacked: The force as one tensor (env, 3, taxel), if it was made so.
     """
 
     force: Vec
     carried: Vec
     residual: Vec
+    stacked: Tensor | None = None
 
 
 def shared_forces(
@@ -163,10 +177,10 @@ def shared_forces(
         from tgdsl.sensors import footprint_kernel
 
         own = inverse_radius.flatten()[bodies.row]
-        weight = depth * own + UNREACHED
+        weight = depth * own + unreached()
         place = torch.where(own[:, None] > 0, torch.stack(pos, dim=-1), FAR)
         shared, sums = footprint_kernel.shared_forces(place, weight, point, force, torque, radius, levenberg, bodies.first)
-        return Shared(planes.vec(shared.unbind()), planes.vec(sums[:3].unbind()), planes.vec(sums[3:].unbind()))
+        return Shared(planes.vec(shared.unbind(1)), planes.vec(sums[:3].unbind()), planes.vec(sums[3:].unbind()), shared)
     share, residual = footprint(
         planes.vec(part[taxel] for part in pos),
         inverse_radius > 0,
@@ -202,7 +216,7 @@ def _tilt(weight: Tensor, lever: Vec, load: Tensor, wanted: Vec, levenberg: Tens
         spread = [(load * (share * off[i] * off[k]).sum(dim=-1)).sum(dim=-1) for i, k in _UPPER]
         halfway = _solve(spread, least, excess)
         step = _solve(spread, least, _times(spread, halfway))
-        size = planes.dot(step, _times(spread, step)) + DAMPING * planes.dot(step, step)
+        size = planes.dot(step, _times(spread, step)) + damping() * planes.dot(step, step)
         tilt = planes.sub(tilt, planes.scale(torch.rsqrt(1 + size), step))
     return tilt
 
@@ -244,15 +258,15 @@ def reference(
     """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m]."""
     num = len(point)
     weight, captured = np.zeros((num, len(pos))), np.zeros(num)
-    strength = np.sqrt(np.sum(force**2, axis=1) + NO_FORCE**2)
+    strength = np.sqrt(np.sum(force**2, axis=1) + no_force() ** 2)
     for c in range(num):
         apart = np.where(is_active, np.sum((pos - point[c]) ** 2, axis=1) / radius**2, 4.0)
-        weight[c] = (depth + UNREACHED) * np.maximum(0.0, 1.0 - apart) ** 2
+        weight[c] = (depth + unreached()) * np.maximum(0.0, 1.0 - apart) ** 2
         t = np.clip((1.0 - apart.min()) / 0.75, 0.0, 1.0)
         captured[c] = t**2 * (3.0 - 2.0 * t)
     lever = [np.cross(pos - point[c], force[c] / strength[c]) / radius for c in range(num)]
     load = captured * strength
-    total = load.sum() + NO_FORCE
+    total = load.sum() + no_force()
     beta = reference_beta(weight, lever, load / total, captured @ torque / (radius * total), levenberg)
     shares = np.array([captured[c] * reference_tilt(weight[c], lever[c] @ beta) for c in range(num)]).reshape(num, len(pos))
     carried = np.zeros(3)
@@ -280,7 +294,7 @@ def reference_beta(
             spread += part * (share * (lever[c] - mean).T) @ (lever[c] - mean)
         curvature = spread + least * np.eye(3)
         step = np.linalg.solve(curvature, spread @ np.linalg.solve(curvature, excess))
-        beta -= step / np.sqrt(1.0 + step @ spread @ step + DAMPING * step @ step)
+        beta -= step / np.sqrt(1.0 + step @ spread @ step + damping() * step @ step)
     return beta
 
 

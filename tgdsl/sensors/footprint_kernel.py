@@ -28,7 +28,7 @@ TILE = 4
 """Taxels whose forces are written together."""
 FEW_STEPS = 12
 """Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
-UNROLL = tl.constexpr(4)
+UNROLL = tl.constexpr(8)
 """Taxels of a pass that are worked on at a time."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
@@ -49,7 +49,7 @@ def shared_forces(
     levenberg: Tensor,
     first: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the force on each taxel, (3, env, taxel) [N], and two vectors of each body, (6, env, body).
+    """Return the force on each taxel, (env, 3, taxel) [N], and two vectors of each body, (6, env, body).
 
     These are the sum of its taxels' forces [N], and what they leave of the moment [N·m].
 
@@ -80,7 +80,7 @@ def launch(
     """Run the kernel, plain or wrapped, on the arguments of `shared_forces`."""
     num_envs, num_bodies, num_contacts = point[0].shape
     num_taxels = weight.shape[1]
-    shared = weight.new_empty((3, num_envs, num_taxels))
+    shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((6, num_envs, num_bodies))
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque)]
     kernel[(triton.cdiv(num_envs, ENVS), num_bodies)](
@@ -143,14 +143,28 @@ def kernel(
             unmet = _add3(unmet, _unmet(captured, mean, force, torque))
             each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
             carried = _add3(carried, _summed(_scale3(norm, each)))
+            x, y, z = _each3(point)
+            u, v, w = _each3(slope)
+            fx, fy, fz = _each3(each)
+            tops = _each(top)
             for taxel in range(0, num_own, TILE):
                 own = taxel + tl.arange(0, TILE)
                 is_own = is_env[:, None] & (own < num_own)[None, :]
-                x, y, z = _tile(pos, weights, own, num_own, is_own, point, slope, top, inverse, each)
-                out = shared + first_taxel + env[:, None] * num_taxels + own[None, :]
-                _accumulate(out, x, is_own, start)
-                _accumulate(out + all_envs * num_taxels, y, is_own, start)
-                _accumulate(out + 2 * all_envs * num_taxels, z, is_own, start)
+                at = pos + 3 * own
+                place = (
+                    _load(at, own < num_own)[None, :],
+                    _load(at + 1, own < num_own)[None, :],
+                    _load(at + 2, own < num_own)[None, :],
+                )
+                pull = _load(weights[:, None] + own[None, :], is_own)
+                p0 = _pulled(place, pull, (x[0], y[0], z[0]), (u[0], v[0], w[0]), tops[0], inverse)
+                p1 = _pulled(place, pull, (x[1], y[1], z[1]), (u[1], v[1], w[1]), tops[1], inverse)
+                p2 = _pulled(place, pull, (x[2], y[2], z[2]), (u[2], v[2], w[2]), tops[2], inverse)
+                p3 = _pulled(place, pull, (x[3], y[3], z[3]), (u[3], v[3], w[3]), tops[3], inverse)
+                out = shared + first_taxel + env[:, None] * (3 * num_taxels) + own[None, :]
+                _accumulate(out, _weighted(p0, p1, p2, p3, fx), is_own, start)
+                _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_own, start)
+                _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_own, start)
             tl.debug_barrier()
     out = sums + row
     plane = all_envs * num_bodies
@@ -200,9 +214,9 @@ def _slope(way, tilt, inverse):
 
 
 @triton.jit
-def _arm(x, y, z, point):
+def _arm(place, point):
     """Return x_j − x_c [m]."""
-    return x - point[0], y - point[1], z - point[2]
+    return place[0] - point[0], place[1] - point[1], place[2] - point[2]
 
 
 @triton.jit
@@ -224,7 +238,7 @@ def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
         at = pos + 3 * taxel
-        arm = _arm(tl.load(at), tl.load(at + 1), tl.load(at + 2), point)
+        arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
@@ -245,15 +259,12 @@ def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr
 
 
 @triton.jit
-def _tile(pos, weights, own, num_own, is_own, point, slope, top, inverse, force):
-    """Return Σ_c share_cj f_c of a tile of taxels, (env, taxel) [N]."""
-    at, is_taxel = pos + 3 * own, own < num_own
-    x, y, z = _load(at, is_taxel), _load(at + 1, is_taxel), _load(at + 2, is_taxel)
-    arm = _arm(x[None, :, None], y[None, :, None], z[None, :, None], _beside(point))
-    weight = _load(weights[:, None] + own[None, :], is_own)
-    _near, part = _pull(arm, weight[:, :, None], _beside(slope), top[:, None, :], inverse)
-    part = _each(part)
-    return _weighted(part, _each(force[0])), _weighted(part, _each(force[1])), _weighted(part, _each(force[2]))
+def _pulled(place, weight, point, slope, top, inverse):
+    """Return what one contact of each environment pulls at a tile of taxels with, (env, taxel)."""
+    arm = _arm(place, (point[0][:, None], point[1][:, None], point[2][:, None]))
+    slope = (slope[0][:, None], slope[1][:, None], slope[2][:, None])
+    _near, part = _pull(arm, weight, slope, top[:, None], inverse)
+    return part
 
 
 @triton.jit
@@ -266,9 +277,15 @@ def _each(a):
 
 
 @triton.jit
-def _weighted(part, force):
+def _each3(a):
+    """Return each plane's four contacts."""
+    return _each(a[0]), _each(a[1]), _each(a[2])
+
+
+@triton.jit
+def _weighted(p0, p1, p2, p3, force):
     """Return Σ_c part_c f_c, (env, taxel), of four parts (env, taxel) and four forces (env,)."""
-    return part[0] * force[0][:, None] + part[1] * force[1][:, None] + part[2] * force[2][:, None] + part[3] * force[3][:, None]
+    return p0 * force[0][:, None] + p1 * force[1][:, None] + p2 * force[2][:, None] + p3 * force[3][:, None]
 
 
 @triton.jit
@@ -277,7 +294,7 @@ def _highest(pos, weights, num_own, point, slope, inverse):
     top = tl.full(point[0].shape, float("-inf"), tl.float32)
     for taxel in range(num_own):
         at = pos + 3 * taxel
-        arm = _arm(tl.load(at), tl.load(at + 1), tl.load(at + 2), point)
+        arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
         is_reached = inverse * inverse * _dot(arm, arm) < 1.0
         top = tl.maximum(top, tl.where(is_reached, _dot(slope, arm), float("-inf")))
     return tl.where(top == float("-inf"), 0.0, top)
@@ -366,12 +383,6 @@ def _scale3(factor, a):
 @triton.jit
 def _scale6(factor, a):
     return factor * a[0], factor * a[1], factor * a[2], factor * a[3], factor * a[4], factor * a[5]
-
-
-@triton.jit
-def _beside(a):
-    """Return (env, contact) planes as (env, 1, contact)."""
-    return a[0][:, None, :], a[1][:, None, :], a[2][:, None, :]
 
 
 @triton.jit

@@ -156,6 +156,8 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     if "inward" in constants:
         inward = planes.vec(constants["inward"])
         readings["pressure"] = planes.dot(shared.force, inward).clamp(min=0)
+    elif shared.stacked is not None:
+        readings["signal"] = shared.stacked
     return readings, {}
 
 
