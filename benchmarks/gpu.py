@@ -207,6 +207,20 @@ def median_of(taken: Callable[[], float], repeats: int) -> float:
     return statistics.median(times)
 
 
+def replaying(bench: Bench, states: list[SceneState]) -> TactileModule:
+    """Return a module whose calls replay a graph, after a look at whether they read what plain calls do.
+
+    Raises:
+        ValueError: If they do not, to the bit.
+    """
+    touch, plain = bench.module(graph=True), bench.module()
+    for state in states[:CALLS]:
+        found, expected = touch(state), plain(state)
+        if off := [name for name in expected if not torch.equal(found[name], expected[name])]:
+            raise ValueError(f"replayed, {', '.join(off)} is not what a plain call reads")
+    return bench.module(graph=True)
+
+
 def copy_ms(num_bytes: int, repeats: int, device: torch.device) -> float:
     """Return the median time [ms] of a copy that reads and writes so many bytes together, by the faster of two kernels."""
     pairs = [torch.rand(2, max(num_bytes // 8, 1), device=device).unbind(0) for _ in range(num_sets(num_bytes))]
@@ -265,7 +279,7 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
         error_largest=float(error.max()),
         graph=graph,
         plain=plain_ms(touch, states, options.repeats, device),
-        replayed=plain_ms(bench.module(graph=True), states, options.repeats, device),
+        replayed=plain_ms(replaying(bench, states), states, options.repeats, device),
         copy=copy_ms(num_envs * size.moved, options.repeats, device),
         sets=len(sets),
         moved=num_envs * size.moved,

@@ -83,6 +83,7 @@ def test_each_reads_what_it_reads_alone(document, noise):
     both = tgdsl.compile(document(**sensors), dtype=torch.float64)
     assert joined(both) == {"left": ("left", "right"), "right": ("left", "right")}
     assert len(both.plan.queries) == 1
+    assert "computed as one with right" in both.explain() and "computed as one with left" in both.explain()
     alone = {name: tgdsl.compile(document(**{name: sensor}), dtype=torch.float64) for name, sensor in sensors.items()}
     assert [joined(touch) for touch in alone.values()] == [{"left": ()}, {"right": ()}]
     for step in range(4):

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from tgdsl.runtime.batch import BatchSimulation
     from tgdsl.runtime.batch import simulate as simulate
     from tgdsl.runtime.connect import connect as connect
+    from tgdsl.runtime.warp import WarpSimulation
     from tgdsl.state import SceneState
 
 _PLACES = {
@@ -44,6 +45,7 @@ _PLACES = {
     "StateError": "errors",
     "TactileModule": "module",
     "TgdslError": "errors",
+    "WarpSimulation": "runtime.warp",
     "compile": "compiler.pipeline",
     "connect": "runtime.connect",
     "instrument": "compiler.scene",
@@ -64,6 +66,7 @@ __all__ = [
     "StateError",
     "TactileModule",
     "TgdslError",
+    "WarpSimulation",
     "compile",
     "connect",
     "instrument",
