@@ -15,7 +15,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from tgdsl.geometry.planes import Vec, length_and_direction, safe_roots, tie
+from tgdsl.geometry.planes import Vec, length_and_direction, length_and_inverse, tie
 
 Shape = Callable[[Vec, Vec], tuple[Tensor, Vec]]
 
@@ -48,15 +48,14 @@ def box(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     qx, qy, qz = (part.abs() - half for part, half in zip(point, size, strict=True))
     sx, sy, sz = (torch.where(part < -tie(), -1.0, 1.0).to(part.dtype) for part in point)
     wx, wy, wz = qx.clamp(min=0), qy.clamp(min=0), qz.clamp(min=0)
-    outside, inverse = safe_roots(wx * wx + wy * wy + wz * wz)
-    is_outside = outside > tie()
+    outside, is_inside, inverse = length_and_inverse(wx * wx + wy * wy + wz * wz)
     inside = torch.maximum(torch.maximum(qx, qy), qz)
     is_x = qx >= torch.maximum(qy, qz) - tie()
     is_y = ~is_x & (qy >= qz - tie())
     gradient = (
-        sx * torch.where(is_outside, wx * inverse, is_x.to(sx.dtype)),
-        sy * torch.where(is_outside, wy * inverse, is_y.to(sy.dtype)),
-        sz * torch.where(is_outside, wz * inverse, (~is_x & ~is_y).to(sz.dtype)),
+        sx * torch.where(is_inside, is_x.to(sx.dtype), wx * inverse),
+        sy * torch.where(is_inside, is_y.to(sy.dtype), wy * inverse),
+        sz * torch.where(is_inside, (~is_x & ~is_y).to(sz.dtype), wz * inverse),
     )
     return outside + inside.clamp(max=0), gradient
 
@@ -68,11 +67,10 @@ def cylinder(point: Vec, size: Vec) -> tuple[Tensor, Vec]:
     qr, qz = radial - size[0], z.abs() - size[1]
     sz = torch.where(z < -tie(), -1.0, 1.0).to(z.dtype)
     wr, wz = qr.clamp(min=0), qz.clamp(min=0)
-    outside, inverse = safe_roots(wr * wr + wz * wz)
-    is_outside = outside > tie()
+    outside, is_inside, inverse = length_and_inverse(wr * wr + wz * wz)
     is_wall = qr >= qz - tie()
-    along_radius = torch.where(is_outside, wr * inverse, is_wall.to(wr.dtype))
-    along_axis = torch.where(is_outside, wz * inverse, (~is_wall).to(wz.dtype))
+    along_radius = torch.where(is_inside, is_wall.to(wr.dtype), wr * inverse)
+    along_axis = torch.where(is_inside, (~is_wall).to(wz.dtype), wz * inverse)
     distance = outside + torch.maximum(qr, qz).clamp(max=0)
     return distance, (along_radius * ux, along_radius * uy, along_axis * sz)
 
