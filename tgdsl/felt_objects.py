@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import split, vec
 from tgdsl.geometry.points import PointSource
 from tgdsl.geometry.query import FeltObject, RaycastSurface
+from tgdsl.geometry.search import geom_tables, is_searchable
 from tgdsl.plan import Inputs, Plan, PlannedObject, PlannedPoints
 
 
@@ -33,6 +35,24 @@ class FeltObjects:
     def kept(self) -> tuple[str, ...]:
         """Paths of the arrays that are no constants: the triangles."""
         return tuple(f"{part}/" for part in self._raycast)
+
+    def searched(self) -> dict[str, np.ndarray]:
+        """Return by path what searches are given that is the same at all calls: see `geometry.search.Tables`."""
+        plan, found = self._plan, {}
+        primitives = {name: value for name, value in plan.arrays.items() if name.startswith("objects/") and value.ndim == 3}
+        constants = Constants(primitives, torch.float64)
+        for i, query in enumerate(plan.queries):
+            for a, answer in enumerate(query.answers):
+                path, targets = f"queries/{i}/{a}/search", [plan.objects[query.objects[o]] for o in answer.objects]
+                if not is_searchable([shape for target in targets for shape in target.shapes], answer.needs):
+                    continue
+                first = np.array([target.first_pair for target in targets])
+                pair = plan.arrays[f"queries/{i}/pair"][list(answer.objects)] + first[:, None]
+                found[f"{path}/pair"] = pair.astype(np.int32)
+                if all(target.num_variants == 1 and not target.is_sized for target in targets):
+                    tables = geom_tables([self.felt(target, constants, {}) for target in targets])
+                    found |= {f"{path}/{name}": own.numpy() for name, own in zip(("spheres", "geoms"), tables, strict=True)}
+        return found
 
     def felt(self, target: PlannedObject, constants: Constants, tensors: Mapping[str, Tensor]) -> FeltObject:
         """Return an object as each environment has it."""

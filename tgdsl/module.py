@@ -26,7 +26,8 @@ from tgdsl.felt_objects import FeltObjects
 from tgdsl.geometry.contacts import Contacts, contacts
 from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.points import with_points
-from tgdsl.geometry.query import Felt, FeltObject, Near, Pairs, Probes, feel, measure, relate, search
+from tgdsl.geometry.query import Felt, FeltObject, Near, Pairs, Probes, feel, measure, relate
+from tgdsl.geometry.search import Tables, search
 from tgdsl.graphed import Graphed
 from tgdsl.history import History, last_step
 from tgdsl.memory import Memory, store
@@ -88,7 +89,8 @@ class TactileModule(nn.Module):
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
         self._felt_objects = FeltObjects(plan)
         unused = ("layout/", *self._felt_objects.kept)
-        self.constants = Constants({k: v for k, v in plan.arrays.items() if not k.startswith(unused)}, dtype)
+        arrays = {k: v for k, v in plan.arrays.items() if not k.startswith(unused)}
+        self.constants = Constants(arrays | self._felt_objects.searched(), dtype)
         self.memory = Memory(plan.sensors)
         self.histories = nn.ModuleDict(
             {
@@ -405,7 +407,10 @@ class TactileModule(nn.Module):
                 shift = stages.radius_shift(half_width, now, probes.pos[0])
                 reach = stages.shifted(reach[:, None], shift)
             found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
-            felt = search(own, probes, answer.objects, targets, reach, answer.needs, found)
+            felt = None
+            if known := [name for name in Tables._fields if f"queries/{i}/{a}/search/{name}" in self.constants]:
+                tables = self.constants.under(f"queries/{i}/{a}/search", known)
+                felt = search(own, probes, [targets[o] for o in answer.objects], tables, reach, answer.needs, found)
             if felt is None:
                 near = near if near is not None else measure(pairs, probes, targets)
                 felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)

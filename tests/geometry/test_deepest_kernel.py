@@ -12,6 +12,7 @@ from tgdsl.fusion import HAS_TRITON
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, split, vec
 from tgdsl.geometry.query import FeltObject, Motion, Pairs, Probes, feel, measure
+from tgdsl.geometry.search import Tables, geom_tables
 
 TOLERANCE = 3e-7
 """Of places within half a metre in float32 [m]; directions are off by as much over the distance that makes them."""
@@ -81,10 +82,17 @@ def by_torch(pairs, probes, which, objects, reach):
     return felt.depth, torch.stack(felt.normal), torch.stack([*felt.velocity, *felt.angular])
 
 
-def by_kernel(pairs, probes, which, objects, reach):
+def deepest_of(pairs, probes, which, objects, reach):
+    """Return what the kernel finds."""
     from tgdsl.geometry.deepest_kernel import deepest
 
-    found = deepest(pairs, probes, which, objects, reach)
+    felt = [objects[index] for index in which]
+    pair = torch.stack([probes.pair[index] + objects[index].first_pair for index in which]).int()
+    return deepest(pairs, probes.pos, Tables(pair, *geom_tables(felt)), reach)
+
+
+def by_kernel(pairs, probes, which, objects, reach):
+    found = deepest_of(pairs, probes, which, objects, reach)
     assert found.pair.dtype == torch.int32 and found.depth.dtype == torch.float32
 
     def won(part):
@@ -150,11 +158,9 @@ def scene(shapes, size, pos, depths):
 
 def check_ties():
     """The first among equals wins, of objects and of geoms, and of a box's faces."""
-    from tgdsl.geometry.deepest_kernel import deepest
-
     box = ("box",), [[0.01, 0.01, 0.01]], [[0.0, 0.0, 0.0]]
     for depths, winner in (((0.001, 0.001), 0), ((0.001, 0.001 + 5e-8), 0), ((0.001, 0.001 + 5e-7), 1), ((-0.001, 0.0), -1)):
-        found = deepest(*scene(*box, depths))
+        found = deepest_of(*scene(*box, depths))
         assert found.pair.item() == winner, depths
         assert found.normal[2].item() == (winner >= 0)
     for nearer, x in ((0.0, 0.0), (5e-8, 0.0), (5e-7, -1.0)):  # one box below, and one beside that is as near or nearer
@@ -170,18 +176,6 @@ def check_ties():
             torch.testing.assert_close(by_kernel(*arguments)[:2], by_torch(*arguments)[:2], rtol=0, atol=2e-7)
 
 
-def check_searchable():
-    """The kernel is asked of several primitives, and of what it knows."""
-    from tgdsl.geometry.deepest_kernel import THRESHOLD, is_searchable
-
-    target = made("several geoms", torch.float32)[3][0]
-    many = [target] * THRESHOLD
-    assert is_searchable(many, {"normal"}) and is_searchable(many, ())
-    assert not is_searchable(many, {"normal", "distance"})
-    assert not is_searchable([target._replace(shapes=("box",))] * (THRESHOLD - 1), NEEDS)
-    assert not is_searchable([*many, target._replace(shapes=("ellipsoid", "box", "box"))], NEEDS)
-
-
 def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
     from tgdsl.geometry import deepest_kernel
@@ -191,7 +185,6 @@ def compare() -> None:
         check(case)
     check_strange_poses()
     check_ties()
-    check_searchable()
 
 
 @pytest.mark.skipif(not HAS_TRITON, reason="Triton is not installed")

@@ -13,8 +13,6 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects,
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import torch
@@ -26,9 +24,9 @@ from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.query import FeltObject, Pairs, Probes
+from tgdsl.geometry.query import Pairs
+from tgdsl.geometry.search import Tables
 from tgdsl.geometry.shapes_kernel import (
-    SHAPES,
     TIE,
     chosen,
     distance_to,
@@ -43,16 +41,8 @@ from tgdsl.geometry.shapes_kernel import (
 
 BLOCK = 64
 """Probes of a program, which is one warp: two for each of its lanes."""
-THRESHOLD = 5
-"""Geoms from which on the kernel is used: it takes 0.05 ms for 1.6 million probes however few there are."""
-EVERYWHERE = 3e38
-"""Bound of a plane [m]: finite, but not its square, so that no place is beyond it, and −∞ added to it is −∞."""
-SPHERE = SHAPES.index("sphere")
-MARGIN = 1e-6
-"""By how much farther than its reach a geom is passed over [m]: ten times `TIE`, and the rounding of float32."""
-
 POS, ROTATION, BOUND, KIND, ROW = tl.constexpr(3), tl.constexpr(6), tl.constexpr(15), tl.constexpr(16), tl.constexpr(17)
-"""Columns of the geoms' table, which begins with the size, and their number."""
+"""Columns of the geoms' table, see `search.Tables`, which begins with the size, and their number."""
 
 
 class Deepest(NamedTuple):
@@ -69,93 +59,17 @@ class Deepest(NamedTuple):
     pair: Int[Tensor, "env taxel"]
 
 
-def is_searchable(objects: Sequence[FeltObject], needs: Collection[str]) -> bool:
-    """Return whether the kernel can answer: only primitives but ellipsoids, more than a geom, nothing but normal and motion."""
-    shapes = [shape for target in objects for shape in target.shapes]
-    is_known = all(shape in SHAPES for shape in shapes) and all(need in ("normal", "motion") for need in needs)
-    return is_known and len(shapes) >= THRESHOLD
-
-
-def deepest(
-    pairs: Pairs, probes: Probes, which: Sequence[int], objects: Sequence[FeltObject], reach: Float[Tensor, "object *env taxel"]
-) -> Deepest:
+def deepest(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *env taxel"]) -> Deepest:
     """Return what the probes are deepest in.
 
     Args:
         pairs: Relative poses of all pairs of the plan; the gate holds.
-        probes: The probes.
-        which: Indices of the objects that are felt, the first of equals first.
-        objects: The query's objects, in the order of `probes.pair`.
+        pos: Positions of the probes in their links' frames [m].
+        tables: The objects that are felt.
         reach: Radius of each probe towards each of those felt [m]; −∞ where the probe is inactive or the pair cannot meet.
     """
-    felt = [objects[index] for index in which]
-    depth, normal, winner = _deepest(
-        [*pairs.rotation, *pairs.offset], list(probes.pos), _pairs(probes, which, felt), reach, pairs.gate, *_tables(felt)
-    )  # fmt: skip
+    depth, normal, winner = _deepest([*pairs.rotation, *pairs.offset], list(pos), tables.pair, reach, pairs.gate, *tables[1:])
     return Deepest(depth, planes.vec(normal.unbind()), winner)
-
-
-# Tables are made of many small arrays at each call, so of as few operations as can be: each is a kernel of a microsecond.
-
-
-def _pairs(probes: Probes, which: Sequence[int], felt: Sequence[FeltObject]) -> Int[Tensor, "object taxel"]:
-    """Return the index of each probe's pair with each felt object among all pairs."""
-    first, step = felt[0].first_pair, felt[0].num_pairs
-    if list(which) == list(range(len(probes.pair))) and all(o.first_pair == first + step * i for i, o in enumerate(felt)):
-        return (probes.pair + step * torch.arange(len(felt), device=probes.pair.device)[:, None] + first).int()
-    return torch.stack([probes.pair[index] + target.first_pair for index, target in zip(which, felt, strict=True)]).int()
-
-
-def _tables(objects: Sequence[FeltObject]) -> tuple[Tensor, Tensor]:
-    """Return bound and number of geoms of each object (case, object, 2), and size … kind of each geom (case, geom, row).
-
-    A bound is the radius of a sphere that holds it, about its frame's origin [m]; −∞ if it is absent. A kind is negative if the
-    geom has a frame of its own.
-    """
-    parts = [part for target in objects for part in (target.size, target.pos, target.rotation, target.is_absent)]
-    num_cases = next((part.shape[0] for part in parts if part is not None and part.shape[0] != 1), 1)
-    counts = [len(target.shapes) for target in objects]
-    each = [geom for target in objects for geom in zip(target.shapes, target.is_centred, strict=True)]
-    shape = _filled(parts[0], [float(SHAPES.index(shape)) for shape, _ in each])
-    is_centred = _filled(parts[0], [float(is_centred) for _, is_centred in each]) > 0
-    size, pos, rotation = (
-        _side_by_side([getattr(target, name).expand(num_cases, -1, -1) for target in objects])
-        for name in ("size", "pos", "rotation")
-    )
-    x, y, z = planes.split(size)
-    y = torch.where(shape == SPHERE, 0.0, y)
-    squared = x * x + y * y + torch.where(shape == SHAPES.index("box"), z * z, 0.0)
-    bound = torch.where(shape <= SHAPES.index("capsule"), x + y, planes.safe_sqrt(squared))
-    bound = torch.where(shape == SHAPES.index("plane"), EVERYWHERE, bound + MARGIN)
-    if any(target.is_absent is not None for target in objects):
-        masks = [target.size[..., 0] < -1 if target.is_absent is None else target.is_absent for target in objects]
-        bound = torch.where(_side_by_side([mask.expand(num_cases, -1) for mask in masks]), -torch.inf, bound)
-    kind = torch.where(shape > SPHERE, shape - 1, shape)  # a sphere is a capsule without a length
-    kind = torch.where(is_centred, kind, -kind).expand(num_cases, -1)
-    geoms = torch.cat([torch.stack([x, y, z], dim=-1), pos, rotation, bound[..., None], kind[..., None]], dim=-1)
-    held = torch.where(is_centred, bound, bound + planes.safe_sqrt(planes.dot(planes.split(pos), planes.split(pos))))
-    if len(set(counts)) == 1:
-        held = held.unflatten(1, (len(objects), counts[0])).amax(dim=2)
-    else:
-        held = torch.stack([own.amax(dim=1) for own in held.split(counts, dim=1)], dim=1)
-    return torch.stack([held, _filled(held, [float(count) for count in counts]).expand(num_cases, -1)], dim=-1), geoms
-
-
-def _filled(like: Tensor, values: Sequence[float]) -> Float[Tensor, "1 value"]:
-    """Return numbers as a tensor, without a copy from the host."""
-    runs = [(value, len(list(run))) for value, run in groupby(values)]
-    return torch.cat([like.new_full((1, count), value) for value, count in runs], dim=1)
-
-
-@torch.library.custom_op("tgdsl::side_by_side", mutates_args=())
-def _side_by_side(parts: list[Tensor]) -> Tensor:
-    """Return torch.cat(parts, dim=1), by one kernel: a compiler would make one of each part."""
-    return torch.cat(parts, dim=1)
-
-
-@_side_by_side.register_fake
-def _(parts: list[Tensor]) -> Tensor:
-    return torch.cat(parts, dim=1)
 
 
 @triton_op("tgdsl::deepest", mutates_args={})
@@ -185,7 +99,7 @@ def launch(
         pair: Index of each probe's pair among all.
         reach: As `deepest` has it.
         gate: 0 where a pair may be felt, −∞ where it may not.
-        spheres: The objects, see `_tables`.
+        spheres: The objects, see `Tables`.
         geoms: Their geoms, likewise.
     """
     num_envs, (num_objects, num_taxels) = pose[0].shape[0], pair.shape
