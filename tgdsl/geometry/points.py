@@ -13,7 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
+from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.query import Felt, FeltObject, MetPoints, Pairs, body_distance
 
 
@@ -39,13 +41,24 @@ class PointSource(NamedTuple):
 
 def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Felt:
     """Return an answer with the points of objects added, gated as the pairs are."""
-    found = {}
-    for source in sources:
-        rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
-        offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
-        pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
-        distance, gradient = body_distance(pos, source.links)
-        if pairs.gate is not None:
-            distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
-        found[source.object] = MetPoints(source.taxels, pos, distance, gradient, source.area)
-    return felt._replace(points=found)
+    return felt._replace(points={source.object: _met(pairs, source) for source in sources})
+
+
+def _met(pairs: Pairs, source: PointSource) -> MetPoints:
+    """Return the points of one object."""
+    links, surface = source.links, source.links.surfaces[0]
+    if (
+        isinstance(surface, Grid)
+        and len(links.surfaces) == 1
+        and takes_kernel(*pairs.rotation, *pairs.offset, *source.points, links.pos, links.rotation)
+    ):
+        from tgdsl.geometry.skin_kernel import meet
+
+        return MetPoints(source.taxels, *meet(pairs, source.pair, source.points, links, surface), source.area)
+    rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
+    offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
+    pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
+    distance, gradient = body_distance(pos, links)
+    if pairs.gate is not None:
+        distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
+    return MetPoints(source.taxels, planes.vec(map(stored, pos)), distance, gradient, source.area)

@@ -1,7 +1,7 @@
 """The question every contact sensor asks: how deep is a probe in which object, which way is out, how does it move.
 
 Two steps: `measure` finds the distance of every probe to every object, once, and `feel` makes of it what one sensor feels, of
-which there may be several with different gates, objects and needs. `search` does both where a GPU's kernel can.
+which there may be several with different gates, objects and needs. `search.search` does both where a GPU's kernel can.
 
 Shapes: `env` environments, `pair` (link, object) pairs, `taxel` probes, `geom` geoms of an object, `case` 1, or `env` if the
 object differs between environments. A pair's planes are small, a taxel's are not, so everything that depends on the pair alone
@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fusion import takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.bvh import TriangleMesh, nearest
 from tgdsl.geometry.contacts import Contacts
@@ -151,8 +150,9 @@ class MetPoints(NamedTuple):
 
     Attributes:
         taxels: First of each link's taxels, and one beyond the last.
-        pos: Where they are now [m].
-        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed.
+        pos: Where they are now [m]; a compiler stores them.
+        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what
+            the sensors asked for.
         gradient: Its unit gradient.
         area: Surface of the object that each stands for [m²], (case, 1).
     """
@@ -309,45 +309,6 @@ def feel(
         area={},
         points={},
     )
-
-
-def search(
-    pairs: Pairs,
-    probes: Probes,
-    which: Sequence[int],
-    objects: Sequence[FeltObject],
-    reach: Float[Tensor, "object *env taxel"],
-    needs: Collection[str],
-    contacts: Contacts | None = None,
-) -> Felt | None:
-    """Return what `feel` would of several geoms, found by one kernel; None where there is no such kernel.
-
-    Args:
-        pairs: Relative poses of all pairs of the plan.
-        probes: The probes.
-        which: Indices of the objects that are felt, the first of equals first.
-        objects: The query's objects, in the order of `probes.pair`.
-        reach: As `feel` has it.
-        needs: As `feel` has them.
-        contacts: Handed through.
-    """
-    felt = [objects[index] for index in which]
-    motion = () if pairs.motion is None else (*pairs.motion.linear, *pairs.motion.angular)
-    of_objects = [part for target in felt for part in (target.size, target.pos, target.rotation)]
-    if not takes_kernel(*pairs.offset, *pairs.rotation, *motion, *probes.pos, reach, *of_objects):
-        return None
-    from tgdsl.geometry.deepest_kernel import deepest, is_searchable
-
-    if not is_searchable(felt, [need for need in needs if need != "contacts"]):
-        return None
-    found = deepest(pairs, probes, which, objects, reach)
-    velocity = angular = None
-    if "motion" in needs and pairs.motion is not None:
-        own, is_met = found.pair.clamp(min=0).long(), found.pair >= 0
-        x, y, z, u, v, w = (torch.where(is_met, part.gather(1, own), 0.0) for part in motion)
-        velocity, angular = planes.add((x, y, z), planes.cross((u, v, w), probes.pos)), (u, v, w)
-    normal = found.normal if "normal" in needs else None
-    return Felt(found.depth, normal, velocity, angular, {}, {}, contacts, {}, {}, {}, {})
 
 
 def _distance(pairs: Pairs, probes: Probes, target: FeltObject, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:

@@ -11,8 +11,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-SHAPES = ("", "plane", "sphere", "capsule", "cylinder", "box")
-"""The shapes that kernels know. For one a sphere is a capsule without a length, and what comes after it moves up by one."""
 CAPSULE, CYLINDER, BOX = tl.constexpr(2.0), tl.constexpr(3.0), tl.constexpr(4.0)
 TIE = tl.constexpr(1e-7)
 """As `planes.tie()`, of which a kernel can see constants alone."""
@@ -40,9 +38,9 @@ def gradient_of(shape, size, point):
     first, second = tl.load(size), tl.load(size + 1)
     gradient = (tl.zeros_like(x), tl.zeros_like(x), tl.full(x.shape, 1.0, tl.float32))
     if is_any(shape == CAPSULE):
-        gradient = chosen(shape == CAPSULE, _direction(x, y, z - tl.clamp(z, -second, second)), gradient)
+        gradient = chosen(shape == CAPSULE, direction(x, y, z - tl.clamp(z, -second, second)), gradient)
     if is_any(shape == CYLINDER):
-        ux, uy, _ = _direction(x, y, tl.zeros_like(x))
+        ux, uy, _ = direction(x, y, tl.zeros_like(x))
         wall, _, end = _from_walls(tl.sqrt(x * x + y * y) - first, float("-inf"), tl.abs(z) - second)
         gradient = chosen(shape == CYLINDER, (wall * ux, wall * uy, end * _sign(z)), gradient)
     if is_any(shape == BOX):
@@ -71,7 +69,7 @@ def _from_walls(x, y, z):
 
 
 @triton.jit
-def _direction(x, y, z):
+def direction(x, y, z):
     """Return the unit vector along one, a fixed one if it is null."""
     norm = length(x, y, z)
     inverse = 1.0 / tl.where(norm <= TIE, 1.0, norm)

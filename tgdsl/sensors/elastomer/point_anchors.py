@@ -55,10 +55,9 @@ def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> 
     """Return what the points of each object pull with, and the new anchors."""
     pulls, after, start = [], {name: [] for name in PLANES}, 0
     for points in met:
-        place = planes.vec(map(stored, points.pos))
         # Flat as the state is: a compiler then reads and writes that in one loop.
         distance = points.distance.flatten(1)
-        pos, gradient = (planes.vec(part.flatten(1) for part in vector) for vector in (place, points.gradient))
+        pos, gradient = (planes.vec(part.flatten(1) for part in vector) for vector in (points.pos, points.gradient))
         end = start + distance.shape[1]
         x, y, z, held = (state[name][:, start:end] for name in PLANES)
         anchor, start = (x, y, z), end
@@ -74,7 +73,7 @@ def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> 
         is_taken = ~is_held & (law.reach - distance > law.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
         shape = points.distance.shape[1:]
-        pulls.append(Pull(place, planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))))
+        pulls.append(Pull(points.pos, planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))))
         for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
             after[name].append(plane)
     return pulls, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}

@@ -1,0 +1,226 @@
+"""Points of an object in the links' frames, and how deep in the links' own surfaces, on a GPU, in one kernel.
+
+It is what `points.with_points` finds where each link's surface is one grid. A program takes one link of one environment and
+all points, a block after the other. Nothing is looked up where the gate is closed or a whole block is outside the grid. Outside
+the distance reads +∞ and its gradient 0: grids hold all distances that those who ask for points want to know.
+
+Shapes: `env` environments, `pair` pairs, `link` links that may meet the object, `point` its points, `case` 1, or `env` if the
+object differs between environments, `node` nodes of all grids.
+"""
+
+# What a kernel's types are only Triton's compiler knows.
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.library import triton_op, wrap_triton
+
+from tgdsl.geometry.grid import Grid
+from tgdsl.geometry.planes import Vec, vec
+from tgdsl.geometry.query import FeltObject, Pairs
+from tgdsl.geometry.shapes_kernel import TIE, chosen, direction, is_any, loaded, rotate, rotate_back
+
+BLOCK = 32
+"""Points that are looked up together, by a program of one warp; two for each lane do not fit into its registers."""
+GEOM, ORIGIN, CELL, FRAME = tl.constexpr(3), tl.constexpr(12), tl.constexpr(15), tl.constexpr(16)
+"""Columns of the frames' table, which begins with the geom's place, and their number."""
+
+
+def meet(
+    pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: FeltObject, grid: Grid
+) -> tuple[Vec, Float[Tensor, "env link point"], Vec]:
+    """Return the points' places in the links' frames [m], signed distances to their surfaces [m], and unit gradients.
+
+    Args:
+        pairs: Relative poses of all pairs; where the gate is closed the distance is +∞.
+        pair: Index of the pair of each link and the object.
+        points: Places in the object's frame [m], planes (case, 1, point).
+        links: The links' own surfaces: an object of one geom whose cases are links.
+        grid: That geom's grids.
+    """
+    frames = torch.cat([links.pos[:, 0], links.rotation[:, 0], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)
+    counts = torch.cat([part.reshape(-1, 1) for part in (grid.first, *grid.num)], dim=1)  # type: ignore[union-attr]
+    where = torch.stack(points)[:, :, 0]
+    found = _meet(
+        [*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, grid.values, links.shapes[0] == "tricubic"
+    )
+    x, y, z, distance, *gradient = found.unbind()
+    return (x, y, z), distance, vec(gradient)
+
+
+@triton_op("tgdsl::meet", mutates_args={})
+def _meet(
+    pose: list[Tensor],
+    gate: Tensor | None,
+    pair: Tensor,
+    points: Tensor,
+    frames: Tensor,
+    counts: Tensor,
+    values: Tensor,
+    is_cubic: bool,
+) -> Tensor:
+    return launch(wrap_triton(kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
+
+
+def launch(
+    run: Any,
+    pose: list[Float[Tensor, "env pair"]],
+    gate: Float[Tensor, "env pair"] | None,
+    pair: Int[Tensor, " link"],
+    points: Float[Tensor, "3 case point"],
+    frames: Float[Tensor, "link 16"],
+    counts: Int[Tensor, "link 4"],
+    values: Float[Tensor, " node"],
+    is_cubic: bool,
+) -> Float[Tensor, "7 env link point"]:
+    """Run the kernel, plain or wrapped, and return places, distance and gradient.
+
+    Args:
+        run: The kernel.
+        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
+            that lie in memory alike.
+        gate: Negative where a pair may not be felt.
+        pair: Index of each link's pair.
+        points: Places in the object's frame [m].
+        frames: Place and rotation of each link's geom, and origin and spacing of its grid's nodes [m].
+        counts: Index of each grid's first node, and the number of its nodes along each axis.
+        values: `Grid.values`.
+        is_cubic: Whether it is interpolated by cubes.
+    """
+    num_envs, num_links, num_points = pose[0].shape[0], pair.shape[0], points.shape[2]
+    found = pose[0].new_empty((7, num_envs, num_links, num_points))
+    points, gates = points.contiguous(), pose[0] if gate is None else gate
+    run[(num_envs * num_links,)](
+        found, *pose, gates, pair, points, frames.contiguous(), counts.contiguous(), values,
+        num_links, num_points, *pose[0].stride(), *gates.stride(), points.stride(0),
+        points.stride(1) if points.shape[1] != 1 else 0,
+        IS_GATED=gate is not None, IS_CUBIC=is_cubic, BLOCK=BLOCK, num_warps=1,
+    )  # fmt: skip
+    return found
+
+
+@triton.jit
+def kernel(
+    found, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
+    num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
+    IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Write what all points are to one link of one environment; see `launch`."""
+    env, link = (tl.program_id(0) // num_links).to(tl.int64), tl.program_id(0) % num_links
+    pair = tl.load(pairs + link)
+    at = env * pose_env + pair * pose_pair
+    x, y, z = (tl.load(xx + at), tl.load(xy + at), tl.load(xz + at)), (yx + at, yy + at, yz + at), (zx + at, zy + at, zz + at)
+    turn = (
+        x[0], x[1], x[2], tl.load(y[0]), tl.load(y[1]), tl.load(y[2]), tl.load(z[0]), tl.load(z[1]), tl.load(z[2]),
+    )  # fmt: skip
+    shift_x, shift_y, shift_z = tl.load(ox + at), tl.load(oy + at), tl.load(oz + at)
+    is_open = tl.full((), 1, tl.int1)
+    if IS_GATED:
+        is_open = (tl.load(gates + env * gate_env + pair * gate_pair) < 0) == 0  # so is one that is not a number
+    frame, count = frames + link * FRAME, counts + link * 4
+    geom_x, geom_y, geom_z = tl.load(frame), tl.load(frame + 1), tl.load(frame + 2)
+    geom_turn = loaded(frame + GEOM)
+    low_x, low_y, low_z = tl.load(frame + ORIGIN), tl.load(frame + ORIGIN + 1), tl.load(frame + ORIGIN + 2)
+    cell = tl.load(frame + CELL)
+    nodes = values + tl.load(count).to(tl.int64)
+    num_x, num_y, num_z = tl.load(count + 1).to(tl.int32), tl.load(count + 2).to(tl.int32), tl.load(count + 3).to(tl.int32)
+    points += env * point_env
+    plane = (tl.num_programs(0).to(tl.int64)) * num_points
+    found += tl.program_id(0).to(tl.int64) * num_points
+    for start in range(0, num_points, BLOCK):
+        point = start + tl.arange(0, BLOCK)
+        is_point = point < num_points
+        px, py, pz = (
+            tl.load(points + point, is_point, 0.0), tl.load(points + point_axis + point, is_point, 0.0),
+            tl.load(points + 2 * point_axis + point, is_point, 0.0),
+        )  # fmt: skip
+        here = rotate_back(turn, (px - shift_x, py - shift_y, pz - shift_z))
+        tl.store(found + point, here[0], is_point)
+        tl.store(found + plane + point, here[1], is_point)
+        tl.store(found + 2 * plane + point, here[2], is_point)
+        distance = tl.full((BLOCK,), float("inf"), tl.float32)
+        gradient = (tl.zeros_like(distance), tl.zeros_like(distance), tl.zeros_like(distance))
+        if is_open:
+            own = rotate_back(geom_turn, (here[0] - geom_x, here[1] - geom_y, here[2] - geom_z))
+            u, v, w = (own[0] - low_x) / cell, (own[1] - low_y) / cell, (own[2] - low_z) / cell
+            is_out = _is_beyond(u, num_x) | _is_beyond(v, num_y) | _is_beyond(w, num_z) | (is_point == 0)
+            if is_any(is_out == 0):
+                value, slope = _interpolated(nodes, (u, v, w), (num_x, num_y, num_z), TIE / cell, is_out == 0, IS_CUBIC)
+                distance = tl.where(is_out, distance, value)
+                slope = chosen(value != value, gradient, (slope[0] / cell, slope[1] / cell, slope[2] / cell))
+                outward = rotate(geom_turn, direction(slope[0], slope[1], slope[2]))
+                gradient = chosen(is_out, gradient, outward)
+        tl.store(found + 3 * plane + point, distance, is_point)
+        tl.store(found + 4 * plane + point, gradient[0], is_point)
+        tl.store(found + 5 * plane + point, gradient[1], is_point)
+        tl.store(found + 6 * plane + point, gradient[2], is_point)
+
+
+@triton.jit
+def _is_beyond(place, num):
+    """Return whether places along an axis are outside a grid; what is no number is not."""
+    return (place < 0) | (place > num - 1)
+
+
+@triton.jit
+def _interpolated(nodes, place, num, slack, is_wanted, IS_CUBIC: tl.constexpr):
+    """Return the distance at places within one grid [m], and its slope along the axes [m per cell]; as `grid` has them."""
+    x, y, z = _lower(place[0], num[0], slack), _lower(place[1], num[1], slack), _lower(place[2], num[2], slack)
+    t_x, t_y, t_z = place[0] - x, place[1] - y, place[2] - z
+    total = tl.zeros_like(t_x)
+    slope = (total, total, total)
+    for i in tl.static_range(4 if IS_CUBIC else 2):
+        w_x, d_x = _weight(t_x, i, IS_CUBIC)
+        sheet, sheet_y, sheet_z = tl.zeros_like(t_x), tl.zeros_like(t_x), tl.zeros_like(t_x)
+        rows = _node(x, i, num[0], IS_CUBIC) * num[1]
+        for j in tl.static_range(4 if IS_CUBIC else 2):
+            w_y, d_y = _weight(t_y, j, IS_CUBIC)
+            row = (rows + _node(y, j, num[1], IS_CUBIC)) * num[2]
+            line, line_z = tl.zeros_like(t_x), tl.zeros_like(t_x)
+            for k in tl.static_range(4 if IS_CUBIC else 2):
+                value = tl.load(nodes + (row + _node(z, k, num[2], IS_CUBIC)), is_wanted, 0.0)
+                w_z, d_z = _weight(t_z, k, IS_CUBIC)
+                line += w_z * value
+                line_z += d_z * value
+            sheet += w_y * line
+            sheet_y += d_y * line
+            sheet_z += w_y * line_z
+        total += w_x * sheet
+        slope = (slope[0] + d_x * sheet, slope[1] + w_x * sheet_y, slope[2] + w_x * sheet_z)
+    return total, slope
+
+
+@triton.jit
+def _lower(place, num, slack):
+    """Return the number of the node below a place along an axis; an arbitrary one where it is no number."""
+    return tl.minimum(tl.maximum(tl.floor(place + slack).to(tl.int32), 0), num - 2)
+
+
+@triton.jit
+def _node(lower, k: tl.constexpr, num, IS_CUBIC: tl.constexpr):
+    """Return the number of a weight's node along an axis; beyond the border the outermost ones repeat."""
+    return tl.minimum(tl.maximum(lower + (k - 1), 0), num - 1) if IS_CUBIC else lower + k
+
+
+@triton.jit
+def _weight(t, k: tl.constexpr, IS_CUBIC: tl.constexpr):
+    """Return the weight of the k-th node along an axis, and its derivative; as `grid` has them."""
+    if not IS_CUBIC:
+        one = tl.full(t.shape, 1.0, tl.float32)
+        weight, slope = (1 - t, -one) if k == 0 else (t, one)
+    elif k == 0:
+        weight, slope = 0.5 * t * (t * (2 - t) - 1), 0.5 * (t * (4 - 3 * t) - 1)
+    elif k == 1:
+        weight, slope = 0.5 * (t * t * (3 * t - 5) + 2), 0.5 * t * (9 * t - 10)
+    elif k == 2:
+        weight, slope = 0.5 * t * (t * (4 - 3 * t) + 1), 0.5 * (t * (8 - 9 * t) + 1)
+    else:
+        weight, slope = 0.5 * t * t * (t - 1), 0.5 * t * (3 * t - 2)
+    return weight, slope
