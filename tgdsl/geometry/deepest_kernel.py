@@ -152,16 +152,22 @@ def kernel(
     winner = tl.full((BLOCK,), -1, tl.int32)
     met = tl.full((BLOCK,), -1, tl.int32)
     first = tl.full((), 0, tl.int32)
-    for _ in range(num_objects):
+    next_pair = tl.load(own_pair)
+    next_radius, next_shift, next_strange = _begun(
+        next_pair, radii, gates, env * gate_env, gate_pair, (ox, oy, oz, xy), pose, pose_pair, IS_GATED
+    )
+    for k in range(num_objects):
         last = first + tl.load(spheres + 1).to(tl.int32)
-        pair = tl.load(own_pair)
+        pair, radius, shift, strange = next_pair, next_radius, next_shift, next_strange
         at = pose + pair * pose_pair
-        radius = tl.load(radii)
-        if IS_GATED:
-            radius += tl.load(gates + (env * gate_env + pair * gate_pair))
-        shift = (tl.load(ox + at), tl.load(oy + at), tl.load(oz + at))
-        # If an orientation is not a number, no part of the rotation is, and its object is never passed over.
-        strange = 0.0 * tl.load(xy + at)
+        # The next object is loaded before this one is judged, as it takes long; after the last one it is that one again.
+        is_more = k + 1 < num_objects
+        own_pair += tl.where(is_more, NUM_TAXELS, 0)
+        radii += tl.where(is_more, reach_object, 0)
+        next_pair = tl.load(own_pair)
+        next_radius, next_shift, next_strange = _begun(
+            next_pair, radii, gates, env * gate_env, gate_pair, (ox, oy, oz, xy), pose, pose_pair, IS_GATED
+        )
         if _is_any_within(dot(shift, shift) + strange, tl.load(bounds) + arm + radius):
             px, py, pz = rotate(_pose(turns, at), (x, y, z))
             px, py, pz = px + shift[0], py + shift[1], pz + shift[2]
@@ -190,8 +196,6 @@ def kernel(
             met = tl.where(is_deeper, pair, met)
             depth = tl.maximum(depth, reached, propagate_nan=tl.PropagateNan.ALL)
         first = last
-        own_pair += NUM_TAXELS
-        radii += reach_object
         spheres += 2
         bounds += 2
 
@@ -215,6 +219,19 @@ def kernel(
     tl.store(normal_out + out, normal[0], is_probe)
     tl.store(normal_out + plane + out, normal[1], is_probe)
     tl.store(normal_out + 2 * plane + out, normal[2], is_probe)
+
+
+@triton.jit
+def _begun(pair, radii, gates, gate_row, gate_pair, pose, row, pose_pair, IS_GATED: tl.constexpr):
+    """Return what tells whether probes can meet an object: their radii, where its links are, and what is 0 if it is somewhere.
+
+    If an orientation is not a number, no part of the rotation is, and its object is never passed over.
+    """
+    at = row + pair * pose_pair
+    radius = tl.load(radii)
+    if IS_GATED:
+        radius += tl.load(gates + (gate_row + pair * gate_pair))
+    return radius, (tl.load(pose[0] + at), tl.load(pose[1] + at), tl.load(pose[2] + at)), 0.0 * tl.load(pose[3] + at)
 
 
 @triton.jit

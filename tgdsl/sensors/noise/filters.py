@@ -5,12 +5,12 @@ Shapes: `env` environments, `channel` numbers of the signal, `row` its rows; val
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from tgdsl.fusion import stored
+from tgdsl.fusion import stored, takes_kernel
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.instant import Now, Signal
 
@@ -33,18 +33,23 @@ def hysteresis(
 def crosstalk(signal: Signal, values: Mapping[str, Tensor]) -> Signal:
     """Spread each taxel's signal over its link, a product for each: with W, or with G where χ or σ differ between episodes."""
     given = signal * values["crosstalk_strength"] if "crosstalk_strength" in values else signal
-    lines = given.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
-    parts, start = [], 0
-    for name in sorted(name for name in values if name.startswith(KERNEL)):
-        kernel = values[name]
-        own = lines[:, start : start + kernel.shape[-1]]
-        mixed = (own @ kernel[0].T).view(*signal.shape[:2], -1)
-        if len(kernel) > 1:
-            mixed = mixed + values["crosstalk_mixture"] * (own @ kernel[1].T).view(mixed.shape)
-        parts.append(mixed)
-        start += kernel.shape[-1]
-    spread = torch.cat(parts, dim=-1)
-    return signal - given + spread if "crosstalk_strength" in values else spread
+    kernels = [values[name] for name in sorted(name for name in values if name.startswith(KERNEL))]
+    mixed = _product(given, [kernel[0] for kernel in kernels])
+    if len(kernels[0]) > 1:
+        mixed = mixed + values["crosstalk_mixture"] * _product(given, [kernel[1] for kernel in kernels])
+    return signal - given + mixed if "crosstalk_strength" in values else mixed
+
+
+def _product(signal: Signal, operators: Sequence[Tensor]) -> Signal:
+    """Return the signal with each link's rows multiplied by its operator, (to, from)."""
+    lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
+    if takes_kernel(lines, *operators):
+        from tgdsl.sensors.noise.crosstalk_kernel import spread
+
+        return spread(lines.contiguous(), operators).view(signal.shape)
+    parts = lines.split([len(operator) for operator in operators], dim=1)
+    products = [own @ operator.T for own, operator in zip(parts, operators, strict=True)]
+    return torch.cat(products, dim=-1).view(signal.shape)
 
 
 def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now) -> Signal:
