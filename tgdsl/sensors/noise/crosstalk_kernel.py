@@ -22,10 +22,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-MIN_BLOCK, BLOCK = 16, 64
-"""Fewest numbers along each side of a product of blocks, and most outputs of a tile."""
-MAX_WHOLE = 2 * BLOCK
-"""Largest link whose operator a program holds for all its lines."""
+MIN_BLOCK, BLOCK, LINES = 16, 64, 64
+"""Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block."""
+LARGEST = 2 * BLOCK
+"""Most taxels of a link: a program holds a tile's part of the operator for all its lines, in registers and shared memory."""
 NUM_PROGRAMS, MAX_STEPS = 768, 8
 """Programs that a GPU should have, three for each that an H200 runs at once, and most blocks of lines of a program.
 
@@ -52,22 +52,16 @@ def launch(kernel: Any, signal: Float[Tensor, "line row"], operators: Sequence[F
     num_lines, num_rows = signal.shape
     found = torch.empty_like(signal)
     largest = max(len(operator) for operator in operators)
-    is_whole = largest <= MAX_WHOLE
-    block = _padded(min(largest, BLOCK))
+    assert largest <= LARGEST
+    block, rest = _padded(min(largest, BLOCK)), _padded(largest - BLOCK) if largest > BLOCK else 0
     operators_flat, tiles = _joined(operators, block)
-    num_tiles = len(tiles) // COLUMNS.value
-    # Registers hold such blocks without spills; two programs run side by side where the operator is held, one elsewhere.
-    if is_whole:
-        rest = _padded(largest - BLOCK) if largest > BLOCK else 0
-        shape = {"LINES": 64, "FROM": block, "REST": rest, "num_warps": 4, "num_stages": 2 if rest == BLOCK else 3}
-    else:
-        shape = {"LINES": 128, "FROM": 32, "REST": 0, "num_warps": 8, "num_stages": 3}
-    num_blocks = triton.cdiv(num_lines, shape["LINES"])
+    num_tiles, num_blocks = len(tiles) // COLUMNS.value, triton.cdiv(num_lines, LINES)
     steps = min(max(num_blocks * num_tiles // NUM_PROGRAMS, 1), MAX_STEPS)
     if signal.numel() > 0:
         kernel[(num_tiles * triton.cdiv(num_blocks, steps),)](
-            signal, operators_flat, tiles, found, num_lines, num_rows, num_tiles, steps, IS_WHOLE=is_whole, TO=block, **shape
-        )
+            signal, operators_flat, tiles, found, num_lines, num_rows, num_tiles, steps,
+            LINES=LINES, SIZE=block, REST=rest, num_warps=4, num_stages=2 if rest == BLOCK else 3,
+        )  # fmt: skip
     return found
 
 
@@ -108,9 +102,9 @@ def _(operators: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
 @triton.jit
 def kernel(
     signal, operators, tiles, found, num_lines, num_rows, num_tiles, steps,
-    IS_WHOLE: tl.constexpr, LINES: tl.constexpr, TO: tl.constexpr, FROM: tl.constexpr, REST: tl.constexpr,
+    LINES: tl.constexpr, SIZE: tl.constexpr, REST: tl.constexpr,
 ):  # fmt: skip
-    """Multiply `steps` blocks of lines by one tile of a link's operator: whole, in one or two parts, or block by block."""
+    """Multiply `steps` blocks of lines by one tile of a link's operator, in one or two parts."""
     tiles += tl.program_id(0) % num_tiles * COLUMNS
     row, size, place, first = tl.load(tiles), tl.load(tiles + 1), tl.load(tiles + 2), tl.load(tiles + 3)
     first_line = tl.cast(tl.program_id(0) // num_tiles, tl.int64) * (LINES * steps)
@@ -118,30 +112,21 @@ def kernel(
     signal += first_line * num_rows + row
     found += first_line * num_rows + row
 
-    to, link_from, rest_from = first + tl.arange(0, TO), tl.arange(0, FROM), FROM + tl.arange(0, REST if REST else FROM)
+    to, link_from, rest_from = first + tl.arange(0, SIZE), tl.arange(0, SIZE), SIZE + tl.arange(0, REST if REST else SIZE)
     is_to = (to < size)[None, :]
     is_from, is_rest = link_from < size, rest_from < size
     operators += place + (to * size)[None, :]
     # Padding is zero on both sides of a product: what is not a number in a link stays in it.
-    if IS_WHOLE:
-        operator = tl.load(operators + link_from[:, None], is_to & is_from[:, None], 0.0)
+    operator = tl.load(operators + link_from[:, None], is_to & is_from[:, None], 0.0)
     if REST:
         rest = tl.load(operators + rest_from[:, None], is_to & is_rest[:, None], 0.0)
     for start in range(0, num_left, LINES):
         line = start + tl.arange(0, LINES)
         # Beyond the last line the last is read again, so that reading needs no mask of lines.
         own = (tl.minimum(line, num_left - 1) * num_rows)[:, None]
-        if IS_WHOLE:
-            part = tl.load((signal + link_from)[None, :] + own, is_from[None, :], 0.0)
-            total = tl.dot(part, operator, input_precision="tf32x3")
-            if REST:
-                part = tl.load((signal + rest_from)[None, :] + own, is_rest[None, :], 0.0)
-                total = tl.dot(part, rest, total, input_precision="tf32x3")
-        else:
-            total = tl.zeros((LINES, TO), tl.float32)
-            for k in range(0, size, FROM):
-                is_own = link_from < size - k
-                part = tl.load((signal + link_from)[None, :] + k + own, is_own[None, :], 0.0)
-                operator = tl.load(operators + link_from[:, None] + k, is_to & is_own[:, None], 0.0)
-                total = tl.dot(part, operator, total, input_precision="tf32x3")
+        part = tl.load((signal + link_from)[None, :] + own, is_from[None, :], 0.0)
+        total = tl.dot(part, operator, input_precision="tf32x3")
+        if REST:
+            part = tl.load((signal + rest_from)[None, :] + own, is_rest[None, :], 0.0)
+            total = tl.dot(part, rest, total, input_precision="tf32x3")
         tl.store((found + to)[None, :] + (line * num_rows)[:, None], total, is_to & (line < num_left)[:, None])

@@ -44,9 +44,10 @@ def _product(signal: Signal, operators: Sequence[Tensor]) -> Signal:
     """Return the signal with each link's rows multiplied by its operator, (to, from)."""
     lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
     if takes_kernel(lines, *operators):
-        from tgdsl.sensors.noise.crosstalk_kernel import spread
+        from tgdsl.sensors.noise.crosstalk_kernel import LARGEST, spread
 
-        return spread(lines.contiguous(), operators).view(signal.shape)
+        if max(len(operator) for operator in operators) <= LARGEST:
+            return spread(lines.contiguous(), operators).view(signal.shape)
     parts = lines.split([len(operator) for operator in operators], dim=1)
     products = [own @ operator.T for own, operator in zip(parts, operators, strict=True)]
     return torch.cat(products, dim=-1).view(signal.shape)
