@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from tgdsl.plan import PlannedSensor
 from tgdsl.sensors.noise.instant import Now
-from tgdsl.sensors.noise.random import sensor_key, streams
+from tgdsl.sensors.noise.random import Stream, sensor_key, streams
 
 
 class Clock(nn.Module):
@@ -31,6 +31,7 @@ class Clock(nn.Module):
         """Note which sensors want to know."""
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.is_timed]
+        self._drawing = list(dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams))
         self._seed, self._first_env = 0, None
         self.home = torch.empty(0)
 
@@ -77,28 +78,33 @@ class Clock(nn.Module):
             self._buffers["age"].masked_fill_(chosen, 0)  # type: ignore[union-attr]
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return what `now` and `after` want, by name."""
+        """Return what `nows` and `after` want, by name."""
         return {f"clock/{name}": buffer for name, buffer in self._buffers.items() if buffer is not None}
 
-    def now(self, sensor: PlannedSensor, clock: Mapping[str, Tensor], dt: Tensor | None, phase: Tensor | None) -> Now:
-        """Return when a sensor is read.
+    def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
+        """Return when each sensor that wants to know is read, by its name.
 
         Args:
-            sensor: The sensor.
-            clock: What `tensors` returned.
+            memory: What `tensors` returned; and for each sensor with a rate of its own `<sensor>:sample/phase`, the time since
+                its last sample was due, (env,) [s].
             dt: Time since the last call [s].
-            phase: Time since the sensor's last sample was due, (env,) [s]; None if it takes one at every call.
         """
-        age, drawn = clock["clock/age"][:, None], {}
-        ages = clock["clock/ages"] + dt if "clock/ages" in clock and dt is not None else None
-        if sensor.noise is not None and sensor.noise.streams:
-            env = torch.arange(len(age), device=age.device) + clock["clock/first_env"]
-            key = clock[f"clock/key {sensor.sensor}"]
-            drawn = streams(key, env, clock["clock/step"], clock["clock/episode"], sensor.noise.streams)
-        if phase is None or dt is None:
-            return Now(dt, clock["clock/step"], age, ages, None, drawn)
-        is_due = (phase[:, None] + 1.5 * dt >= sensor.period) | (age == 0)
-        return Now(dt, clock["clock/step"], age, ages, is_due, drawn)
+        if not self.is_wanted:
+            return {}
+        step, age = memory["clock/step"], memory["clock/age"][:, None]
+        ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
+        drawn: dict[str, Mapping[int, Stream]] = {}
+        if self._drawing:
+            env = torch.arange(len(age), device=age.device) + memory["clock/first_env"]
+            found = streams(memory["clock/keys"], env, step, memory["clock/episode"])
+            drawn = dict(zip(self._drawing, found, strict=True))
+        nows = {}
+        for sensor in self._sensors:
+            phase, is_due = memory.get(f"{sensor.name}:sample/phase"), None
+            if phase is not None and dt is not None:
+                is_due = (phase[:, None] + 1.5 * dt >= sensor.period) | (age == 0)
+            nows[sensor.name] = Now(dt, step, age, ages, is_due, drawn.get(sensor.sensor, {}))
+        return nows
 
     @staticmethod
     def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:
@@ -111,9 +117,9 @@ class Clock(nn.Module):
 
     def _set_keys(self) -> None:
         seed, device = int(self._buffers["seed"]), self._buffers["seed"].device  # type: ignore[arg-type, union-attr]
-        for sensor in self._sensors:
-            words = torch.tensor(sensor_key(seed, sensor.sensor), dtype=torch.int32, device=device)
-            self.register_buffer(f"key {sensor.sensor}", words, persistent=False)
+        if self._drawing:
+            keys = [sensor_key(seed, sensor) for sensor in self._drawing]
+            self.register_buffer("keys", torch.tensor(keys, dtype=torch.int32, device=device), persistent=False)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
         """Make room for the counts that are loaded, and go on with their seed."""

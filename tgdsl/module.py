@@ -372,12 +372,9 @@ class TactileModule(nn.Module):
         self, tensors: dict[str, Tensor], memory: dict[str, Tensor]
     ) -> tuple[dict[str, Now], dict[str, dict[str, Tensor]]]:
         """Return by sensor when it is read, where that matters, and the values of its noise."""
-        nows: dict[str, Now] = {}
+        nows = self.memory.clock.nows(memory, tensors.get("dt"))
         knobs: dict[str, dict[str, Tensor]] = {}
         for sensor in self.plan.sensors:
-            if sensor.is_timed:
-                phase = memory.get(f"{sensor.name}:sample/phase")
-                nows[sensor.name] = self.memory.clock.now(sensor, memory, tensors.get("dt"), phase)
             names = () if sensor.noise is None else sensor.noise.constants
             constants = self.constants.under(f"sensors/{sensor.name}/noise", names)
             knobs[sensor.name] = stages.knob_values(constants, nows.get(sensor.name))

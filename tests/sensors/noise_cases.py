@@ -80,8 +80,7 @@ class Noise:
         """Return the circumstances of the next call."""
         step, drawn = torch.tensor(self.step), {}
         if self.lowered.streams:
-            key = torch.tensor(self.key, dtype=torch.int32)
-            drawn = random.streams(key, self.env, step, self.episode, self.lowered.streams)
+            (drawn,) = random.streams(torch.tensor([self.key], dtype=torch.int32), self.env, step, self.episode)
         return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], self.ages + dt, is_sample, drawn)
 
     def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:

@@ -16,9 +16,9 @@ PURPOSES = tuple(range(6))
 
 def batched(seed=0, name="touch", env=1, step=0, episode=0, purpose=random.READING, count=N, first_env=0) -> torch.Tensor:
     """Words (env, count) of a stream."""
-    key = torch.tensor(random.sensor_key(seed, name), dtype=torch.int32)
+    keys = torch.tensor([random.sensor_key(seed, own) for own in ("another", name)], dtype=torch.int32)
     envs, episodes = torch.arange(env) + first_env, torch.full((env,), episode)
-    stream = random.streams(key, envs, torch.tensor(step), episodes, (purpose,))[purpose]
+    stream = random.streams(keys, envs, torch.tensor(step), episodes)[1][purpose]
     return random.words(stream, torch.arange(count, dtype=torch.int32))
 
 

@@ -216,7 +216,7 @@ def advanced(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """One call of all environments, as a pure function of (env, row), of which a compiler makes one kernel."""
     signal, dt = signal.to(noise.dtype), dt.to(noise.dtype)
-    streams = random.streams(torch.tensor(noise.key, dtype=torch.int32), noise.env, step, noise.episode, noise.lowered.streams)
+    (streams,) = random.streams(torch.tensor([noise.key], dtype=torch.int32), noise.env, step, noise.episode)
     ages = memory["ages"] + dt
     now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], ages, None, streams)
     values, past = stages.knob_values(noise.constants, now), {key: memory[key] for key in noise.memory}

@@ -35,10 +35,11 @@ from tgdsl.fusion import stored
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 """What numbers are for: the first three are drawn at each step, the others at each reset."""
 
-PER_STEP = frozenset({READING, RADIUS, JITTER})
+PER_STEP = (READING, RADIUS, JITTER)
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
-PURPOSES = tuple(0x3C6EF372 + 0x1B873593 * i % 2**30 for i in range(12))
+FIRST_PURPOSE, PURPOSE_STEP = 0x3C6EF372, 0x1B873593
+PURPOSES = tuple(FIRST_PURPOSE + PURPOSE_STEP * i % 2**30 for i in range(12))
 """A constant for each purpose and half of a key."""
 
 
@@ -56,29 +57,29 @@ def sensor_key(seed: int, sensor: str) -> tuple[int, int]:
 
 
 def streams(
-    key: Int[Tensor, " half"],
+    keys: Int[Tensor, "sensor half"],
     env: Int[Tensor, " env"],
     step: Int[Tensor, ""],
     episode: Int[Tensor, " env"],
-    purposes: tuple[int, ...],
-) -> Mapping[int, Stream]:
-    """Return a sensor's streams for these purposes.
+) -> list[Mapping[int, Stream]]:
+    """Return the streams of each sensor, by purpose.
+
+    They are found together, of a few operations, whatever number of sensors there is.
 
     Args:
-        key: The sensor's key, int32.
+        keys: The sensors' keys, int32.
         env: Numbers of the environments, int64, counted over all processes.
         step: Number of this reading, int64.
         episode: How often each environment was reset, int64.
-        purposes: What numbers are wanted for.
     """
-    words: list[Tensor] = []
-    for purpose in purposes:
-        counter = step.expand_as(env) if purpose in PER_STEP else episode
-        for half, own in enumerate(key.unbind()):
-            word = mix(mix(env.to(torch.int32) ^ own) ^ counter.to(torch.int32))
-            words.append(mix(word ^ mix((counter >> 32).to(torch.int32)) ^ PURPOSES[2 * purpose + half]))
-    kept = [stored(word)[:, None] for word in words]  # once per environment, not once per taxel
-    return {purpose: Stream(kept[2 * i], kept[2 * i + 1]) for i, purpose in enumerate(purposes)}
+    counter = torch.stack([step.expand_as(env), episode], dim=1)[:, None, :, None]
+    low, high = counter.to(torch.int32), mix((counter >> 32).to(torch.int32))
+    begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
+    purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP % 2**30 + FIRST_PURPOSE
+    purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
+    found = stored(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
+    halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
+    return [{p: Stream(a[:, p, None], b[:, p, None]) for p in range(a.shape[1])} for a, b in halves]
 
 
 def words(stream: Stream, index: Int[Tensor, "*row"]) -> Int[Tensor, "*both"]:
