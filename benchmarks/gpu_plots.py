@@ -311,7 +311,9 @@ def throughput(rows: list[Row]) -> Any:
             at = sorted({of(row) for own in chosen.values() for row in own})
             axes.set_xticks(at, [f"{value:,}" for value in at])
             axes.tick_params(axis="x", which="minor", bottom=False, labelbottom=False)
-            axes.legend(frameon=False, fontsize=8.5)
+            axes.legend(frameon=False, fontsize=8.5, **({"loc": "lower right", "ncols": 3} if len(chosen) > 3 else {}))
+        if len(chosen) > 3:
+            axes.set_ylim(bottom=axes.get_ylim()[0] / 3)  # room for the names
     return figure
 
 

@@ -60,6 +60,9 @@ class Clock(nn.Module):
             self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=like.device))
         if calls:
             self.register_buffer("ages", torch.zeros(calls, dtype=like.dtype, device=like.device))
+        # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
+        periods = torch.tensor([sensor.period for sensor in self._sensors], dtype=like.dtype, device=like.device)
+        self.register_buffer("periods", periods, persistent=False)
         self._set_keys()
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
@@ -99,11 +102,12 @@ class Clock(nn.Module):
             found = streams(memory["clock/keys"], env, step, memory["clock/episode"])
             drawn = dict(zip(self._drawing, found, strict=True))
         nows = {}
-        for sensor in self._sensors:
-            phase, is_due = memory.get(f"{sensor.name}:sample/phase"), None
+        for i, sensor in enumerate(self._sensors):
+            phase, is_due, period = memory.get(f"{sensor.name}:sample/phase"), None, None
             if phase is not None and dt is not None:
-                is_due = (phase[:, None] + 1.5 * dt >= sensor.period) | (age == 0)
-            nows[sensor.name] = Now(dt, step, age, ages, is_due, drawn.get(sensor.sensor, {}))
+                period = memory["clock/periods"][i]
+                is_due = (phase[:, None] + 1.5 * dt >= period) | (age == 0)
+            nows[sensor.name] = Now(dt, step, age, ages, is_due, period, drawn.get(sensor.sensor, {}))
         return nows
 
     @staticmethod

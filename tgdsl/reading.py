@@ -99,8 +99,8 @@ def read(
         readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
         readings[reading.name] = torch.stack([found[name] for name in reading.channels], dim=1).transpose(1, 2)
-    if sensor.period > 0 and now is not None:
-        new["sample/phase"] = _phase(memory["sample/phase"], sensor.period, now)
+    if now is not None and now.period is not None:
+        new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
     return readings, new
 
 
@@ -114,7 +114,7 @@ def _own(memory: Tensors) -> Tensors:
     return {name: value for name, value in memory.items() if "/" not in name}
 
 
-def _phase(phase: Float[Tensor, " env"], period: float, now: Now) -> Float[Tensor, " env"]:
+def _phase(phase: Float[Tensor, " env"], period: Tensor, now: Now) -> Float[Tensor, " env"]:
     """Return the time since a sample was due [s]: from −dt/2 on, as samples are taken at the call that is nearest."""
     assert now.dt is not None
     since = phase + now.dt

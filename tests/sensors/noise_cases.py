@@ -81,7 +81,7 @@ class Noise:
         step, drawn = torch.tensor(self.step), {}
         if self.lowered.streams:
             (drawn,) = random.streams(torch.tensor([self.key], dtype=torch.int32), self.env, step, self.episode)
-        return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], self.ages + dt, is_sample, drawn)
+        return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], self.ages + dt, is_sample, None, drawn)
 
     def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""

@@ -218,7 +218,7 @@ def advanced(
     signal, dt = signal.to(noise.dtype), dt.to(noise.dtype)
     (streams,) = random.streams(torch.tensor([noise.key], dtype=torch.int32), noise.env, step, noise.episode)
     ages = memory["ages"] + dt
-    now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], ages, None, streams)
+    now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], ages, None, None, streams)
     values, past = stages.knob_values(noise.constants, now), {key: memory[key] for key in noise.memory}
     found, new = stages.disturb(signal[:, None], noise.lowered.terms, values, past, now)
     place = (step % memory["ring"].shape[1])[None]

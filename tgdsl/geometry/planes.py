@@ -117,10 +117,10 @@ def rotation(quat: Tensor) -> Rot:
     return 1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy
 
 
-def length_and_direction(a: Vec, fixed: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> tuple[Tensor, Vec]:
-    """Return |a| and a/|a|; where |a| ≤ `tie` the direction is a fixed unit vector. Derivatives are finite everywhere."""
+def length_and_direction(a: Vec) -> tuple[Tensor, Vec]:
+    """Return |a| and a/|a|; where |a| ≤ `tie` the direction is (1, 0, 0). Derivatives are finite everywhere."""
     length, is_null, inverse = length_and_inverse(dot(a, a))
-    x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, fixed, strict=True))
+    x, y, z = (torch.where(is_null, value, part * inverse) for part, value in zip(a, (1.0, 0.0, 0.0), strict=True))
     return length, (x, y, z)
 
 

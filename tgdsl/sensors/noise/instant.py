@@ -28,6 +28,7 @@ class Now(NamedTuple):
         age: Calls since each environment's reset, (env, 1); 0 at the first one.
         ages: Time since each of the calls before this one, the last one first [s]; None if no sensor wants to know.
         is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
+        period: Time between samples [s], a scalar; None: one is taken at every call.
         streams: The sensor's random numbers, by purpose.
     """
 
@@ -36,6 +37,7 @@ class Now(NamedTuple):
     age: Tensor
     ages: Tensor | None
     is_sample: Tensor | None
+    period: Tensor | None
     streams: Mapping[int, Stream]
 
 
