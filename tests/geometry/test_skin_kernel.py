@@ -1,14 +1,10 @@
 """The Triton kernel that has points meet links, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
-import os
-import subprocess
-import sys
 from functools import partial
 
-import pytest
 import torch
+from kernels import interpreted, needs_triton
 
-from tgdsl.fusion import HAS_TRITON
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import rot, split, vec
@@ -128,12 +124,10 @@ def compare() -> None:
     check_strange_poses()
 
 
-@pytest.mark.skipif(not HAS_TRITON, reason="Triton is not installed")
+@needs_triton
 def test_the_kernel_is_the_torch_code():
-    run = subprocess.run(
-        [sys.executable, "-c", f"import runpy; runpy.run_path({__file__!r})['compare']()"],
-        env={**os.environ, "TRITON_INTERPRET": "1", "PYTHONWARNINGS": "ignore"},
-        capture_output=True,
-        text=True,
-    )
-    assert run.returncode == 0, run.stderr[-4000:]
+    interpreted(__file__)
+
+
+if __name__ == "__main__":
+    compare()

@@ -1,16 +1,12 @@
 """The kernel of crosstalk's products, by Triton's interpreter on the CPU, against products in float64."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from kernels import interpreted, needs_triton
 
-from tgdsl.fusion import HAS_TRITON
-
-pytestmark = pytest.mark.skipif(not HAS_TRITON, reason="triton is not installed")
+pytestmark = needs_triton
 EPS = torch.finfo(torch.float32).eps
 CASES = {
     "one taxel": (1, [1]),
@@ -62,10 +58,7 @@ def main() -> None:
 
 @pytest.fixture(scope="module")
 def found() -> dict:
-    environment = os.environ | {"TRITON_INTERPRET": "1"}
-    done = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(interpreted(__file__))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -1,22 +1,19 @@
 """The kernel that shares out contacts, by Triton's interpreter on the CPU, against the torch code in float64."""
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from kernels import interpreted, needs_triton
 
-from tgdsl.fusion import HAS_TRITON
 from tgdsl.sensors.footprint import FAR, LEVENBERG, Bodies, shared_forces, unreached
 
 RADIUS = 0.01
 TOLERANCE = 1e-5
 """Of the largest force, and of that times a footprint: steps in float32, from differences of moments."""
 
-pytestmark = pytest.mark.skipif(not HAS_TRITON, reason="needs Triton")
+pytestmark = needs_triton
 
 
 def pad(num=4):
@@ -99,10 +96,9 @@ def by_kernel(case):
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    """Results of all cases by the interpreter, which has to be chosen before Triton is imported."""
+    """Results of all cases by the interpreter."""
     path = tmp_path_factory.mktemp("kernel") / "found.pt"
-    environment = os.environ | {"TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    subprocess.run([sys.executable, __file__, str(path)], env=environment, check=True, cwd=Path(__file__).parent)
+    interpreted(__file__, str(path))
     return torch.load(path)
 
 

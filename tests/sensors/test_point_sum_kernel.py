@@ -1,18 +1,15 @@
 """The kernel that sums over points, by Triton's interpreter on the CPU, against the torch code that it stands in for."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from kernels import interpreted, needs_triton
 
-from tgdsl.fusion import HAS_TRITON
 from tgdsl.geometry.planes import Vec, vec
 from tgdsl.sensors.elastomer.point_anchors import Markers, Pull, _summed
 
-pytestmark = pytest.mark.skipif(not HAS_TRITON, reason="triton is not installed")
+pytestmark = needs_triton
 TOLERANCE = 1e-5
 """Of the largest sum: what float32 leaves of positions of some centimetres and of a few hundred terms."""
 FALLOFF = 2000.0
@@ -83,10 +80,7 @@ def main() -> None:
 
 @pytest.fixture(scope="module")
 def found() -> dict:
-    environment = os.environ | {"TRITON_INTERPRET": "1"}
-    done = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(interpreted(__file__))
 
 
 @pytest.mark.parametrize("name", CASES)
