@@ -12,6 +12,7 @@ FLOORS = {
     3: {
         "schema",
         "module",
+        "queries",
         "buffers",
         "moment_sources",
         "clock",

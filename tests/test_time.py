@@ -101,15 +101,13 @@ def test_the_phase_does_not_drift(build, rate, dt, every):
     """Over 10⁵ calls in float32 every sample is taken at its own call."""
     touch = build(torch.float32, s={"rate": rate})
     memory = touch.memory.tensors(1, dt, touch.dtype, touch.device)
-    phase, period = torch.zeros(1), touch.plan.sensors[0].period
-    step, taken = torch.tensor(dt), []
+    phase, step, taken = torch.zeros(1), torch.tensor(dt), []
     for call in range(100_000):
-        clock = {**memory, "clock/age": torch.tensor([call])}
-        now = touch.memory.clock.now(touch.plan.sensors[0], clock, step, phase)
-        assert now.is_sample is not None
+        now = touch.memory.clock.nows({**memory, "clock/age": torch.tensor([call]), "s:sample/phase": phase}, step)["s"]
+        assert now.is_sample is not None and now.period is not None
         if now.is_sample.item():
             taken.append(call)
-        phase = _phase(phase, period, now)
+        phase = _phase(phase, now.period, now)
     assert taken == list(range(0, 100_000, every))
 
 

@@ -22,17 +22,12 @@ from tgdsl import observations
 from tgdsl.buffers import Constants
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
-from tgdsl.felt_objects import FeltObjects
-from tgdsl.geometry.contacts import Contacts, contacts
-from tgdsl.geometry.nearby import with_moments
-from tgdsl.geometry.points import with_points
-from tgdsl.geometry.query import Felt, FeltObject, Near, Pairs, Probes, feel, measure, relate
-from tgdsl.geometry.search import Tables, search
+from tgdsl.geometry.query import Felt, Probes
 from tgdsl.graphed import Graphed
 from tgdsl.history import History, last_step
 from tgdsl.memory import Memory, store
-from tgdsl.moment_sources import moment_sources
 from tgdsl.plan import Inputs, Plan
+from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
@@ -87,10 +82,8 @@ class TactileModule(nn.Module):
                 hint = did_you_mean(sensor.kind, known, "kinds")
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
-        self._felt_objects = FeltObjects(plan)
-        unused = ("layout/", *self._felt_objects.kept)
-        arrays = {k: v for k, v in plan.arrays.items() if not k.startswith(unused)}
-        self.constants = Constants(arrays | self._felt_objects.searched(), dtype)
+        self._queries = Queries(plan)
+        self.constants = Constants(self._queries.constants(), dtype)
         self.memory = Memory(plan.sensors)
         self.histories = nn.ModuleDict(
             {
@@ -198,11 +191,8 @@ class TactileModule(nn.Module):
             Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
             what is new: (env, …).
         """
-        pairs = self._pairs(tensors)
         nows, knobs = self._circumstances(tensors, memory)
-        measured = sorted({o for query in self.plan.queries for o in query.objects})
-        objects = {o: self._felt_objects.felt(self.plan.objects[o], self.constants, tensors) for o in measured}
-        answers = [self._query(i, pairs, objects, tensors, nows, knobs) for i in range(len(self.plan.queries))]
+        answers = self._queries.answers(self.constants, tensors, nows, knobs)
         readings: dict[str, Tensor] = {}
         joined: dict[tuple[str, ...], Tensor] = {}
         updated = self.memory.clock.after(memory, tensors.get("dt"))
@@ -352,22 +342,6 @@ class TactileModule(nn.Module):
 
         return explain(self)
 
-    def _pairs(self, tensors: dict[str, Tensor]) -> Pairs:
-        gate = None
-        if "contact_found" in tensors:
-            found = tensors["contact_found"][:, self.constants["pairs/gate"]] > 0
-            gate = torch.where(found, 0.0, -torch.inf).to(self.dtype)
-        return relate(
-            tensors["body_pos"],
-            tensors["body_quat"],
-            self.constants["pairs/link"],
-            self.constants["pairs/object"],
-            self.dtype,
-            tensors.get("body_linvel"),
-            tensors.get("body_angvel"),
-            gate,
-        )
-
     def _circumstances(
         self, tensors: dict[str, Tensor], memory: dict[str, Tensor]
     ) -> tuple[dict[str, Now], dict[str, dict[str, Tensor]]]:
@@ -380,56 +354,11 @@ class TactileModule(nn.Module):
             knobs[sensor.name] = stages.knob_values(constants, nows.get(sensor.name))
         return nows, knobs
 
-    def _query(
-        self,
-        i: int,
-        pairs: Pairs,
-        objects: Mapping[int, FeltObject],
-        tensors: dict[str, Tensor],
-        nows: Mapping[str, Now],
-        knobs: Mapping[str, dict[str, Tensor]],
-    ) -> list[tuple[Felt, Probes]]:
-        """Return the answers to a query, and its probes."""
-        query = self.plan.queries[i]
-        x, y, z = self.constants[f"queries/{i}/pos"]
-        probes = Probes((x, y, z), self.constants[f"queries/{i}/pair"])
-        targets: list[FeltObject] = [objects[index] for index in query.objects]
-        near: tuple[Near, ...] | None = None
-        answers = []
-        for a, answer in enumerate(query.answers):
-            own = pairs if answer.is_gated else pairs._replace(gate=None)
-            reach, shift = self.constants[f"queries/{i}/{a}/reach"], None
-            if answer.radius_noise:
-                half_width, now = knobs[answer.radius_noise]["radius_noise"], nows[answer.radius_noise]
-                shift = stages.radius_shift(half_width, now, probes.pos[0])
-                reach = stages.shifted(reach[:, None], shift)
-            found = self._contacts(i, a, tensors) if "contacts" in answer.needs else None
-            felt = None
-            if known := [name for name in Tables._fields if f"queries/{i}/{a}/search/{name}" in self.constants]:
-                tables = self.constants.under(f"queries/{i}/{a}/search", known)
-                felt = search(own, probes, [targets[o] for o in answer.objects], tables, reach, answer.needs, found)
-            if felt is None:
-                near = near if near is not None else measure(pairs, probes, targets)
-                felt = feel(own, probes, [near[o] for o in answer.objects], reach, answer.needs, found)
-            if answer.moments is not None:
-                path = f"queries/{i}/{a}/moments"
-                sources = moment_sources(self.plan, self.constants, path, answer.moments, tensors, shift)
-                felt = with_moments(felt, own, probes, sources)
-            if answer.points is not None:
-                path = f"queries/{i}/{a}/points"
-                met = self._felt_objects.point_sources(path, answer.points, self.constants, tensors)
-                felt = with_points(felt, own, met)
-            answers.append((felt, probes))
-        return answers
-
     def _joined_signal(self, names: Sequence[str], felt: Felt, probes: Probes) -> Tensor:
         by_name = {sensor.name: sensor for sensor in self.plan.sensors}
         sensors = [by_name[name] for name in names]
         constants = [self.constants.under(sensor.folder, sensor.constants) for sensor in sensors]
         return joined_signal(self._kinds[names[0]], sensors, felt, probes, constants)
-
-    def _contacts(self, i: int, a: int, tensors: dict[str, Tensor]) -> Contacts:
-        return contacts(tensors, self.constants[f"queries/{i}/bodies"], self.constants[f"queries/{i}/{a}/contacts"], self.dtype)
 
     def _dt_tensor(self, dt: float) -> Tensor:
         """Return dt as a tensor that is written only when it changes.

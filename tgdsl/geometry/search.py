@@ -97,8 +97,8 @@ def geom_tables(objects: Sequence[FeltObject]) -> tuple[Tensor, Tensor]:
     num_cases = next((part.shape[0] for part in parts if part is not None and part.shape[0] != 1), 1)
     counts = [len(target.shapes) for target in objects]
     each = [geom for target in objects for geom in zip(target.shapes, target.is_centred, strict=True)]
-    shape = _filled(parts[0], [float(SHAPES.index(shape)) for shape, _ in each])
-    is_centred = _filled(parts[0], [float(is_centred) for _, is_centred in each]) > 0
+    shape = _filled(objects[0].size, [float(SHAPES.index(shape)) for shape, _ in each])
+    is_centred = _filled(objects[0].size, [float(is_centred) for _, is_centred in each]) > 0
     size, pos, rotation = (
         _side_by_side([getattr(target, name).expand(num_cases, -1, -1) for target in objects])
         for name in ("size", "pos", "rotation")
