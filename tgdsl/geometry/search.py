@@ -20,7 +20,7 @@ from tgdsl.geometry.contacts import Contacts
 from tgdsl.geometry.query import Felt, FeltObject, Pairs, Probes
 
 THRESHOLD = 5
-"""Geoms from which on the kernel is used: it takes 0.05 ms for 1.6 million probes however few there are."""
+"""Geoms from which on the kernel is used: with four boxes Inductor's code is as fast, 1.6 million probes in 0.08 ms."""
 SHAPES = ("", "plane", "sphere", "capsule", "cylinder", "box")
 """The shapes that the kernel knows. For it a sphere is a capsule without a length, and what comes after it moves up by one."""
 SPHERE = SHAPES.index("sphere")
