@@ -8,7 +8,7 @@ from kernels import interpreted, needs_triton
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.geometry.points import PointSource, _met
+from tgdsl.geometry.points import PointSource, _met, _met_by_kernel
 from tgdsl.geometry.query import FeltObject, Pairs
 
 NUM_ENVS, CELL = 4, 0.002
@@ -17,44 +17,53 @@ TOLERANCE = 3e-7
 TURN = 1e-3
 """Of gradients: a place that is off by as much, over the cell."""
 CASES = {
-    # points, links, how grids are interpolated, whether the object differs between environments, is it gated
-    "one link": (10, 1, "trilinear", False, False),
-    "cubes": (70, 3, "tricubic", False, True),
-    "many points": (130, 2, "tricubic", True, True),
-    "two nodes": (64, 2, "trilinear", True, False),
+    # points, links, how each geom's grids are interpolated, whether the object differs between environments, is it gated
+    "one link": (10, 1, ["trilinear"], False, False),
+    "cubes": (70, 3, ["tricubic"], False, True),
+    "many points": (130, 2, ["tricubic"], True, True),
+    "several meshes": (40, 3, ["trilinear", "tricubic"], False, False),
 }
 NUMS = ((9, 7, 8), (6, 11, 5), (2, 2, 2))
+"""Nodes along the axes of each link's grid of the first geom; of the second those of the next link."""
 
 
-def nums_of(case):
-    """Return the numbers of nodes along the axes of each link's grid."""
-    return NUMS[: CASES[case][1]] if case != "two nodes" else NUMS[-2:]
+def nums_of(case, g):
+    """Return the numbers of nodes along the axes of each link's grid of a geom."""
+    return torch.tensor([NUMS[(link + g) % 3] for link in range(CASES[case][1])])
+
+
+def spheres(nums, cells, dtype):
+    """Return grids of distances to spheres about their middles."""
+    values, first = [], [0]
+    for num, cell in zip(nums, cells.double(), strict=True):
+        places = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in num.tolist()))
+        values.append(cell * places.norm(dim=1) - 0.003)
+        first.append(first[-1] + len(places))
+    origins = -0.5 * cells[:, None] * (nums - 1)
+    return Grid(
+        torch.cat(values).float().to(dtype),
+        torch.tensor(first[:-1])[:, None],
+        split(nums[:, None]),
+        split(origins[:, None]),
+        cells[:, None],
+    )
 
 
 def made(case, dtype):
     """Return pairs, and an object's points with the links that they may meet: spheres in grids of their own."""
-    num_points, num_links, shape, differs, is_gated = CASES[case]
+    num_points, num_links, shapes, differs, is_gated = CASES[case]
     rng = torch.Generator().manual_seed(len(case))
     draw = partial(torch.randn, generator=rng, dtype=torch.float64)
-    nums = nums_of(case)
     cells = CELL * (1 + torch.arange(num_links)).to(dtype)
-    values, first = [], [0]
-    for num, cell in zip(nums, cells.double(), strict=True):
-        middle = [(n - 1) / 2 for n in num]
-        places = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) - m for n, m in zip(num, middle, strict=True)))
-        values.append(cell * places.norm(dim=1) - 0.003)
-        first.append(first[-1] + len(places))
-    origins = torch.stack([-0.5 * c * (torch.tensor(n) - 1.0) for n, c in zip(nums, cells, strict=True)]).to(dtype)
-    grid = Grid(
-        torch.cat(values).float().to(dtype),
-        torch.tensor(first[:-1])[:, None],
-        split(torch.tensor(nums)[:, None]),
-        split(origins[:, None]),
-        cells[:, None],
-    )
-    place = (0.002 * draw(num_links, 1, 3)).to(dtype)
-    turns = torch.stack(planes.rotation(draw(num_links, 1, 4)), dim=-1).to(dtype)
-    links = FeltObject("links", 0, 0, (shape,), (False,), place, place, turns, None, torch.arange(num_links), (grid,))
+    grids = tuple(spheres(nums_of(case, g), cells, dtype) for g in range(len(shapes)))
+    place = (0.002 * draw(num_links, len(shapes), 3)).to(dtype)
+    turns = torch.stack(planes.rotation(draw(num_links, len(shapes), 4)), dim=-1).to(dtype)
+    is_absent = None
+    if len(shapes) > 1:
+        is_absent = torch.zeros((num_links, len(shapes)), dtype=torch.bool)
+        is_absent[0, 1] = is_absent[2, 0] = True
+    every = torch.arange(num_links)
+    links = FeltObject("links", 0, 0, tuple(shapes), (False,) * len(shapes), place, place, turns, is_absent, every, grids)
     num_pairs = num_links + 2
     parts = [*planes.rotation(draw(NUM_ENVS, num_pairs, 4)), *(0.003 * draw(3, NUM_ENVS, num_pairs))]
     parts = torch.stack(list(parts), dim=1).to(dtype)
@@ -67,9 +76,23 @@ def made(case, dtype):
 
 
 def by_kernel(pairs, source):
-    from tgdsl.geometry.skin_kernel import meet
+    found = _met_by_kernel(pairs, source)
+    return found.pos, found.distance, found.gradient
 
-    return meet(pairs, source.pair, source.points, source.links, source.links.surfaces[0])
+
+def is_within(case, pairs, source, pos, slack):
+    """Return which points the gate is open for, and that are inside a grid of their link or at most so far out of it [m]."""
+    found = torch.zeros_like(pos[0], dtype=torch.bool)
+    links = source.links
+    for g, grid in enumerate(links.surfaces):
+        for link, num in enumerate(nums_of(case, g)):
+            turn = planes.rot(links.rotation[link, g])
+            at = planes.rotate_back(turn, planes.sub(vec(part[:, link] for part in pos), vec(links.pos[link, g])))
+            half = 0.5 * grid.cell[link] * (num - 1)
+            beyond = torch.stack([part.abs() - size for part, size in zip(at, half, strict=True)]).amax(dim=0)
+            if links.is_absent is None or not links.is_absent[link, g]:
+                found[:, link] |= beyond < slack
+    return found if pairs.gate is None else found & (pairs.gate[:, source.pair, None] == 0)
 
 
 def check(case):
@@ -79,24 +102,16 @@ def check(case):
     torch.testing.assert_close(torch.stack(pos).double(), torch.stack(expected.pos), rtol=0, atol=TOLERANCE)
     found = distance.isfinite()
     assert 0.02 < found.double().mean() < 0.98, case
-    torch.testing.assert_close(distance[found].double(), expected.distance[found], rtol=0, atol=TOLERANCE)
-    apart = torch.stack([(a - b)[found].abs() for a, b in zip(gradient, expected.gradient, strict=True)])
-    # In the middle of a sphere the gradient is next to nothing, and between two linear cells it jumps.
-    is_sure = (apart < TURN).all(dim=0)
-    assert is_sure.double().mean() > 0.98, case
-    source = exact[1]
-    inside = torch.zeros_like(found)
-    for link, own in enumerate(torch.tensor(nums_of(case))):
-        turn = planes.rot(part[None, None] for part in source.links.rotation[link, 0])
-        at = planes.rotate_back(turn, planes.sub(vec(part[:, link] for part in expected.pos), vec(source.links.pos[link, 0])))
-        half = 0.5 * source.links.surfaces[0].cell[link] * (own - 1)
-        margin = torch.stack([part.abs() - size for part, size in zip(at, half, strict=True)]).amax(dim=0)
-        gate = exact[0].gate
-        is_open = torch.ones_like(margin[:, :1]) if gate is None else (gate[:, source.pair[link], None] == 0)
-        inside[:, link] = (margin < -1e-6) & (is_open > 0)
-        assert (~found[:, link] | (margin < 1e-6)).all(), case
-    assert found[inside].all(), case
+    assert (found | ~is_within(case, *exact, expected.pos, -1e-6)).all(), case
+    assert (~found | is_within(case, *exact, expected.pos, 1e-6)).all(), case
     assert (distance[~found] == torch.inf).all() and all((part[~found] == 0).all() for part in gradient)
+    # A point that is out of one grid and in another reads the latter, though it may be nearer to what the former holds.
+    is_known = found & (expected.distance > distance.double() - TOLERANCE)
+    assert is_known.sum() > (0.7 if len(CASES[case][2]) > 1 else 0.999) * found.sum(), case
+    torch.testing.assert_close(distance[is_known].double(), expected.distance[is_known], rtol=0, atol=TOLERANCE)
+    # In the middle of a sphere the gradient is next to nothing, and between two linear cells it jumps.
+    apart = torch.stack([(a - b)[is_known].abs() for a, b in zip(gradient, expected.gradient, strict=True)])
+    assert (apart < TURN).all(dim=0).double().mean() > 0.97, case
 
 
 def check_strange_poses():

@@ -46,15 +46,10 @@ def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Fel
 
 def _met(pairs: Pairs, source: PointSource) -> MetPoints:
     """Return the points of one object."""
-    links, surface = source.links, source.links.surfaces[0]
-    if (
-        isinstance(surface, Grid)
-        and len(links.surfaces) == 1
-        and takes_kernel(*pairs.rotation, *pairs.offset, *source.points, links.pos, links.rotation)
-    ):
-        from tgdsl.geometry.skin_kernel import meet
-
-        return MetPoints(source.taxels, *meet(pairs, source.pair, source.points, links, surface), source.area)
+    links = source.links
+    are_grids = all(isinstance(surface, Grid) for surface in links.surfaces)
+    if are_grids and takes_kernel(*pairs.rotation, *pairs.offset, *source.points, links.pos, links.rotation):
+        return _met_by_kernel(pairs, source)
     rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
     offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
     pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
@@ -62,3 +57,21 @@ def _met(pairs: Pairs, source: PointSource) -> MetPoints:
     if pairs.gate is not None:
         distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
     return MetPoints(source.taxels, planes.vec(map(stored, pos)), distance, gradient, source.area)
+
+
+def _met_by_kernel(pairs: Pairs, source: PointSource) -> MetPoints:
+    """Return the points of one object where all geoms of the links are grids, one geom after the other."""
+    from tgdsl.geometry.skin_kernel import meet
+
+    links, pos, least, outward = source.links, None, None, None
+    for g in range(len(links.shapes)):
+        pos, distance, gradient = meet(pairs, source.pair, source.points, links, g)
+        if links.is_absent is not None:
+            distance = torch.where(links.is_absent[:, g, None], torch.inf, distance)
+        if least is None or outward is None:
+            least, outward = distance, gradient
+        else:
+            outward = planes.where(distance < least - planes.tie(), gradient, outward)
+            least = torch.minimum(least, distance)
+    assert pos is not None and least is not None and outward is not None
+    return MetPoints(source.taxels, pos, least, outward, source.area)

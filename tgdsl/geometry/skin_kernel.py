@@ -1,8 +1,8 @@
 """Points of an object in the links' frames, and how deep in the links' own surfaces, on a GPU, in one kernel.
 
-It is what `points.with_points` finds where each link's surface is one grid. A program takes one link of one environment and
-all points, a block after the other. Nothing is looked up where the gate is closed or a whole block is outside the grid. Outside
-the distance reads +∞ and its gradient 0: grids hold all distances that those who ask for points want to know.
+It is what `points.with_points` finds of one geom of the links, where that is a grid. A program takes a link of an environment
+and all points, a block after the other. Nothing is looked up where the gate is closed or a whole block is outside the grid.
+Outside the distance reads +∞ and its gradient 0: grids hold all distances that those who ask for points want to know.
 
 Shapes: `env` environments, `pair` pairs, `link` links that may meet the object, `point` its points, `case` 1, or `env` if the
 object differs between environments, `node` nodes of all grids.
@@ -34,7 +34,7 @@ GEOM, ORIGIN, CELL, FRAME = tl.constexpr(3), tl.constexpr(12), tl.constexpr(15),
 
 
 def meet(
-    pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: FeltObject, grid: Grid
+    pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: FeltObject, g: int
 ) -> tuple[Vec, Float[Tensor, "env link point"], Vec]:
     """Return the points' places in the links' frames [m], signed distances to their surfaces [m], and unit gradients.
 
@@ -42,14 +42,16 @@ def meet(
         pairs: Relative poses of all pairs; where the gate is closed the distance is +∞.
         pair: Index of the pair of each link and the object.
         points: Places in the object's frame [m], planes (case, 1, point).
-        links: The links' own surfaces: an object of one geom whose cases are links.
-        grid: That geom's grids.
+        links: The links' own surfaces: an object whose cases are links.
+        g: Which of their geoms.
     """
-    frames = torch.cat([links.pos[:, 0], links.rotation[:, 0], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)
+    grid = links.surfaces[g]
+    assert isinstance(grid, Grid)
+    frames = torch.cat([links.pos[:, g], links.rotation[:, g], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)
     counts = torch.cat([part.reshape(-1, 1) for part in (grid.first, *grid.num)], dim=1)  # type: ignore[union-attr]
     where = torch.stack(points)[:, :, 0]
     found = _meet(
-        [*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, grid.values, links.shapes[0] == "tricubic"
+        [*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, grid.values, links.shapes[g] == "tricubic"
     )
     x, y, z, distance, *gradient = found.unbind()
     return (x, y, z), distance, vec(gradient)
