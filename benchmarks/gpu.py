@@ -352,7 +352,7 @@ def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
     path.write_text(json.dumps({**versions, "rows": [asdict(other) for other in (*kept, row)]}, indent=1))
 
 
-def one_of(jobs: int) -> dict[str, str]:
+def sharing_processors(jobs: int) -> dict[str, str]:
     """Return the environment of one of several processes that compile at once: the processors are shared out."""
     return {**os.environ, "TORCHINDUCTOR_COMPILE_THREADS": str(max(2, 2 * (os.cpu_count() or 1) // jobs))}
 
@@ -367,7 +367,7 @@ def warm(options: argparse.Namespace) -> None:
 
     def compile_one(name: str) -> str:
         start = time.perf_counter()
-        done = subprocess.run([*own, "--rows", name], capture_output=True, text=True, env=one_of(options.jobs))
+        done = subprocess.run([*own, "--rows", name], capture_output=True, text=True, env=sharing_processors(options.jobs))
         account = "" if done.returncode == 0 else f"  FAILED\n{done.stdout[-1500:]}{done.stderr[-1500:]}"
         return f"{name:<32}{time.perf_counter() - start:7.1f} s{account}"
 

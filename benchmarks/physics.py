@@ -32,7 +32,7 @@ from typing import Any
 
 import mujoco
 import torch
-from gpu import one_of
+from gpu import sharing_processors
 from physics_scenes import MODULES, PLAIN, SCENES, Scene, artefact, make_artefacts
 from torch import Tensor
 
@@ -287,7 +287,7 @@ def warm(options: argparse.Namespace) -> None:
         out = scratch.with_stem("-".join((scratch.stem, *job)).replace(" ", "_").replace(",", ""))
         own = [*command(options, [job[0]], [job[1]], [256]), "--out", str(out)]
         start = time.perf_counter()
-        done = subprocess.run(own, capture_output=True, text=True, env=one_of(options.jobs))
+        done = subprocess.run(own, capture_output=True, text=True, env=sharing_processors(options.jobs))
         out.unlink(missing_ok=True)
         has_failed = done.returncode != 0 or "FAILED" in done.stdout
         account = f"\n{done.stdout[-1500:]}{done.stderr[-1500:]}" if has_failed else "ok"

@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
-from tgdsl.geometry.query import Felt, FeltObject, MetPoints, Pairs, body_distance
+from tgdsl.geometry.query import Felt, FeltObject, MetPoints, Pairs, body_distance, united
 
 
 class PointSource(NamedTuple):
@@ -63,15 +63,6 @@ def _met_by_kernel(pairs: Pairs, source: PointSource) -> MetPoints:
     """Return the points of one object where all geoms of the links are grids, one geom after the other."""
     from tgdsl.geometry.skin_kernel import meet
 
-    links, pos, least, outward = source.links, None, None, None
-    for g in range(len(links.shapes)):
-        pos, distance, gradient = meet(pairs, source.pair, source.points, links, g)
-        if links.is_absent is not None:
-            distance = torch.where(links.is_absent[:, g, None], torch.inf, distance)
-        if least is None or outward is None:
-            least, outward = distance, gradient
-        else:
-            outward = planes.where(distance < least - planes.tie(), gradient, outward)
-            least = torch.minimum(least, distance)
-    assert pos is not None and least is not None and outward is not None
-    return MetPoints(source.taxels, pos, least, outward, source.area)
+    found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
+    distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
+    return MetPoints(source.taxels, found[0][0], distance, gradient, source.area)

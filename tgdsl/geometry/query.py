@@ -10,7 +10,7 @@ is formed first and gathered once.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -338,13 +338,20 @@ def _union(point: Vec, frames: Sequence[Frame | None], target: FeltObject) -> tu
 
     `frames` say how each geom sees the points; None: they are in its frame already.
     """
+    return united((_in_frame(point, frame, target, g) for g, frame in enumerate(frames)), target.is_absent)
+
+
+def united(geoms: Iterable[tuple[Tensor, Vec]], is_absent: Bool[Tensor, "case geom"] | None) -> tuple[Tensor, Vec]:
+    """Return the least of the distances to an object's geoms [m], the first among equals, and its gradient.
+
+    Args:
+        geoms: Signed distance to each geom [m] and its gradient, planes (case, …, point).
+        is_absent: Which geoms a case lacks; None if none does.
+    """
     least, outward = None, None
-    for g, frame in enumerate(frames):
-        local = point if frame is None else planes.add(planes.rotate(frame.rotation, point), frame.offset)
-        distance, gradient = _to_geom(local, target, g)
-        gradient = gradient if frame is None else planes.rotate_back(frame.rotation, gradient)
-        if target.is_absent is not None:
-            distance = torch.where(target.is_absent[:, g, None], torch.inf, distance)
+    for g, (distance, gradient) in enumerate(geoms):
+        if is_absent is not None:
+            distance = torch.where(is_absent[:, g, None], torch.inf, distance)
         if least is None or outward is None:
             least, outward = distance, gradient
         else:
@@ -352,6 +359,14 @@ def _union(point: Vec, frames: Sequence[Frame | None], target: FeltObject) -> tu
             least = torch.minimum(least, distance)
     assert least is not None and outward is not None
     return least, outward
+
+
+def _in_frame(point: Vec, frame: Frame | None, target: FeltObject, g: int) -> tuple[Tensor, Vec]:
+    """Return signed distance [m] of points to a geom that sees them as a frame says, and its gradient in the points' frame."""
+    if frame is None:
+        return _to_geom(point, target, g)
+    distance, gradient = _to_geom(planes.add(planes.rotate(frame.rotation, point), frame.offset), target, g)
+    return distance, planes.rotate_back(frame.rotation, gradient)
 
 
 def _to_geom(point: Vec, target: FeltObject, g: int) -> tuple[Tensor, Vec]:
