@@ -38,7 +38,7 @@ class Clock(nn.Module):
     @property
     def is_wanted(self) -> bool:
         """Whether any sensor wants to know."""
-        return bool(self._sensors)
+        return len(self._sensors) > 0
 
     @property
     def num_envs(self) -> int | None:
