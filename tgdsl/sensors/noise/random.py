@@ -38,9 +38,9 @@ READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 PER_STEP = (READING, RADIUS, JITTER)
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
-FIRST_PURPOSE, PURPOSE_STEP = 0x3C6EF372, 0x1B873593
-PURPOSES = tuple(FIRST_PURPOSE + PURPOSE_STEP * i % 2**30 for i in range(12))
-"""A constant for each purpose and half of a key."""
+FIRST_PURPOSE, PURPOSE_STEP = 0x010DCD65, 0x0B873593
+PURPOSES = tuple(FIRST_PURPOSE + PURPOSE_STEP * i for i in range(12))
+"""A constant for each purpose and half of a key: below 2³¹, as a compiler may form them by 32-bit index arithmetic."""
 
 
 class Stream(NamedTuple):
@@ -75,7 +75,7 @@ def streams(
     counter = torch.stack([step.expand_as(env), episode], dim=1)[:, None, :, None]
     low, high = counter.to(torch.int32), mix((counter >> 32).to(torch.int32))
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
-    purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP % 2**30 + FIRST_PURPOSE
+    purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
     purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
     found = stored(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
     halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
