@@ -81,8 +81,8 @@ def fields(state: SceneState, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 def num_contacts(state: SceneState) -> np.ndarray:
     """Return how many contacts each pair has, (env, pair)."""
-    assert state.contact_normal is not None
-    return (state.contact_normal != 0).any(dim=-1).sum(dim=-1).cpu().numpy()
+    assert state.contact_found is not None
+    return state.contact_found.cpu().numpy()
 
 
 def numbers(values: dict[str, Tensor]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ TOLERANCE = 1e-5
 MOVING_FORCE = 1e-3
 """The same for forces of contacts that slide and part, with a solver that stops where MuJoCo's does: found are up to 2e-4."""
 WEIGHT = 0.25 * 9.81
-FORCES = ("contact_force", "contact_netforce")
+FORCES = ("contact_force", "contact_torque", "contact_netforce")
 CONTACTS = ("contact_found", "contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce")
 
 SCENE = """

@@ -19,8 +19,8 @@ POOLS = {
     "nconmax × num_envs is {naconmax}",
     4: "nconmax={nconmax} is too small in environments {envs}: contacts of convex shapes are left out",
     5: "contacts with a height field are left out in environments {envs}: a finer field meets too many of its cells",
-    6: "contacts that a sensor should report are left out in environments {envs}: there are more than {maxmatch} between a "
-    'link and an object; raise it with <custom><numeric name="contact_sensor_maxmatch" data="…"/></custom> in the scene',
+    6: "contacts that a contact sensor of the model's own should report are left out in environments {envs}: it matches more "
+    'than {maxmatch}; raise it with <custom><numeric name="contact_sensor_maxmatch" data="…"/></custom> in the scene',
     7: "nvmax is too small in environments {envs}: degrees of freedom are left out",
     8: "the search for the deepest point of two convex shapes ran out of room in environments {envs}: contacts may be wrong",
     11: "contacts of MuJoCo's tactile sensors are left out in environments {envs}",

@@ -44,7 +44,8 @@ class WarpSimulation:
         model: The compiled scene; where objects differ between environments, that of the first, and with a spare body at the
             end if some of their variants are meshes.
         substeps: Physics steps per control step.
-        arrays: Live tensors (env, …) of MuJoCo's arrays, such as `arrays["qpos"]`.
+        arrays: Live tensors (env, …) of MuJoCo's arrays, such as `arrays["qpos"]`. In `arrays["sensordata"]` the contact
+            sensors that `tgdsl.instrument` adds are zero: their contacts are read elsewhere.
         parameters: Live tensors (env, …) of the model's fields that environments have of their own; what MuJoCo derives from
             them, such as `body_subtreemass`, is not derived anew.
         warp_model: MuJoCo Warp's model.
@@ -74,15 +75,15 @@ class WarpSimulation:
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
             nconmax: Room for contacts per environment, in a pool that all share; default 48.
             njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts and all limits make.
-            model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
-                artefact's scene. Its objects are the same in all environments.
+            model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
+                are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, holds something that MuJoCo Warp does
+            SimulationError: If the model lacks a body or the keyframe, holds something that MuJoCo Warp does
                 not support, if there is nothing to step, or no such device or library.
         """
         if num_envs < 1 or substeps < 1:
@@ -101,6 +102,7 @@ class WarpSimulation:
         self.model: mujoco.MjModel = model
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
+            touch.inputs,
             num_envs,
             self._lane,
             keyframe=-1 if keyframe is None else keyframe_id(model, keyframe),
@@ -110,7 +112,7 @@ class WarpSimulation:
         )
         if self._objects is not None:
             self._objects.tell(self._worlds)
-        self._reader = StateReader(touch.inputs, model, self._worlds.arrays)
+        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.contacts)
         self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
         self._substep = Replay(self._lane, lambda: self._worlds.step(1))
         self._step_and_read = Replay(self._lane, self._physics_and_touch)

@@ -15,6 +15,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
+from tgdsl.plan import Inputs
+from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
 from tgdsl.runtime.warp.reading import SOURCES
@@ -37,12 +39,14 @@ class Worlds:
         data: MuJoCo Warp's data.
         arrays: Live tensors of `data`, (env, …): what is integrated, what a state is read from, `geom_xpos` and `geom_xmat`.
         parameters: Live tensors of those fields of `model` that environments have of their own, (env, …).
+        contacts: The contacts that the module wants.
         faults: What has gone wrong.
     """
 
     def __init__(
         self,
         model: mujoco.MjModel,
+        inputs: Inputs,
         num_envs: int,
         lane: Lane,
         *,
@@ -55,6 +59,7 @@ class Worlds:
 
         Args:
             model: The scene.
+            inputs: What the module wants.
             num_envs: Number of environments.
             lane: Where to work.
             keyframe: Index of the keyframe to start from; -1: the model's own initial state.
@@ -63,7 +68,8 @@ class Worlds:
             per_env: Fields of the model that environments have of their own.
 
         Raises:
-            SimulationError: If MuJoCo Warp does not support something of the model, or a field cannot differ.
+            SimulationError: If MuJoCo Warp does not support something of the model, a field cannot differ, or the model lacks a
+                body.
         """
         check_supported(model)
         self.nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
@@ -82,9 +88,11 @@ class Worlds:
             # MuJoCo Warp takes this flag for one thing alone: boxes then meet as in MuJoCo, whose normal is the first box's
             # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+            self._leave_out_sensors(wp, model, inputs)
             names = (*INTEGRATED, *SOURCES, *_WATCHED, "geom_xpos", "geom_xmat")
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
+            self.contacts = PairContacts(inputs, model, num_envs, lane.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
             self._is_reset = torch.zeros_like(self._is_stale)
@@ -106,6 +114,8 @@ class Worlds:
                 self._mjw.step(self.model, self.data)
         finally:
             self.model.opt.disableflags = whole
+        # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
+        self.contacts.update(self.model, self.data)
         self._is_stale.zero_()
         self.faults.update()
 
@@ -143,6 +153,15 @@ class Worlds:
         }
         return self.faults.account(sizes)
 
+    def _leave_out_sensors(self, wp: Any, model: mujoco.MjModel, inputs: Inputs) -> None:
+        """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""
+        foreign = foreign_sensors(model, inputs)
+        for name in ("sensor_contact_pos_adr", "sensor_contact_acc_adr"):  # of the stages of positions and of forces
+            kept = np.intersect1d(getattr(self.model, name).numpy(), foreign)
+            setattr(self.model, name, wp.array(kept, dtype=int))
+        if not len(foreign):
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
     def _restart(self) -> None:
         for name, start in self._start.items():
             array = self.arrays[name]
@@ -153,10 +172,12 @@ class Worlds:
 
     def _evaluate_stale(self) -> None:
         """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
-        kept = {name: self.arrays[name].clone() for name in SOURCES}
+        arrays = {name: self.arrays[name] for name in SOURCES} | self.contacts.arrays
+        kept = {name: array.clone() for name, array in arrays.items()}
         self._mjw.forward(self.model, self.data)
+        self.contacts.update(self.model, self.data)
         for name, before in kept.items():
-            array = self.arrays[name]
+            array = arrays[name]
             if array.numel():
                 array.copy_(torch.where(_like(self._is_stale, array), array, before))
         self._is_stale.zero_()

@@ -1,0 +1,158 @@
+"""Contacts between links and objects, read from MuJoCo Warp's own contacts and constraint forces by one kernel.
+
+They are what the contact sensors of `tgdsl.instrument` hand out, without what these cost in MuJoCo Warp: room for 64 contacts
+per environment and sensor, each contact matched with each sensor, a sort.
+
+Shapes: `env` environments, `pair` and `slot` as the module's `inputs` list them, `sensor` sensors of a model.
+"""
+
+# pyright: reportInvalidTypeForm=false
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, no_type_check
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.plan import SLOT_FIELDS, Inputs, contact_sensor_names
+from tgdsl.runtime.lookup import body_id
+from tgdsl.runtime.warp.lane import libraries
+from tgdsl.state import shape_of
+
+_VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
+"""Fields of vectors, in the order of the kernel's arguments."""
+
+
+class PairContacts:
+    """Contacts of the pairs that a module wants, on the device. Only what the module wants is found and kept.
+
+    Pairs whose link and object are the same bodies are found once.
+
+    Attributes:
+        arrays: Live tensors (env, row, …) of the fields of a state, float32; a row is a pair of bodies. Where slots are wanted,
+            `contact_found` is among them.
+    """
+
+    arrays: dict[str, Float[Tensor, "env ..."]]
+
+    def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
+        """Make room for what is wanted.
+
+        Args:
+            inputs: What the module wants.
+            model: The scene.
+            num_envs: Number of environments.
+            device: Where physics runs.
+
+        Raises:
+            SimulationError: If the model lacks a body.
+        """
+        wp, mjw = libraries()
+        self._fields = [name for name in ("contact_found", *_VECTORS) if name in inputs.fields]
+        bodies = [(body_id(model, inputs.bodies_of[pair.object]), body_id(model, pair.link)) for pair in inputs.pairs]
+        rows = {own: row for row, own in enumerate(dict.fromkeys(bodies))}
+        row_of_bodies = np.full((model.nbody, model.nbody), -1, dtype=np.int32)
+        for (target, link), row in rows.items():
+            row_of_bodies[target, link] = row
+        self._row_of_pair: Int[Tensor, " pair"] | None = None
+        if len(rows) < len(bodies):
+            self._row_of_pair = torch.tensor([rows[own] for own in bodies], dtype=torch.int64, device=device)
+        names = list(self._fields)
+        if any(name in names for name in SLOT_FIELDS) and "contact_found" not in names:
+            names.append("contact_found")  # it says which slot is free
+        shapes = {name: (num_envs, len(rows), *shape_of(name, inputs)[1:]) for name in names}
+        # One piece of memory, which one call clears.
+        self._memory = torch.zeros(sum(math.prod(shape) for shape in shapes.values()), device=device)
+        parts = self._memory.split([math.prod(shape) for shape in shapes.values()])
+        self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+        self._launch, self._kernel = wp.launch, _kernel(wp, mjw)
+        self._outputs: list[Any] = [
+            wp.array(row_of_bodies, dtype=int, device=wp.device_from_torch(device)),
+            inputs.slots,
+            wp.from_torch(self.arrays["contact_found"]) if "contact_found" in names else None,
+            *(wp.from_torch(self.arrays[name], dtype=wp.vec3) if name in names else None for name in _VECTORS),
+        ]
+
+    def update(self, warp_model: Any, warp_data: Any) -> None:
+        """Read MuJoCo Warp's contacts, of the instant that `forward` or `step` has left there: work for a `Replay`."""
+        if not self.arrays:
+            return
+        self._memory.zero_()
+        own = warp_data.contact
+        inputs = [warp_model.opt.cone, warp_model.geom_bodyid, warp_data.nacon, own.worldid, own.geom, own.type, own.pos]
+        inputs += [own.frame, own.friction, own.dim, own.efc_address, own.adhesion, warp_data.efc.force, warp_data.njmax]
+        self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
+
+    def read(self) -> dict[str, Float[Tensor, "env pair ..."]]:
+        """Return the fields that are wanted, each a tensor of its own."""
+        rows = self._row_of_pair
+        return {name: self.arrays[name].clone() if rows is None else self.arrays[name][:, rows] for name in self._fields}
+
+
+def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " sensor"]:
+    """Return the indices of a model's sensors, those left out that would find a module's contacts."""
+    ours = {name for pair in inputs.pairs for name in contact_sensor_names(pair)}
+    is_contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
+    is_ours = [bool(is_contact[i]) and model.sensor(i).name in ours for i in range(model.nsensor)]
+    return np.flatnonzero(~np.array(is_ours, dtype=bool))
+
+
+@functools.cache
+@no_type_check
+def _kernel(wp: Any, mjw: Any) -> Any:
+    """Return the kernel: one thread per contact. Arrays that are None are not wanted.
+
+    The normal points from the first geom's body to the second's. MuJoCo's sensor takes it as it is where the first one is the
+    object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
+    the part along that: in the world both are turned, as the normal is.
+    """
+    # Both are private, but a kernel can call a function and no kernel: the public `contact_force` is one.
+    wrench_of = mjw._src.support.contact_force_fn
+    constraint = wp.constant(int(mjw._src.types.ContactType.CONSTRAINT))
+
+    # fmt: off
+    @wp.kernel(enable_backward=False)
+    def gather(
+        cone: int, geom_body: wp.array[int], nacon: wp.array[int], world: wp.array[int], geom: wp.array[wp.vec2i],
+        kind: wp.array[int], pos: wp.array[wp.vec3], frame: wp.array[wp.mat33], friction: Any, dim: wp.array[int],
+        efc_address: wp.array2d[int], adhesion: wp.array[float], efc_force: wp.array2d[float], njmax: int,
+        row_of_bodies: wp.array2d[int], num_slots: int, found: wp.array2d[float], place: wp.array3d[wp.vec3],
+        normal: wp.array3d[wp.vec3], force: wp.array3d[wp.vec3], torque: wp.array3d[wp.vec3], netforce: wp.array2d[wp.vec3],
+    ):
+        # fmt: on
+        contact = wp.tid()
+        if contact >= nacon[0]:
+            return
+        geoms = geom[contact]
+        if (kind[contact] & constraint) == 0 or geoms[0] < 0 or geoms[1] < 0:  # a flex has no geom
+            return
+        env = world[contact]
+        for turned in range(2):  # a body may be the object of one pair and the link of another
+            row = row_of_bodies[geom_body[geoms[turned]], geom_body[geoms[1 - turned]]]
+            if row >= 0:
+                sign = 1.0 - 2.0 * float(turned)
+                slot = num_slots
+                if found:
+                    slot = int(wp.atomic_add(found, env, row, 1.0))
+                is_kept = slot < num_slots
+                if netforce or (is_kept and (force or torque)):
+                    wrench = wrench_of(
+                        cone, frame, friction, dim, efc_address, adhesion, efc_force, njmax, nacon, env, contact, True
+                    )
+                    if netforce:
+                        wp.atomic_add(netforce, env, row, sign * wp.spatial_top(wrench))
+                    if force and is_kept:
+                        force[env, row, slot] = sign * wp.spatial_top(wrench)
+                    if torque and is_kept:
+                        torque[env, row, slot] = sign * wp.spatial_bottom(wrench)
+                if place and is_kept:
+                    place[env, row, slot] = pos[contact]
+                if normal and is_kept:
+                    normal[env, row, slot] = sign * frame[contact][0]
+
+    return gather
