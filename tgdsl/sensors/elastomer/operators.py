@@ -15,6 +15,7 @@ error is within a tolerance of the matrix, by Frobenius' norm. The choice is by 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError
 from tgdsl.sensors.elastomer.kernels import Skin
+from tgdsl.sensors.link_products import are_for_kernel, products
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
 """Time per multiply-add of each form, over that of a large matrix product (one CPU core, float32, 512 environments)."""
@@ -107,6 +109,10 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
         name: The operator's name.
         planes: What goes in: any number of leading axes, taxels last.
     """
+    if (matrices := _matrices(constants, name)) and are_for_kernel(planes[0], matrices[0]):
+        lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
+        found = reduce(torch.add, [products(own, each) for own, each in zip(lines, matrices, strict=True)])
+        return tuple(found.unflatten(1, planes[0].shape[:-1]).unbind())
     parts: list[tuple[Tensor, ...]] = []
     start = 0
     while (form := _form(constants, f"{name}/{len(parts)}")) is not None:
@@ -114,6 +120,16 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
         parts.append(use(constant, [plane[..., start : start + num] for plane in planes]))
         start += num
     return tuple(part[0] if len(part) == 1 else torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
+
+
+def _matrices(constants: Mapping[str, Tensor], name: str) -> list[list[Float[Tensor, "_source out _target"]]]:
+    """Return the matrices of all links, for each plane that goes in; nothing if there are other forms."""
+    found: list[Tensor] = []
+    while (form := _form(constants, f"{name}/{len(found)}")) is not None:
+        if "matrix" not in form[0]:
+            return []
+        found.append(form[0]["matrix"])
+    return [[matrix[i] for matrix in found] for i in range(len(found[0]))] if found else []
 
 
 Block = Mapping[str, Tensor]

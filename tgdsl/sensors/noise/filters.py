@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from tgdsl.fusion import stored, takes_kernel
+from tgdsl.fusion import stored
+from tgdsl.sensors.link_products import products
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.instant import Now, Signal
 
 KERNEL = "kernel/"
-"""Kernels of the links, (σ, taxel to, taxel from): `kernel/0000` and so on, in the order of the taxels."""
+"""Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
 
 
 def hysteresis(
@@ -40,17 +41,10 @@ def crosstalk(signal: Signal, values: Mapping[str, Tensor]) -> Signal:
     return signal - given + mixed if "crosstalk_strength" in values else mixed
 
 
-def _product(signal: Signal, operators: Sequence[Tensor]) -> Signal:
-    """Return the signal with each link's rows multiplied by its operator, (to, from)."""
+def _product(signal: Signal, kernels: Sequence[Tensor]) -> Signal:
+    """Return the signal with each link's rows multiplied by its kernel, (from, to)."""
     lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
-    if takes_kernel(lines, *operators):
-        from tgdsl.sensors.noise.crosstalk_kernel import LARGEST, spread
-
-        if max(len(operator) for operator in operators) <= LARGEST:
-            return spread(lines.contiguous(), operators).view(signal.shape)
-    parts = lines.split([len(operator) for operator in operators], dim=1)
-    products = [own @ operator.T for own, operator in zip(parts, operators, strict=True)]
-    return torch.cat(products, dim=-1).view(signal.shape)
+    return products(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
 
 
 def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now) -> Signal:

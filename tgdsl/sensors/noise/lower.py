@@ -193,7 +193,7 @@ def _kernels(values: Mapping[str, np.ndarray], layout: Layout) -> dict[str, np.n
             kernels = [kernel]
         else:
             kernels = [np.diag(1 - strength[0, own]) + strength[0, own] * kernel]
-        found[f"{KERNEL}{i:04d}"] = np.stack(kernels)
+        found[f"{KERNEL}{i:04d}"] = np.stack(kernels).transpose(0, 2, 1)
     if is_wider:
         found["crosstalk_mixture"] = np.array([0.0, 1.0])[:, None, None]
     return found
