@@ -12,7 +12,7 @@ from tgdsl.buffers import Constants
 from tgdsl.geometry.bvh import TriangleMesh
 from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import split, vec
-from tgdsl.geometry.points import PointSource
+from tgdsl.geometry.points import PointSource, point_tiles
 from tgdsl.geometry.query import FeltObject, RaycastSurface
 from tgdsl.geometry.search import geom_tables, is_searchable
 from tgdsl.plan import Inputs, Plan, PlannedObject, PlannedPoints
@@ -54,6 +54,16 @@ class FeltObjects:
                     found |= {f"{path}/{name}": own.numpy() for name, own in zip(("spheres", "geoms"), tables, strict=True)}
         return found
 
+    def tiles(self) -> dict[str, np.ndarray]:
+        """Return by path the tiles of taxels that points of objects act on."""
+        found = {}
+        for i, query in enumerate(self._plan.queries):
+            for a, answer in enumerate(query.answers):
+                for k, taxels in enumerate(answer.points.taxels if answer.points is not None else ()):
+                    tiles = np.array(point_tiles(taxels, query.num_taxels), dtype=np.int32)
+                    found[f"queries/{i}/{a}/points/{k}/tiles"] = tiles.reshape(-1, 3)
+        return found
+
     def felt(self, target: PlannedObject, constants: Constants, tensors: Mapping[str, Tensor]) -> FeltObject:
         """Return an object as each environment has it."""
         variant, path = _variant(self._plan.inputs, target, tensors), f"objects/{target.name}"
@@ -92,8 +102,9 @@ class FeltObjects:
             if variant is not None:
                 points, area = points[:, variant], area[variant]
             places = vec(points[:, :, None].unbind())
-            pair, link = (constants[f"{path}/{k}/{name}"] for name in ("pair", "link"))
-            found.append(PointSource(target.name, pair, planned.taxels[k], places, area[:, None], self._skin(link, constants)))
+            pair, link, tiles = (constants[f"{path}/{k}/{name}"] for name in ("pair", "link", "tiles"))
+            skin = self._skin(link, constants)
+            found.append(PointSource(target.name, pair, planned.taxels[k], tiles, places, area[:, None], skin))
         return found
 
     def _skin(self, link: Tensor, constants: Constants) -> FeltObject:

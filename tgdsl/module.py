@@ -85,6 +85,13 @@ class TactileModule(nn.Module):
         self._queries = Queries(plan)
         self.constants = Constants(self._queries.constants(), dtype)
         self.memory = Memory(plan.sensors)
+        self._overwritten = [
+            f"{sensor.name}:{name}"
+            for sensor in plan.sensors
+            if plan.queries[sensor.query].answers[sensor.answer].points is not None
+            for name in sensor.state
+            if "/" not in name
+        ]
         self.histories = nn.ModuleDict(
             {
                 reading.name: History(sensor.history)
@@ -176,7 +183,7 @@ class TactileModule(nn.Module):
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
-        readings, updated = self.core(tensors, memory)
+        readings, updated = self._read(tensors, memory)
         store(memory, updated)
         return readings
 
@@ -191,6 +198,12 @@ class TactileModule(nn.Module):
             Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
             what is new: (env, …).
         """
+        copies = {name: memory[name].clone() for name in self._overwritten}
+        readings, updated = self._read(tensors, memory | copies)
+        return readings, copies | updated
+
+    def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
         nows, knobs = self._circumstances(tensors, memory)
         answers = self._queries.answers(self.constants, tensors, nows, knobs)
         readings: dict[str, Tensor] = {}

@@ -41,7 +41,7 @@ class Queries:
         """Return the Plan's arrays that a module keeps, and tables made of them, by their paths."""
         unused = ("layout/", *self._felt_objects.kept)
         arrays = {path: array for path, array in self._plan.arrays.items() if not path.startswith(unused)}
-        return arrays | self._felt_objects.searched()
+        return arrays | self._felt_objects.searched() | self._felt_objects.tiles()
 
     def answers(self, constants: Constants, tensors: Tensors, nows: Mapping[str, Now], knobs: Knobs) -> list[list[Answer]]:
         """Return the answers to all queries, and the probes of each.

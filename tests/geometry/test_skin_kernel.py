@@ -4,75 +4,16 @@ from functools import partial
 
 import torch
 from kernels import interpreted, needs_triton
+from meetings import CASES, made, nums_of
 
 from tgdsl.geometry import planes
-from tgdsl.geometry.grid import Grid
-from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.geometry.points import PointSource, _met, _met_by_kernel
-from tgdsl.geometry.query import FeltObject, Pairs
+from tgdsl.geometry.planes import vec
+from tgdsl.geometry.points import _met_by_kernel
 
-NUM_ENVS, CELL = 4, 0.002
 TOLERANCE = 3e-7
 """Of places within a decimetre in float32 [m]."""
 TURN = 1e-3
 """Of gradients: a place that is off by as much, over the cell."""
-CASES = {
-    # points, links, how each geom's grids are interpolated, whether the object differs between environments, is it gated
-    "one link": (10, 1, ["trilinear"], False, False),
-    "cubes": (70, 3, ["tricubic"], False, True),
-    "many points": (130, 2, ["tricubic"], True, True),
-    "several meshes": (40, 3, ["trilinear", "tricubic"], False, False),
-}
-NUMS = ((9, 7, 8), (6, 11, 5), (2, 2, 2))
-"""Nodes along the axes of each link's grid of the first geom; of the second those of the next link."""
-
-
-def nums_of(case, g):
-    """Return the numbers of nodes along the axes of each link's grid of a geom."""
-    return torch.tensor([NUMS[(link + g) % 3] for link in range(CASES[case][1])])
-
-
-def spheres(nums, cells, dtype):
-    """Return grids of distances to spheres about their middles."""
-    values, first = [], [0]
-    for num, cell in zip(nums, cells.double(), strict=True):
-        places = torch.cartesian_prod(*(torch.arange(n, dtype=torch.float64) - (n - 1) / 2 for n in num.tolist()))
-        values.append(cell * places.norm(dim=1) - 0.003)
-        first.append(first[-1] + len(places))
-    origins = -0.5 * cells[:, None] * (nums - 1)
-    return Grid(
-        torch.cat(values).float().to(dtype),
-        torch.tensor(first[:-1])[:, None],
-        split(nums[:, None]),
-        split(origins[:, None]),
-        cells[:, None],
-    )
-
-
-def made(case, dtype):
-    """Return pairs, and an object's points with the links that they may meet: spheres in grids of their own."""
-    num_points, num_links, shapes, differs, is_gated = CASES[case]
-    rng = torch.Generator().manual_seed(len(case))
-    draw = partial(torch.randn, generator=rng, dtype=torch.float64)
-    cells = CELL * (1 + torch.arange(num_links)).to(dtype)
-    grids = tuple(spheres(nums_of(case, g), cells, dtype) for g in range(len(shapes)))
-    place = (0.002 * draw(num_links, len(shapes), 3)).to(dtype)
-    turns = torch.stack(planes.rotation(draw(num_links, len(shapes), 4)), dim=-1).to(dtype)
-    is_absent = None
-    if len(shapes) > 1:
-        is_absent = torch.zeros((num_links, len(shapes)), dtype=torch.bool)
-        is_absent[0, 1] = is_absent[2, 0] = True
-    every = torch.arange(num_links)
-    links = FeltObject("links", 0, 0, tuple(shapes), (False,) * len(shapes), place, place, turns, is_absent, every, grids)
-    num_pairs = num_links + 2
-    parts = [*planes.rotation(draw(NUM_ENVS, num_pairs, 4)), *(0.003 * draw(3, NUM_ENVS, num_pairs))]
-    parts = torch.stack(list(parts), dim=1).to(dtype)
-    parts[:, :, 0] = torch.nan  # a pair that nobody asks for
-    gate = torch.where(draw(NUM_ENVS, num_pairs) > 0.4, -torch.inf, 0.0).to(dtype) if is_gated else None
-    pairs = Pairs(rot(parts[:, :9].unbind(1)), vec(parts[:, 9:].unbind(1)), None, gate)
-    points = vec((0.006 * draw(3, NUM_ENVS if differs else 1, 1, num_points)).to(dtype))
-    pair = 1 + torch.randperm(num_links, generator=rng)
-    return pairs, PointSource("cube", pair, ((0, 1),) * num_links, points, torch.ones(1, 1), links)
 
 
 def by_kernel(pairs, source):
@@ -98,7 +39,7 @@ def is_within(case, pairs, source, pos, slack):
 def check(case):
     """Compare what the kernel finds with the torch code: all places, and distances within the grids."""
     exact, arguments = made(case, torch.float64), made(case, torch.float32)
-    expected, (pos, distance, gradient) = _met(*exact), by_kernel(*arguments)
+    expected, (pos, distance, gradient) = exact.met(), by_kernel(*arguments)
     torch.testing.assert_close(torch.stack(pos).double(), torch.stack(expected.pos), rtol=0, atol=TOLERANCE)
     found = distance.isfinite()
     assert 0.02 < found.double().mean() < 0.98, case

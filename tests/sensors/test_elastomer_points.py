@@ -15,7 +15,7 @@ from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.compiler.quadrature import Pieces
 from tgdsl.errors import SpecError
 from tgdsl.geometry.planes import vec
-from tgdsl.geometry.query import MetPoints
+from tgdsl.geometry.points import MetPoints, point_tiles
 from tgdsl.geometry.reference import ReferencePoints
 from tgdsl.module import TactileModule
 from tgdsl.schema.load import load
@@ -71,6 +71,7 @@ def test_shear_is_in_what_the_suite_compares(tmp_path):
 
 
 LAW = Law(1e-3, 1e-5, 1e-4, None)
+TILES = torch.tensor(point_tiles([(0, 2)], 2))
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -94,12 +95,12 @@ class Skin:
             return vec(torch.from_numpy(np.array(part))[None, None] for part in vectors.T)
 
         phi, area = torch.tensor(distance)[None, None], torch.tensor([[3e-6]], dtype=torch.float64)
-        met = MetPoints(((0, 2),), rows(pos), phi, rows(self.gradient), area)
+        met = MetPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
         before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
         pulls, found = advance([met], self.law, before)
         marker, normal = (vec(part[0, 0] for part in rows(vectors)) for vectors in (self.POS, self.NORMAL))
         markers = Markers(marker, normal, *torch.tensor([2000.0, 6e-6], dtype=torch.float64))
-        np.testing.assert_allclose(torch.stack(drag([met], pulls, markers, 1), dim=-1)[0], expected, rtol=1e-12, atol=1e-22)
+        np.testing.assert_allclose(torch.stack(drag(pulls, markers, 1), dim=-1)[0], expected, rtol=1e-12, atol=1e-22)
         for name in PLANES:
             np.testing.assert_allclose(found[name][0], after[name], rtol=1e-12, atol=1e-18)
         self.memory, self.pulls = after, torch.stack(pulls[0].strength, dim=-1)[0, 0].numpy()
@@ -169,7 +170,7 @@ def test_not_a_number_comes_out_and_is_not_remembered():
     skin.step(START, [0.5e-3, 5.0])
     before = {name: torch.from_numpy(value)[None] for name, value in skin.memory.items()}
     nan = torch.full((1, 1, 2), torch.nan, dtype=torch.float64)
-    broken = MetPoints(((0, 2),), (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
+    broken = MetPoints(((0, 2),), TILES, (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
     pulls, after = advance([broken], skin.law, before)
     assert pulls[0].strength[0][0, 0, 0].isnan()
     for name in PLANES:

@@ -11,7 +11,7 @@ is formed first and gathered once.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -145,25 +145,6 @@ class Frame(NamedTuple):
     offset: Vec
 
 
-class MetPoints(NamedTuple):
-    """Points sampled on one object, as the links that they may meet see them; planes (env, link, point), in each link's frame.
-
-    Attributes:
-        taxels: First of each link's taxels, and one beyond the last.
-        pos: Where they are now [m]; a compiler stores them.
-        distance: Signed distance to the link's own surface [m]; +∞ where the gate is closed, and maybe where it is beyond what
-            the sensors asked for.
-        gradient: Its unit gradient.
-        area: Surface of the object that each stands for [m²], (case, 1).
-    """
-
-    taxels: tuple[tuple[int, int], ...]
-    pos: Vec
-    distance: Tensor
-    gradient: Vec
-    area: Tensor
-
-
 class Felt(NamedTuple):
     """The answer, at the geom that each probe is deepest in; planes of shape (env, taxel), in the link's frame.
 
@@ -178,7 +159,7 @@ class Felt(NamedTuple):
         moments: Moments of each object's surface, by its name, see `moments`; empty if not wanted, as the next two.
         motions: Motion of each object relative to the link; only with moments.
         area: Area of each object's outer surface, planes left out [m²], (case, 1).
-        points: Points of each object that some link may meet, by its name, see `points`; empty if not wanted.
+        points: Points of each object that some link may meet, by its name: a `points.Meeting`; empty if not wanted.
     """
 
     depth: Tensor
@@ -191,7 +172,7 @@ class Felt(NamedTuple):
     moments: dict[str, Moments]
     motions: dict[str, Motion]
     area: dict[str, Tensor]
-    points: dict[str, MetPoints]
+    points: dict[str, Any]
 
 
 def relate(

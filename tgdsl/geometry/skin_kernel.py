@@ -45,16 +45,20 @@ def meet(
         links: The links' own surfaces: an object whose cases are links.
         g: Which of their geoms.
     """
+    frames, counts, values = grid_tables(links, g)
+    where, is_cubic = torch.stack(points)[:, :, 0], links.shapes[g] == "tricubic"
+    found = _meet([*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, values, is_cubic)
+    x, y, z, distance, *gradient = found.unbind()
+    return (x, y, z), distance, vec(gradient)
+
+
+def grid_tables(links: FeltObject, g: int) -> tuple[Float[Tensor, "link 16"], Int[Tensor, "link 4"], Float[Tensor, " node"]]:
+    """Return what kernels are told of a geom of the links: `frames`, `counts` and `values`, see `launch`."""
     grid = links.surfaces[g]
     assert isinstance(grid, Grid)
     frames = torch.cat([links.pos[:, g], links.rotation[:, g], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)
     counts = torch.cat([part.reshape(-1, 1) for part in (grid.first, *grid.num)], dim=1)  # type: ignore[union-attr]
-    where = torch.stack(points)[:, :, 0]
-    found = _meet(
-        [*pairs.rotation, *pairs.offset], pairs.gate, pair, where, frames, counts, grid.values, links.shapes[g] == "tricubic"
-    )
-    x, y, z, distance, *gradient = found.unbind()
-    return (x, y, z), distance, vec(gradient)
+    return frames, counts, grid.values
 
 
 @triton_op("tgdsl::meet", mutates_args={})
@@ -117,52 +121,102 @@ def kernel(
     """Write what all points are to one link of one environment; see `launch`."""
     env, link = (tl.program_id(0) // num_links).to(tl.int64), tl.program_id(0) % num_links
     pair = tl.load(pairs + link)
-    at = env * pose_env + pair * pose_pair
-    x, y, z = (tl.load(xx + at), tl.load(xy + at), tl.load(xz + at)), (yx + at, yy + at, yz + at), (zx + at, zy + at, zz + at)
-    turn = (
-        x[0], x[1], x[2], tl.load(y[0]), tl.load(y[1]), tl.load(y[2]), tl.load(z[0]), tl.load(z[1]), tl.load(z[2]),
-    )  # fmt: skip
-    shift_x, shift_y, shift_z = tl.load(ox + at), tl.load(oy + at), tl.load(oz + at)
-    is_open = tl.full((), 1, tl.int1)
-    if IS_GATED:
-        is_open = (tl.load(gates + env * gate_env + pair * gate_pair) < 0) == 0  # so is one that is not a number
-    frame, count = frames + link * FRAME, counts + link * 4
-    geom_x, geom_y, geom_z = tl.load(frame), tl.load(frame + 1), tl.load(frame + 2)
-    geom_turn = loaded(frame + GEOM)
-    low_x, low_y, low_z = tl.load(frame + ORIGIN), tl.load(frame + ORIGIN + 1), tl.load(frame + ORIGIN + 2)
-    cell = tl.load(frame + CELL)
-    nodes = values + tl.load(count).to(tl.int64)
-    num_x, num_y, num_z = tl.load(count + 1).to(tl.int32), tl.load(count + 2).to(tl.int32), tl.load(count + 3).to(tl.int32)
+    pose = posed((xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz), env * pose_env + pair * pose_pair)
+    is_open = is_felt(gates, env * gate_env + pair * gate_pair, IS_GATED)
+    skin = surface(frames, counts, values, link)
     points += env * point_env
     plane = (tl.num_programs(0).to(tl.int64)) * num_points
     found += tl.program_id(0).to(tl.int64) * num_points
     for start in range(0, num_points, BLOCK):
         point = start + tl.arange(0, BLOCK)
         is_point = point < num_points
-        px, py, pz = (
-            tl.load(points + point, is_point, 0.0), tl.load(points + point_axis + point, is_point, 0.0),
-            tl.load(points + 2 * point_axis + point, is_point, 0.0),
-        )  # fmt: skip
-        here = rotate_back(turn, (px - shift_x, py - shift_y, pz - shift_z))
+        here = placed(pose, points, point_axis, point, is_point)
         tl.store(found + point, here[0], is_point)
         tl.store(found + plane + point, here[1], is_point)
         tl.store(found + 2 * plane + point, here[2], is_point)
-        distance = tl.full((BLOCK,), float("inf"), tl.float32)
-        gradient = (tl.zeros_like(distance), tl.zeros_like(distance), tl.zeros_like(distance))
+        distance, gradient = outside(here)
         if is_open:
-            own = rotate_back(geom_turn, (here[0] - geom_x, here[1] - geom_y, here[2] - geom_z))
-            u, v, w = (own[0] - low_x) / cell, (own[1] - low_y) / cell, (own[2] - low_z) / cell
-            is_out = _is_beyond(u, num_x) | _is_beyond(v, num_y) | _is_beyond(w, num_z) | (is_point == 0)
-            if is_any(is_out == 0):
-                value, slope = _interpolated(nodes, (u, v, w), (num_x, num_y, num_z), TIE / cell, is_out == 0, IS_CUBIC)
-                distance = tl.where(is_out, distance, value)
-                slope = chosen(value != value, gradient, (slope[0] / cell, slope[1] / cell, slope[2] / cell))
-                outward = rotate(geom_turn, direction(slope[0], slope[1], slope[2]))
-                gradient = chosen(is_out, gradient, outward)
+            distance, gradient = measured(skin, here, is_point, IS_CUBIC)
         tl.store(found + 3 * plane + point, distance, is_point)
         tl.store(found + 4 * plane + point, gradient[0], is_point)
         tl.store(found + 5 * plane + point, gradient[1], is_point)
         tl.store(found + 6 * plane + point, gradient[2], is_point)
+
+
+@triton.jit
+def posed(planes, at):
+    """Return the pose of a pair, rotation and then offset: `planes` are where twelve numbers begin, `at` the pair's place."""
+    return (
+        tl.load(planes[0] + at), tl.load(planes[1] + at), tl.load(planes[2] + at), tl.load(planes[3] + at),
+        tl.load(planes[4] + at), tl.load(planes[5] + at), tl.load(planes[6] + at), tl.load(planes[7] + at),
+        tl.load(planes[8] + at), tl.load(planes[9] + at), tl.load(planes[10] + at), tl.load(planes[11] + at),
+    )  # fmt: skip
+
+
+@triton.jit
+def is_felt(gates, at, IS_GATED: tl.constexpr):
+    """Return whether a pair may be felt; so may one whose gate is not a number."""
+    is_open = tl.full((), 1, tl.int1)
+    if IS_GATED:
+        is_open = (tl.load(gates + at) < 0) == 0
+    return is_open
+
+
+@triton.jit
+def surface(frames, counts, values, link):
+    """Return a link's surface: its geom's place and rotation, the grid's origin, spacing, numbers of nodes, and nodes."""
+    frame, count = frames + link * FRAME, counts + link * 4
+    place = tl.load(frame), tl.load(frame + 1), tl.load(frame + 2)
+    origin = tl.load(frame + ORIGIN), tl.load(frame + ORIGIN + 1), tl.load(frame + ORIGIN + 2)
+    num = tl.load(count + 1).to(tl.int32), tl.load(count + 2).to(tl.int32), tl.load(count + 3).to(tl.int32)
+    return place, loaded(frame + GEOM), origin, tl.load(frame + CELL), num, values + tl.load(count).to(tl.int64)
+
+
+@triton.jit
+def placed(pose, points, point_axis, point, is_point):
+    """Return where a block of an object's points is in the link's frame [m]."""
+    turn = (pose[0], pose[1], pose[2], pose[3], pose[4], pose[5], pose[6], pose[7], pose[8])
+    x = tl.load(points + point, is_point, 0.0) - pose[9]
+    y = tl.load(points + point_axis + point, is_point, 0.0) - pose[10]
+    z = tl.load(points + 2 * point_axis + point, is_point, 0.0) - pose[11]
+    return rotate_back(turn, (x, y, z))
+
+
+@triton.jit
+def outside(here):
+    """Return what is read outside: distance and gradient."""
+    none = tl.zeros_like(here[0])
+    return none + float("inf"), (none, none, none)
+
+
+@triton.jit
+def cells(skin, here):
+    """Return where a block of points in the link's frame is along the axes of the grid, in its cells."""
+    place, turn, low, cell, _, _ = skin
+    own = rotate_back(turn, (here[0] - place[0], here[1] - place[1], here[2] - place[2]))
+    return (own[0] - low[0]) / cell, (own[1] - low[1]) / cell, (own[2] - low[2]) / cell
+
+
+@triton.jit
+def is_within(skin, at):
+    """Return whether places in cells are inside the grid; what is no number is."""
+    num = skin[4]
+    return (_is_beyond(at[0], num[0]) | _is_beyond(at[1], num[1]) | _is_beyond(at[2], num[2])) == 0
+
+
+@triton.jit
+def measured(skin, here, is_point, IS_CUBIC: tl.constexpr):
+    """Return signed distances of a block of points to a link's surface [m], and unit gradients, in the link's frame."""
+    _, turn, _, cell, num, nodes = skin
+    distance, gradient = outside(here)
+    at = cells(skin, here)
+    is_in = is_within(skin, at) & is_point
+    if is_any(is_in):
+        value, slope = _interpolated(nodes, at, num, TIE / cell, is_in, IS_CUBIC)
+        distance = tl.where(is_in, value, distance)
+        slope = chosen(value != value, gradient, (slope[0] / cell, slope[1] / cell, slope[2] / cell))
+        gradient = chosen(is_in, rotate(turn, direction(slope[0], slope[1], slope[2])), gradient)
+    return distance, gradient
 
 
 @triton.jit
@@ -172,31 +226,52 @@ def _is_beyond(place, num):
 
 
 @triton.jit
+def nearest(skin, at, is_in):
+    """Return the distance at the node next to places in cells [m]: theirs is within a cell of it."""
+    num, nodes = skin[4], skin[5]
+    x, y, z = _rounded(at[0], num[0]), _rounded(at[1], num[1]), _rounded(at[2], num[2])
+    return tl.load(nodes + ((x * num[1] + y) * num[2] + z), is_in, float("inf"))
+
+
+@triton.jit
+def _rounded(place, num):
+    """Return the number of the node next to a place along an axis; an arbitrary one where it is no number."""
+    return tl.minimum(tl.maximum((place + 0.5).to(tl.int32), 0), num - 1)
+
+
+@triton.jit
 def _interpolated(nodes, place, num, slack, is_wanted, IS_CUBIC: tl.constexpr):
-    """Return the distance at places within one grid [m], and its slope along the axes [m per cell]; as `grid` has them."""
+    """Return the distance at places within one grid [m], and its slope along the axes [m per cell]; as `grid` has them.
+
+    Nodes along the last axis, which lie side by side, are a block's second axis: lanes that read them share sectors of memory.
+    """
+    NUM: tl.constexpr = 4 if IS_CUBIC else 2
     x, y, z = _lower(place[0], num[0], slack), _lower(place[1], num[1], slack), _lower(place[2], num[2], slack)
-    t_x, t_y, t_z = place[0] - x, place[1] - y, place[2] - z
-    total = tl.zeros_like(t_x)
-    slope = (total, total, total)
-    for i in tl.static_range(4 if IS_CUBIC else 2):
+    t_x, t_y, t_z = (place[0] - x)[:, None], (place[1] - y)[:, None], (place[2] - z)[:, None]
+    x, y, z, is_wanted = x[:, None], y[:, None], z[:, None], is_wanted[:, None]
+    k = tl.arange(0, NUM)[None, :]
+    column = tl.minimum(tl.maximum(z + k - 1, 0), num[2] - 1) if IS_CUBIC else z + k
+    total = tl.zeros_like(t_z + k)
+    total_x, total_y = total, total
+    for i in tl.static_range(NUM):
         w_x, d_x = _weight(t_x, i, IS_CUBIC)
-        sheet, sheet_y, sheet_z = tl.zeros_like(t_x), tl.zeros_like(t_x), tl.zeros_like(t_x)
+        sheet, sheet_y = tl.zeros_like(total), tl.zeros_like(total)
         rows = _node(x, i, num[0], IS_CUBIC) * num[1]
-        for j in tl.static_range(4 if IS_CUBIC else 2):
+        for j in tl.static_range(NUM):
             w_y, d_y = _weight(t_y, j, IS_CUBIC)
             row = (rows + _node(y, j, num[1], IS_CUBIC)) * num[2]
-            line, line_z = tl.zeros_like(t_x), tl.zeros_like(t_x)
-            for k in tl.static_range(4 if IS_CUBIC else 2):
-                value = tl.load(nodes + (row + _node(z, k, num[2], IS_CUBIC)), is_wanted, 0.0)
-                w_z, d_z = _weight(t_z, k, IS_CUBIC)
-                line += w_z * value
-                line_z += d_z * value
-            sheet += w_y * line
-            sheet_y += d_y * line
-            sheet_z += w_y * line_z
+            value = tl.load(nodes + (row + column), is_wanted, 0.0)
+            sheet += w_y * value
+            sheet_y += d_y * value
         total += w_x * sheet
-        slope = (slope[0] + d_x * sheet, slope[1] + w_x * sheet_y, slope[2] + w_x * sheet_z)
-    return total, slope
+        total_x += d_x * sheet
+        total_y += w_x * sheet_y
+    w_z, d_z = _weight(t_z, 0, IS_CUBIC)
+    for i in tl.static_range(1, NUM):
+        weight, slope = _weight(t_z, i, IS_CUBIC)
+        w_z, d_z = tl.where(k == i, weight, w_z), tl.where(k == i, slope, d_z)
+    slope = (tl.sum(w_z * total_x, axis=1), tl.sum(w_z * total_y, axis=1), tl.sum(d_z * total, axis=1))
+    return tl.sum(w_z * total, axis=1), slope
 
 
 @triton.jit

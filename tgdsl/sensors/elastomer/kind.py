@@ -93,14 +93,14 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     if "enter" in constants:
         law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
         if "shear_falloff" in constants:
-            pulls, after = point_anchors.advance(list(felt.points.values()), law, state)
+            pulls, after = point_anchors.gripped(list(felt.points.values()), law, state)
         else:
             shear, after = anchors.advance(felt, probes.pos, normal, law, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian
     found = move(felt.depth, shear, normal, constants)
     if pulls is not None:
         markers = Markers(probes.pos, normal, constants["shear_falloff"], constants.get("reference_area"))
-        dragged = point_anchors.drag(list(felt.points.values()), pulls, markers, felt.depth.shape[0])
+        dragged = point_anchors.drag(pulls, markers, felt.depth.shape[0])
         found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after
 

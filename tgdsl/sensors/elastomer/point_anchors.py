@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.query import MetPoints
+from tgdsl.geometry.points import Meeting, MetPoints, tile_size
 from tgdsl.geometry.reference import ReferencePoints
 from tgdsl.sensors.elastomer.anchors import Law, capped
 
@@ -45,10 +45,43 @@ class Markers(NamedTuple):
 
 
 class Pull(NamedTuple):
-    """The points of one object, planes (env, link, point) in each link's frame: z_p [m], and (z_p − e_p) h_p [m²]."""
+    """What the points of one object pull with, planes (env, link, point) in each link's frame.
 
+    Attributes:
+        taxels: First of each link's taxels, and one beyond the last.
+        tiles: What `points.point_tiles` returns of them.
+        area: Surface of the object that each stands for [m²], (case, 1).
+        pos: z_p [m].
+        strength: (z_p − e_p) h_p [m²].
+        pulling: A bit for each point that pulls, see `grip_kernel`; the others' numbers then mean nothing. None: it shows.
+    """
+
+    taxels: tuple[tuple[int, int], ...]
+    tiles: Int[Tensor, "tile 3"]
+    area: Tensor
     pos: Vec
     strength: Vec
+    pulling: Tensor | None = None
+
+
+def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
+    """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
+    if not all(meeting.takes_kernel and len(meeting.source.links.shapes) == 1 for meeting in meetings):
+        return advance([meeting.met() for meeting in meetings], law, state)
+    from tgdsl.geometry.skin_kernel import grid_tables
+    from tgdsl.sensors.elastomer.grip_kernel import grip
+
+    pulls, first = [], 0
+    numbers = [part for part in law if isinstance(part, Tensor)]
+    for pairs, source in meetings:
+        places, tables = torch.stack(source.points)[:, :, 0], grid_tables(source.links, 0)
+        is_cubic, pose = source.links.shapes[0] == "tricubic", [*pairs.rotation, *pairs.offset]
+        planes_of = [state[name] for name in PLANES]
+        found, pulling = grip(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
+        x, y, z, *strength = found.unbind()
+        pulls.append(Pull(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), pulling))
+        first += source.pair.shape[0] * places.shape[2]
+    return pulls, {}
 
 
 def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
@@ -73,45 +106,58 @@ def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> 
         is_taken = ~is_held & (law.reach - distance > law.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
         shape = points.distance.shape[1:]
-        pulls.append(Pull(points.pos, planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))))
+        strength = planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))
+        pulls.append(Pull(points.taxels, points.tiles, points.area, points.pos, strength))
         for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
             after[name].append(plane)
     return pulls, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}
 
 
-def drag(met: Sequence[MetPoints], pulls: Sequence[Pull], markers: Markers, num_envs: int) -> Vec:
+def drag(pulls: Sequence[Pull], markers: Markers, num_envs: int) -> Vec:
     """Return u_j / s_s of all markers [m²], planes (env, taxel)."""
-    num_taxels = markers.pos[0].shape[0]
-    zero = markers.pos[0].new_zeros((num_envs, num_taxels))
+    zero = markers.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
     total = (zero, zero, zero)
-    for points, pull in zip(met, pulls, strict=True):
-        weight = 1.0 if markers.reference_area is None else points.area / markers.reference_area
-        for link, (first, last) in enumerate(points.taxels):
-            pos, normal = (planes.vec(part[first:last] for part in vector) for vector in (markers.pos, markers.normal))
-            own = Pull(*(planes.vec(part[:, link] for part in vector) for vector in pull))
-            found = _summed(own, markers._replace(pos=pos, normal=normal))
-            around = (first, num_taxels - last)
-            total = planes.add(total, planes.vec(torch.nn.functional.pad(weight * part, around) for part in found))
+    for pull in pulls:
+        found = _summed(pull, markers)
+        if markers.reference_area is not None:
+            found = planes.scale(pull.area / markers.reference_area, found)
+        total = planes.add(total, found)
     return planes.sub(total, planes.scale(planes.dot(total, markers.normal), markers.normal))
 
 
 def _summed(pull: Pull, markers: Markers) -> Vec:
-    """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of one link's markers; point planes (env, point)."""
+    """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of the points of one object."""
     if takes_kernel(*pull.pos, *pull.strength, markers.falloff):
         from tgdsl.sensors.elastomer.point_sum_kernel import point_sum
 
-        return planes.vec(point_sum(pull.pos, pull.strength, markers.pos, markers.normal, markers.falloff).unbind())
-    num_envs, num = pull.pos[0].shape
+        size, where = tile_size(pull.taxels), (list(markers.pos), list(markers.normal))
+        found = point_sum(list(pull.pos), list(pull.strength), pull.pulling, pull.tiles, size, *where, markers.falloff)
+        return planes.vec(found.unbind())
+    num_taxels = markers.pos[0].shape[0]
+    zero = markers.pos[0].new_zeros((pull.pos[0].shape[0], num_taxels))
+    total = (zero, zero, zero)
+    for link, (first, last) in enumerate(pull.taxels):
+        pos, normal = (planes.vec(part[first:last] for part in vector) for vector in (markers.pos, markers.normal))
+        z, strength = (planes.vec(part[:, link] for part in vector) for vector in (pull.pos, pull.strength))
+        found = _summed_on_link(z, strength, pos, normal, markers.falloff)
+        around = (first, num_taxels - last)
+        total = planes.add(total, planes.vec(torch.nn.functional.pad(part, around) for part in found))
+    return total
+
+
+def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
+    """Return the sum for one link's markers, of planes (env, point)."""
+    num_envs, num = pos[0].shape
     # A compiler fuses kernel and sum into one loop, whatever the length.
     step = num if torch.compiler.is_compiling() else BLOCK
-    x, normal = (planes.vec(part[:, None] for part in vector) for vector in (markers.pos, markers.normal))
-    zero = pull.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
+    x, normal = (planes.vec(part[:, None] for part in vector) for vector in (marker, normal))
+    zero = pos[0].new_zeros((num_envs, marker[0].shape[0]))
     total = (zero, zero, zero)
     for start in range(0, num, step):
-        z, own = (planes.vec(part[:, None, start : start + step] for part in vector) for vector in pull)
+        z, own = (planes.vec(part[:, None, start : start + step] for part in vector) for vector in (pos, strength))
         way = planes.sub(x, z)
         along = planes.dot(way, normal)
-        fall = torch.exp(-markers.falloff * (planes.dot(way, way) - along * along))
+        fall = torch.exp(-falloff * (planes.dot(way, way) - along * along))
         total = planes.add(total, planes.vec((fall * part).sum(dim=-1) for part in own))
     return total
 
