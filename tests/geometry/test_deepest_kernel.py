@@ -176,7 +176,7 @@ def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
     from tgdsl.geometry import deepest_kernel
 
-    deepest_kernel._deepest = partial(deepest_kernel.launch, deepest_kernel.kernel)
+    deepest_kernel._deepest = partial(deepest_kernel.launch, deepest_kernel.deepest_kernel)
     for case in CASES:
         check(case)
     check_strange_poses()

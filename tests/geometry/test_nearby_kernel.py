@@ -83,7 +83,7 @@ def compare() -> None:
     """Compare the kernel with the torch code in all cases: run where `TRITON_INTERPRET` is set."""
     from tgdsl.geometry import nearby_kernel
 
-    nearby_kernel._felt_moments = partial(nearby_kernel.launch, nearby_kernel.kernel)
+    nearby_kernel._felt_moments = partial(nearby_kernel.launch, nearby_kernel.nearby_kernel)
 
     def moments(pairs, probes, source, is_kernel):
         nearby.takes_kernel = lambda *tensors: is_kernel

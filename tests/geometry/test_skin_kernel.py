@@ -74,7 +74,7 @@ def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
     from tgdsl.geometry import skin_kernel
 
-    skin_kernel._meet = partial(skin_kernel.launch, skin_kernel.kernel)
+    skin_kernel._meet = partial(skin_kernel.launch, skin_kernel.skin_kernel)
     for case in CASES:
         check(case)
     check_strange_poses()

@@ -7,7 +7,7 @@ import pytest
 import torch
 from kernels import interpreted, needs_triton
 
-from tgdsl.sensors.footprint import FAR, LEVENBERG, Bodies, shared_forces, unreached
+from tgdsl.sensors.footprint import FAR, LEVENBERG, Bodies, box, shared_forces, unreached
 
 RADIUS = 0.01
 TOLERANCE = 1e-5
@@ -35,10 +35,10 @@ def grip(rng, num_envs, num_contacts, pads, half=0.012, steps=2):
     depth = rng.uniform(0, 0.002, (num_envs, pos.shape[1])) * (rng.random((num_envs, pos.shape[1])) < 0.7)
     radius = np.linspace(RADIUS, 1.3 * RADIUS, len(pads))
     counts = np.array([len(each) for each in pads])
-    return bodies_of(counts, is_active), pos, depth, point, force, torque, radius, np.full(steps, LEVENBERG)
+    return bodies_of(counts, is_active, pos.T), pos, depth, point, force, torque, radius, np.full(steps, LEVENBERG)
 
 
-def bodies_of(counts, is_active):
+def bodies_of(counts, is_active, pos):
     """Return the padded taxels of bodies with so many each, all of a radius of 2 mm."""
     first = np.concatenate([[0], np.cumsum(counts)])
     rank = np.arange(first[-1]) - np.repeat(first[:-1], counts)
@@ -47,7 +47,8 @@ def bodies_of(counts, is_active):
     inverse_radius = np.zeros(taxel.shape)
     taxel[body, rank] = np.arange(first[-1])
     inverse_radius[body, rank] = is_active / 0.002
-    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first)))
+    boxes = np.array([box(pos[(body == b) & is_active]) for b in range(len(counts))])
+    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first, boxes)))
 
 
 def cases():
@@ -55,7 +56,7 @@ def cases():
     found = {
         "one environment": grip(rng, 1, 8, [pad(3)], steps=4),
         "several bodies": grip(rng, 9, 3, [pad(3), pad(2)[:3], pad(2)[:1]]),
-        "at the edge": grip(rng, 8, 4, [pad()], half=0.03),
+        "at the edge": grip(rng, 400, 4, [pad()], half=0.03),
         "by depth alone": grip(rng, 3, 2, [pad(3)], steps=0),
         "no contacts": grip(rng, 3, 0, [pad(3)]),
         "all beyond reach": grip(rng, 3, 4, [pad(3) + 1.0]),
@@ -89,8 +90,8 @@ def by_kernel(case):
     place = torch.where(own[:, None] > 0, torch.tensor(pos).T, FAR)
     planes = [tuple(torch.tensor(value, dtype=torch.float32)) for value in rest[:3]]
     radius, levenberg = (torch.tensor(value, dtype=torch.float32) for value in rest[3:])
-    arguments = (place.float(), weight.float(), *planes, radius, levenberg, bodies.first)
-    shared, sums = footprint_kernel.launch(footprint_kernel.kernel, *arguments)
+    arguments = (place.float(), weight.float(), *planes, radius, levenberg, bodies.first, bodies.box.float())
+    shared, sums = footprint_kernel.launch(footprint_kernel.footprint_kernel, *arguments)
     return shared.transpose(0, 1), sums[:3], sums[3:]
 
 

@@ -51,13 +51,13 @@ def nothing_held(meeting):
 def by_kernel(meeting, law, state):
     """Return what pulls, and change the state in place, as `gripped` has the kernel do on a GPU."""
     from tgdsl.geometry.skin_kernel import grid_tables
-    from tgdsl.sensors.elastomer.grip_kernel import kernel, launch
+    from tgdsl.sensors.elastomer.grip_kernel import grip_kernel, launch
 
     (rotation, offset, _, gate), source = meeting
     places, numbers = torch.stack(source.points)[:, :, 0], [part for part in law if part is not None]
     how = (*grid_tables(source.links, 0), source.links.shapes[0] == "tricubic")
     held = [state[name] for name in PLANES]
-    return launch(kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
+    return launch(grip_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
 
 
 def unpacked(pulling, num_points):
@@ -117,8 +117,8 @@ def check_sums():
     """A module's own way by both kernels moves the markers as the torch code does."""
     from tgdsl.sensors.elastomer import grip_kernel, point_sum_kernel
 
-    grip_kernel.grip = partial(grip_kernel.launch, grip_kernel.kernel)
-    point_sum_kernel.point_sum = partial(point_sum_kernel.launch, point_sum_kernel.kernel)
+    grip_kernel.grip = partial(grip_kernel.launch, grip_kernel.grip_kernel)
+    point_sum_kernel.point_sum = partial(point_sum_kernel.launch, point_sum_kernel.point_sum_kernel)
     meeting, exact = made("cubes", torch.float32), made("cubes", torch.float64)
     state = {name: plane[:, BEFORE:].contiguous() for name, plane in nothing_held(meeting).items()}
     places = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]], dtype=torch.float64)

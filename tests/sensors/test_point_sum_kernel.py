@@ -65,11 +65,11 @@ def told(pull: Pull) -> Pull:
 
 def main() -> None:
     """Print the results of all cases, as a process that interprets kernels."""
-    from tgdsl.sensors.elastomer.point_sum_kernel import kernel, launch
+    from tgdsl.sensors.elastomer.point_sum_kernel import launch, point_sum_kernel
 
     def run(pull: Pull, markers: Markers) -> torch.Tensor:
         how = (pull.pulling, pull.tiles, tile_size(pull.taxels))
-        return launch(kernel, pull.pos, pull.strength, *how, markers.pos, markers.normal, markers.falloff)
+        return launch(point_sum_kernel, pull.pos, pull.strength, *how, markers.pos, markers.normal, markers.falloff)
 
     found = {}
     for name, case in CASES.items():

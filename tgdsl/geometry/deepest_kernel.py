@@ -76,11 +76,11 @@ def deepest(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object
 def _deepest(
     pose: list[Tensor], pos: list[Tensor], pair: Tensor, reach: Tensor, gate: Tensor | None, spheres: Tensor, geoms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    return launch(wrap_triton(kernel), pose, pos, pair, reach, gate, spheres, geoms)
+    return launch(wrap_triton(deepest_kernel), pose, pos, pair, reach, gate, spheres, geoms)
 
 
 def launch(
-    kernel: Any,
+    run: Any,
     pose: list[Float[Tensor, "env pair"]],
     pos: list[Float[Tensor, " taxel"]],
     pair: Int[Tensor, "object taxel"],
@@ -92,7 +92,7 @@ def launch(
     """Run the kernel, plain or wrapped, and return what `Deepest` holds.
 
     Args:
-        kernel: The kernel.
+        run: The kernel.
         pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
             that lie in memory alike.
         pos: Positions of the probes in their links' frames [m].
@@ -109,7 +109,7 @@ def launch(
     num_points = num_envs * num_taxels
     tables = [table.contiguous() for table in (reach, spheres, geoms)]
     own = tables[0].stride()
-    kernel[(triton.cdiv(num_points, BLOCK),)](
+    run[(triton.cdiv(num_points, BLOCK),)](
         depth, normal, winner, *pose, *pos, pair, *tables, pose[0] if gate is None else gate, num_points, num_objects,
         *pose[0].stride(), *(gate if gate is not None else pose[0]).stride(), own[0],
         own[1] if reach.ndim == 3 and reach.shape[1] != 1 else 0,
@@ -120,7 +120,7 @@ def launch(
 
 
 @triton.jit
-def kernel(
+def deepest_kernel(
     depth_out, normal_out, pair_out, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, x_in, y_in, z_in,
     pairs, reach, spheres, geoms, gates, num_points, num_objects, pose_env, pose_pair, gate_env, gate_pair,
     reach_object, reach_env, sphere_env, geom_env,

@@ -70,7 +70,7 @@ def _felt_moments(
     table: Tensor | None,
     numbers: list[int],
 ) -> Tensor:
-    return launch(wrap_triton(kernel), pose, pos, pair, radius, shift, values, lattice, table, numbers)
+    return launch(wrap_triton(nearby_kernel), pose, pos, pair, radius, shift, values, lattice, table, numbers)
 
 
 def launch(
@@ -143,7 +143,7 @@ def _along(place, num):
 
 
 @triton.jit
-def kernel(
+def nearby_kernel(
     moments_ptr,
     xx_ptr,
     xy_ptr,

@@ -72,7 +72,7 @@ def _meet(
     values: Tensor,
     is_cubic: bool,
 ) -> Tensor:
-    return launch(wrap_triton(kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
+    return launch(wrap_triton(skin_kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
 
 
 def launch(
@@ -113,7 +113,7 @@ def launch(
 
 
 @triton.jit
-def kernel(
+def skin_kernel(
     found, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
     num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
     IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,

@@ -126,12 +126,19 @@ class Bodies(NamedTuple):
         inverse_radius: 1/R of each [1/m], 0 for inactive ones and those repeated.
         row: Place of each taxel in these, flattened.
         first: First taxel of each body, and the number of all.
+        box: Least and largest coordinates of its active taxels [m].
     """
 
     taxel: Int[Tensor, "body padded"]
     inverse_radius: Float[Tensor, "body padded"]
     row: Int[Tensor, " taxel"]
     first: Int[Tensor, " bodies_and_one"]
+    box: Float[Tensor, "body 6"]
+
+
+def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
+    """Return the least and the largest coordinates of taxels [m], 0 of none."""
+    return np.concatenate([pos.min(axis=0), pos.max(axis=0)]) if len(pos) else np.zeros(6)
 
 
 class Shared(NamedTuple):
@@ -179,7 +186,8 @@ def shared_forces(
         own = inverse_radius.flatten()[bodies.row]
         weight = depth * own + unreached()
         place = torch.where(own[:, None] > 0, torch.stack(pos, dim=-1), FAR)
-        shared, sums = footprint_kernel.shared_forces(place, weight, point, force, torque, radius, levenberg, bodies.first)
+        args = radius, levenberg, bodies.first, bodies.box
+        shared, sums = footprint_kernel.shared_forces(place, weight, point, force, torque, *args)
         return Shared(planes.vec(shared.unbind(1)), planes.vec(sums[:3].unbind()), planes.vec(sums[3:].unbind()), shared)
     share, residual = footprint(
         planes.vec(part[taxel] for part in pos),

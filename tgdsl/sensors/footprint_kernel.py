@@ -4,8 +4,9 @@ A program takes one body in a block of environments. Its lanes hold contacts, an
 taxels need no exchange between lanes. A pass over the taxels sums the moments of the arms x_j − x_c; the mean and covariance of
 the levers g follow from those, as g is linear in the arm. Groups of contacts that are all empty are passed over.
 
-Covariances are differences of moments about the contact: where few taxels are in reach, all of them on one side of it, float32
-keeps fewer digits than in the torch code, and forces differ by up to 3·10⁻⁵ of the largest.
+Covariances are differences of moments, and float32 would lose their digits where few taxels are in reach, all of them on one
+side of the contact. So moments of contacts that stand beside the box of the body's taxels are about the point of that box which
+is next to them.
 
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """
@@ -30,6 +31,8 @@ FEW_STEPS = 12
 """Steps up to which no exponent β · g can overflow float32, as each makes β longer by √10 at most."""
 UNROLL = tl.constexpr(8)
 """Taxels of a pass that are worked on at a time."""
+BESIDE = tl.constexpr(0.25)
+"""How far a contact stands beside the box of the taxels where moments are about that [footprints]."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
 LOG2_E = tl.constexpr(1.4426950408889634)
@@ -48,6 +51,7 @@ def shared_forces(
     radius: Tensor,
     levenberg: Tensor,
     first: Tensor,
+    box: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the force on each taxel, (env, 3, taxel) [N], and two vectors of each body, (6, env, body).
 
@@ -62,12 +66,13 @@ def shared_forces(
         radius: Radius of a footprint, (body,) [m].
         levenberg: Least curvature of each step towards the moment [1].
         first: First taxel of each body, and the number of all: (body + 1,).
+        box: Least and largest coordinates of each body's active taxels, (body, 6) [m].
     """
-    return launch(wrap_triton(kernel), pos, weight, point, force, torque, radius, levenberg, first)
+    return launch(wrap_triton(footprint_kernel), pos, weight, point, force, torque, radius, levenberg, first, box)
 
 
 def launch(
-    kernel: Any,
+    run: Any,
     pos: Tensor,
     weight: Tensor,
     point: Sequence[Tensor],
@@ -76,6 +81,7 @@ def launch(
     radius: Tensor,
     levenberg: Tensor,
     first: Tensor,
+    box: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Run the kernel, plain or wrapped, on the arguments of `shared_forces`."""
     num_envs, num_bodies, num_contacts = point[0].shape
@@ -83,17 +89,17 @@ def launch(
     shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((6, num_envs, num_bodies))
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque)]
-    kernel[(triton.cdiv(num_envs, ENVS), num_bodies)](
-        *planes, radius, levenberg, first, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    run[(triton.cdiv(num_envs, ENVS), num_bodies)](
+        *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
         STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
     )  # fmt: skip
     return shared, sums
 
 
 @triton.jit
-def kernel(
+def footprint_kernel(
     pos, weight, point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z,
-    radius, levenberg, first, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
@@ -108,6 +114,7 @@ def kernel(
     weights = weight + first_taxel + tl.where(is_env, env, 0) * num_taxels
     planes = (point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z)
     inverse = 1.0 / tl.load(radius + body)
+    box += 6 * body
     IS_LONG: tl.constexpr = STEPS > FEW
 
     zero = tl.zeros((ENVS,), tl.float32)
@@ -121,7 +128,15 @@ def kernel(
             if is_any:
                 strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
-                captured, norm, top, mean, covariance = _moments(pos, weights, num_own, point, slope, inverse, IS_LONG)
+                away, is_beside = _away(box, point, force, inverse)
+                if is_beside:
+                    captured, norm, top, mean, covariance = _moments(
+                        pos, weights, num_own, point, slope, inverse, away, IS_LONG, True
+                    )
+                else:
+                    captured, norm, top, mean, covariance = _moments(
+                        pos, weights, num_own, point, slope, inverse, away, IS_LONG, False
+                    )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
                 excess = _add3(excess, _unmet(captured, mean, force, torque))
@@ -139,7 +154,15 @@ def kernel(
         if is_any | (start == 0):
             strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
-            captured, norm, top, mean, covariance = _moments(pos, weights, num_own, point, slope, inverse, IS_LONG)
+            away, is_beside = _away(box, point, force, inverse)
+            if is_beside:
+                captured, norm, top, mean, covariance = _moments(
+                    pos, weights, num_own, point, slope, inverse, away, IS_LONG, True
+                )
+            else:
+                captured, norm, top, mean, covariance = _moments(
+                    pos, weights, num_own, point, slope, inverse, away, IS_LONG, False
+                )
             unmet = _add3(unmet, _unmet(captured, mean, force, torque))
             each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
             carried = _add3(carried, _summed(_scale3(norm, each)))
@@ -228,7 +251,18 @@ def _pull(arm, weight, slope, top, inverse):
 
 
 @triton.jit
-def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr):
+def _away(box, point, force, inverse):
+    """Return the way from contacts to the box of the taxels, (env, contact) [m], and whether one that acts stands beside it."""
+    x = tl.clamp(point[0], tl.load(box), tl.load(box + 3)) - point[0]
+    y = tl.clamp(point[1], tl.load(box + 1), tl.load(box + 4)) - point[1]
+    z = tl.clamp(point[2], tl.load(box + 2), tl.load(box + 5)) - point[2]
+    acts = (force[0] != 0) | (force[1] != 0) | (force[2] != 0)
+    is_beside = acts & (inverse * inverse * (x * x + y * y + z * z) > BESIDE * BESIDE)
+    return (x, y, z), tl.max(tl.max(is_beside.to(tl.int32), axis=1), axis=0) != 0
+
+
+@triton.jit
+def _moments(pos, weights, num_own, point, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
     zero = tl.zeros_like(point[0])
     top = zero
@@ -242,6 +276,8 @@ def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
+        if IS_BESIDE:
+            arm = _arm(arm, away)
         px, py, pz = part * arm[0], part * arm[1], part * arm[2]
         total += part
         x, y, z = x + px, y + py, z + pz
@@ -255,7 +291,8 @@ def _moments(pos, weights, num_own, point, slope, inverse, IS_LONG: tl.constexpr
         norm * xx - x * x, norm * xy - x * y, norm * xz - x * z,
         norm * yy - y * y, norm * yz - y * z, norm * zz - z * z,
     )  # fmt: skip
-    return captured, total, top, (x, y, z), spread
+    mean = (x + away[0], y + away[1], z + away[2]) if IS_BESIDE else (x, y, z)
+    return captured, total, top, mean, spread
 
 
 @triton.jit

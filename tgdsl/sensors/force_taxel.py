@@ -116,6 +116,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "inverse_radius": inverse_radius,
         "first": first,
         "row": layout.body_id * counts.max() + rank,
+        "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
     }
@@ -138,7 +139,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     """Return the force planes [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
     contacts = felt.contacts
     assert contacts is not None
-    bodies = footprint.Bodies(constants["taxel"], constants["inverse_radius"], constants["row"], constants["first"])
+    bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
     shared = footprint.shared_forces(
         bodies,
         probes.pos,

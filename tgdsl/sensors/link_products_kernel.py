@@ -46,11 +46,11 @@ def link_products(lines: Tensor, matrices: Sequence[Tensor]) -> Tensor:
         lines: What there is before, (line, row), contiguous.
         matrices: (from, plane, to) of each link, in the order of their rows, which together are all.
     """
-    return launch(wrap_triton(kernel), lines, matrices)
+    return launch(wrap_triton(link_products_kernel), lines, matrices)
 
 
 def launch(
-    kernel: Any, lines: Float[Tensor, "line row"], matrices: Sequence[Float[Tensor, "_from plane _to"]]
+    run: Any, lines: Float[Tensor, "line row"], matrices: Sequence[Float[Tensor, "_from plane _to"]]
 ) -> Float[Tensor, "plane line row"]:
     """Run the kernel, plain or wrapped, on the arguments of `link_products`."""
     assert lines.is_contiguous()
@@ -66,7 +66,7 @@ def launch(
     steps = 1 if not is_held else min(max(num_blocks * num_tiles // NUM_PROGRAMS, 1), MAX_STEPS)
     stages = (2 if rest == BLOCK else 3) if is_held else 1  # more do not fit
     if lines.numel() > 0:
-        kernel[(num_tiles * triton.cdiv(num_blocks, steps),)](
+        run[(num_tiles * triton.cdiv(num_blocks, steps),)](
             lines, flat, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
             LINES=LINES, SIZE=block, REST=rest, IS_HELD=is_held, num_warps=4, num_stages=stages,
         )  # fmt: skip
@@ -110,7 +110,7 @@ def _(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
 
 
 @triton.jit
-def kernel(
+def link_products_kernel(
     lines, matrices, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
     LINES: tl.constexpr, SIZE: tl.constexpr, REST: tl.constexpr, IS_HELD: tl.constexpr,
 ):  # fmt: skip

@@ -49,7 +49,7 @@ def grip(
     first: int,
 ) -> tuple[Tensor, Tensor]:
     """Advance anchors in place, and return what pulls; see `launch`."""
-    return launch(wrap_triton(kernel), pose, gate, pair, points, frames, counts, values, is_cubic, law, state, first)
+    return launch(wrap_triton(grip_kernel), pose, gate, pair, points, frames, counts, values, is_cubic, law, state, first)
 
 
 def launch(
@@ -101,7 +101,7 @@ def launch(
 
 
 @triton.jit
-def kernel(
+def grip_kernel(
     found, pulling, anchor_x, anchor_y, anchor_z, held, reach, enter, exit, slip,
     xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values, first, state_env,
     num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,

@@ -38,7 +38,7 @@ def point_sum(
     falloff: Tensor,
 ) -> Tensor:
     """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker) [m²]; see `launch`."""
-    return launch(wrap_triton(kernel), pos, strength, pulling, tiles, block, marker, normal, falloff)
+    return launch(wrap_triton(point_sum_kernel), pos, strength, pulling, tiles, block, marker, normal, falloff)
 
 
 def launch(
@@ -78,7 +78,7 @@ def launch(
 
 
 @triton.jit
-def kernel(
+def point_sum_kernel(
     z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, found, told, tiles,
     num_links, num_points, stride_env, stride_link, num_markers, IS_TOLD: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
