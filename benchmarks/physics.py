@@ -10,8 +10,8 @@ taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo
 
 A scene is first stepped once without sensors, and some instants are kept. From each of them every module's control step is
 timed again and again, in turn with one without sensors: physics does the same work each time. Times are medians by CUDA events:
-`plain` is the step without sensors (nor contact sensors in MuJoCo's model), `step` the same with touch in the same CUDA graph,
-`module` a graph of the module alone, on that state, and `read` one that gathers the state too.
+`plain` is the step without sensors, `step` the same with touch in the same CUDA graph, `module` a graph of the module alone, on
+that state, and `read` one that gathers the state too.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ MODULES: dict[str, tuple[tuple[str, ...], Any]] = {
 }
 """What is timed: its sensors, and their noise."""
 PLAIN = "surface_distance"
-"""The module whose scene has no contact sensors: its simulator stands for none."""
+"""The module that asks for no contacts: its simulator, stepped without reading, stands for none."""
 
 
 @dataclass(frozen=True)

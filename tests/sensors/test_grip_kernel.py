@@ -8,6 +8,7 @@ from kernels import interpreted, needs_triton
 from meetings import NUM_ENVS, made
 
 from tgdsl.geometry.planes import rot, vec
+from tgdsl.geometry.points import met_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import Law
 from tgdsl.sensors.elastomer.point_anchors import PLANES, advance, gripped
@@ -74,7 +75,7 @@ def check(case, law):
     state, seen = nothing_held(meeting), torch.zeros(4)
     for step in range(STEPS):
         before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
-        (pull,), expected = advance([moved(exact, step).met()], of(law, torch.float64), before)
+        (pull,), expected = advance([met_points(moved(exact, step))], of(law, torch.float64), before)
         found, pulling = by_kernel(moved(meeting, step), of(law, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
@@ -125,16 +126,16 @@ def check_sums():
     numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
     for step in range(3):
         before = {name: plane.double() for name, plane in state.items()}
-        pulls, _ = advance([moved(exact, step).met()], of(SLIDES, torch.float64), before)
+        pulls, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
         expected = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
         point_anchors.takes_kernel = lambda *_: True
-        type(meeting).takes_kernel = True
+        point_anchors.are_for_kernel = lambda _: True
         pulls, after = gripped([moved(meeting, step)], of(SLIDES, torch.float32), state)
         markers = point_anchors.Markers(vec(0.003 * places.T.float()), vec(places.T.float()), *numbers.float())
         found = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
         point_anchors.takes_kernel = lambda *_: False
-        type(meeting).takes_kernel = False
+        point_anchors.are_for_kernel = lambda _: False
         assert after == {} and (step != 1 or expected.abs().max() > 1e-9)
         torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
@@ -160,7 +161,7 @@ def test_without_a_kernel_all_objects_are_advanced_by_torch(law):
         meeting = made(case, torch.float64)
         state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
         (pull,), after = gripped([meeting], of(LAWS[law], torch.float64), state)
-        (expected,), wanted = advance([meeting.met()], of(LAWS[law], torch.float64), state)
+        (expected,), wanted = advance([met_points(meeting)], of(LAWS[law], torch.float64), state)
         assert pull.pulling is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
         assert torch.equal(torch.stack(pull.strength), torch.stack(expected.strength))
 

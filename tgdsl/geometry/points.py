@@ -72,25 +72,26 @@ class Meeting(NamedTuple):
     pairs: Pairs
     source: PointSource
 
-    @property
-    def takes_kernel(self) -> bool:
-        """Whether a kernel can take all of it: the links' geoms are grids, on a GPU."""
-        (rotation, offset, _, _), source = self.pairs, self.source
-        are_grids = all(isinstance(surface, Grid) for surface in source.links.surfaces)
-        return are_grids and takes_kernel(*rotation, *offset, *source.points, source.links.pos, source.links.rotation)
 
-    def met(self) -> MetPoints:
-        """Return where the points are, and how deep in the links' surfaces."""
-        pairs, source = self
-        if self.takes_kernel:
-            return _met_by_kernel(pairs, source)
-        rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
-        offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
-        pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
-        distance, gradient = body_distance(pos, source.links)
-        if pairs.gate is not None:
-            distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
-        return MetPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
+def are_for_kernel(meeting: Meeting) -> bool:
+    """Return whether a kernel can take all of it: the links' geoms are grids, on a GPU."""
+    (rotation, offset, _, _), source = meeting.pairs, meeting.source
+    are_grids = all(isinstance(surface, Grid) for surface in source.links.surfaces)
+    return are_grids and takes_kernel(*rotation, *offset, *source.points, source.links.pos, source.links.rotation)
+
+
+def met_points(meeting: Meeting) -> MetPoints:
+    """Return where the points are, and how deep in the links' surfaces."""
+    pairs, source = meeting
+    if are_for_kernel(meeting):
+        return _met_by_kernel(pairs, source)
+    rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
+    offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
+    pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
+    distance, gradient = body_distance(pos, source.links)
+    if pairs.gate is not None:
+        distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
+    return MetPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
 
 
 def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Felt:

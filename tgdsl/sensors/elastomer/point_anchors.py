@@ -25,7 +25,7 @@ from torch import Tensor
 from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.points import Meeting, MetPoints, tile_size
+from tgdsl.geometry.points import Meeting, MetPoints, are_for_kernel, met_points, tile_size
 from tgdsl.geometry.reference import ReferencePoints
 from tgdsl.sensors.elastomer.anchors import Law, capped
 
@@ -66,8 +66,8 @@ class Pull(NamedTuple):
 
 def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
     """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
-    if not all(meeting.takes_kernel and len(meeting.source.links.shapes) == 1 for meeting in meetings):
-        return advance([meeting.met() for meeting in meetings], law, state)
+    if not all(are_for_kernel(meeting) and len(meeting.source.links.shapes) == 1 for meeting in meetings):
+        return advance([met_points(meeting) for meeting in meetings], law, state)
     from tgdsl.geometry.skin_kernel import grid_tables
     from tgdsl.sensors.elastomer.grip_kernel import grip
 

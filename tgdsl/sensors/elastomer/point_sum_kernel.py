@@ -1,8 +1,9 @@
 """The sum over points of `point_anchors` as one Triton kernel, for a GPU in float32 without derivatives.
 
-A program takes one environment and a tile of markers of one link, which its lanes hold; points come one after the other. Most
-of them pull at nothing: groups of those are passed over, so points that are near on the object should be near among all. The
-in-plane offset Π_n(x − z) is found along two tangents of each marker, scaled so that its square is the exponent of 2.
+A program takes one environment and some tiles of markers, each of one link, which its lanes hold; points come one after the
+other. Most of them pull at nothing: tiles and groups of those are passed over, so points that are near on the object should be
+near among all. The in-plane offset Π_n(x − z) is found along two tangents of each marker, scaled so that its square is the
+exponent of 2.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points, `word` groups of 32 of them, `marker` markers
 of all links, `tile` tiles.
@@ -23,6 +24,8 @@ from torch.library import triton_op, wrap_triton
 
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
+TILES = 4
+"""Tiles of a program that is told what pulls: at most of them nothing does."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 
 
@@ -67,12 +70,12 @@ def launch(
     """
     num_envs, num_links, num_points = pos[0].shape
     found = pos[0].new_empty((3, num_envs, marker[0].shape[0]))
-    grid = (num_envs, tiles.shape[0])
+    of_program = 1 if pulling is None else TILES
     planes = (*pos, *strength, *(part.contiguous() for part in (*marker, *normal)))
-    run[grid](
+    run[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
         *planes, falloff, found, tiles if pulling is None else pulling, tiles,
-        num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
-        IS_TOLD=pulling is not None, BLOCK=block, num_warps=1,
+        tiles.shape[0], num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
+        IS_TOLD=pulling is not None, TILES=of_program, BLOCK=block, num_warps=1,
     )  # fmt: skip
     return found
 
@@ -80,87 +83,113 @@ def launch(
 @triton.jit
 def point_sum_kernel(
     z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, found, told, tiles,
-    num_links, num_points, stride_env, stride_link, num_markers, IS_TOLD: tl.constexpr, BLOCK: tl.constexpr,
+    num_tiles, num_links, num_points, stride_env, stride_link, num_markers,
+    IS_TOLD: tl.constexpr, TILES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Sum over the points of one environment for one tile of markers."""
-    env, tile = tl.program_id(0).to(tl.int64), tiles + 3 * tl.program_id(1)
-    link, first, last = tl.load(tile), tl.load(tile + 1), tl.load(tile + 2)
-    marker = first + tl.arange(0, BLOCK)
-    is_marker = marker < last
-    at = env * stride_env + tl.maximum(link, 0) * stride_link
-    z_x, z_y, z_z, s_x, s_y, s_z = z_x + at, z_y + at, z_z + at, s_x + at, s_y + at, s_z + at
-    num_points = tl.where(link < 0, 0, num_points)
-    num_words = tl.cdiv(num_points, 32)  # none of no link
-    told += (env * num_links + link) * num_words
-    has_any = num_points > 0
+    """Sum over the points of one environment for some tiles of markers."""
+    env, first_tile = tl.program_id(0).to(tl.int64), tl.program_id(1) * TILES
+    own = first_tile + tl.arange(0, TILES)
+    links = tl.load(tiles + 3 * own, own < num_tiles, -1)
+    num_words = tl.cdiv(num_points, 32)
+    told += env * num_links * num_words
+    have_any = ((links >= 0) & (num_points > 0)).to(tl.int32)
     if IS_TOLD:
-        most = tl.zeros((32,), tl.int32)
-        for chunk in range(0, num_words, 32):
-            word = chunk + tl.arange(0, 32)
-            most |= tl.load(told + word, word < num_words, 0)
-        has_any = tl.max((most != 0).to(tl.int32), axis=0) != 0
-    none = tl.zeros((BLOCK,), tl.float32)
-    total = (none, none, none)
-    if has_any:
-        nx, ny = tl.load(n_x + marker, is_marker, 0.0), tl.load(n_y + marker, is_marker, 0.0)
-        nz = tl.load(n_z + marker, is_marker, 1.0)
-        # Two tangents without a branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017.
-        sign = tl.where(nz < 0, -1.0, 1.0)
-        a = -1.0 / (sign + nz)
-        b = nx * ny * a
-        scale = tl.sqrt(tl.load(falloff) * LOG2_E)
-        u = (scale * (1.0 + sign * nx * nx * a), scale * sign * b, -scale * sign * nx)
-        v = (scale * b, scale * (sign + ny * ny * a), -scale * ny)
-        x, y = tl.load(x_x + marker, is_marker, 0.0), tl.load(x_y + marker, is_marker, 0.0)
-        z = tl.load(x_z + marker, is_marker, 0.0)
-        middle = (u[0] * x + u[1] * y + u[2] * z, v[0] * x + v[1] * y + v[2] * z)
-        if IS_TOLD:
-            for chunk in range(0, num_words, 32):
-                word = chunk + tl.arange(0, 32)
-                words = tl.load(told + word, word < num_words, 0)
-                busy = tl.sum((words != 0).to(tl.int32) << tl.arange(0, 32), axis=0)
-                for w in range(tl.minimum(32, num_words - chunk)):
-                    if (busy >> w) & 1:
-                        bits = tl.load(told + chunk + w)
-                        for group in range(4):
-                            if (bits >> (8 * group)) & 255:
-                                for bit in range(8 * group, 8 * group + 8):
-                                    if (bits >> bit) & 1:
-                                        p = 32 * (chunk + w) + bit
-                                        pos, strength = (z_x + p, z_y + p, z_z + p), (s_x + p, s_y + p, s_z + p)
-                                        total = _added(total, middle, u, v, pos, strength)
-        else:
-            # The points of an environment share a pose: one that is not a number shows in the first, whether it pulls or not.
-            rest = tl.load(z_x) + tl.load(z_y) + tl.load(z_z)
-            total = (none + 0.0 * rest, none + 0.0 * rest, none + 0.0 * rest)
-            for chunk in range(0, num_points, 32 * GROUP):
-                point = chunk + tl.arange(0, 32 * GROUP)
-                is_point = point < num_points
-                pulls = tl.load(s_x + point, is_point, 0.0) != 0.0
-                pulls |= tl.load(s_y + point, is_point, 0.0) != 0.0
-                pulls |= tl.load(s_z + point, is_point, 0.0) != 0.0
-                groups = tl.max(tl.reshape(pulls.to(tl.int32), (32, GROUP)), axis=1)
-                pulling = tl.sum(groups << tl.arange(0, 32))
-                for group in range(32):
-                    if (pulling >> group) & 1:
-                        start = chunk + group * GROUP
-                        for p in tl.range(start, tl.minimum(start + GROUP, num_points), loop_unroll_factor=4):
-                            total = _added(total, middle, u, v, (z_x + p, z_y + p, z_z + p), (s_x + p, s_y + p, s_z + p))
-    place = found + env * num_markers + marker
+        have_any = tl.zeros((TILES,), tl.int32)
+        for start in range(0, num_words, 32):
+            word = start + tl.arange(0, 32)
+            is_word = (links >= 0)[:, None] & (word < num_words)[None, :]
+            words = tl.load(told + links[:, None] * num_words + word[None, :], is_word, 0)
+            have_any |= tl.max((words != 0).to(tl.int32), axis=1)
+    busy = tl.sum(have_any << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
-    tl.store(place, total[0], is_marker)
-    tl.store(place + plane, total[1], is_marker)
-    tl.store(place + 2 * plane, total[2], is_marker)
+    found += env * num_markers
+    for i in range(tl.minimum(TILES, num_tiles - first_tile)):
+        tile = tiles + 3 * (first_tile + i)
+        link, first, last = tl.load(tile), tl.load(tile + 1), tl.load(tile + 2)
+        marker = first + tl.arange(0, BLOCK)
+        is_marker = marker < last
+        none = tl.zeros((BLOCK,), tl.float32)
+        total = (none, none, none)
+        if (busy >> i) & 1:
+            frame = _frame((x_x, x_y, x_z), (n_x, n_y, n_z), marker, is_marker, tl.load(falloff))
+            at = env * stride_env + link * stride_link
+            pos, strength = (z_x + at, z_y + at, z_z + at), (s_x + at, s_y + at, s_z + at)
+            if IS_TOLD:
+                total = _sum_of_told(total, frame, pos, strength, told + link * num_words, num_words)
+            else:
+                total = _sum_of_all(total, frame, pos, strength, num_points)
+        place = found + marker
+        tl.store(place, total[0], is_marker)
+        tl.store(place + plane, total[1], is_marker)
+        tl.store(place + 2 * plane, total[2], is_marker)
 
 
 @triton.jit
-def _added(total, middle, u, v, pos, strength):
-    """Return the sum with one point more, which is in memory there; `u` and `v` are the markers' scaled tangents."""
-    x, y, z = tl.load(pos[0]), tl.load(pos[1]), tl.load(pos[2])
-    along_u = middle[0] - u[0] * x - u[1] * y - u[2] * z
-    along_v = middle[1] - v[0] * x - v[1] * y - v[2] * z
+def _frame(pos, normal, marker, is_marker, falloff):
+    """Return where markers are along two tangents of their own, and these tangents, scaled by √(λ log₂ e)."""
+    nx, ny = tl.load(normal[0] + marker, is_marker, 0.0), tl.load(normal[1] + marker, is_marker, 0.0)
+    nz = tl.load(normal[2] + marker, is_marker, 1.0)
+    # Two tangents without a branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017.
+    sign = tl.where(nz < 0, -1.0, 1.0)
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    scale = tl.sqrt(falloff * LOG2_E)
+    u = (scale * (1.0 + sign * nx * nx * a), scale * sign * b, -scale * sign * nx)
+    v = (scale * b, scale * (sign + ny * ny * a), -scale * ny)
+    x, y = tl.load(pos[0] + marker, is_marker, 0.0), tl.load(pos[1] + marker, is_marker, 0.0)
+    z = tl.load(pos[2] + marker, is_marker, 0.0)
+    return u[0] * x + u[1] * y + u[2] * z, v[0] * x + v[1] * y + v[2] * z, u, v
+
+
+@triton.jit
+def _sum_of_told(total, frame, pos, strength, told, num_words):
+    """Return the sum over the points whose bits are set."""
+    for start in range(0, num_words, 32):
+        word = start + tl.arange(0, 32)
+        words = tl.load(told + word, word < num_words, 0)
+        busy = tl.sum((words != 0).to(tl.int32) << tl.arange(0, 32), axis=0)
+        for w in range(tl.minimum(32, num_words - start)):
+            if (busy >> w) & 1:
+                bits = tl.load(told + start + w)
+                for group in range(4):
+                    if (bits >> (8 * group)) & 255:
+                        for bit in range(8 * group, 8 * group + 8):
+                            if (bits >> bit) & 1:
+                                total = _added(total, frame, pos, strength, 32 * (start + w) + bit)
+    return total
+
+
+@triton.jit
+def _sum_of_all(total, frame, pos, strength, num_points):
+    """Return the sum over all points; groups that pull at nothing are passed over."""
+    # The points of an environment share a pose: one that is not a number shows in the first, whether it pulls or not.
+    rest = 0.0 * (tl.load(pos[0]) + tl.load(pos[1]) + tl.load(pos[2]))
+    total = (total[0] + rest, total[1] + rest, total[2] + rest)
+    for start in range(0, num_points, 32 * GROUP):
+        point = start + tl.arange(0, 32 * GROUP)
+        is_point = point < num_points
+        pulls = tl.load(strength[0] + point, is_point, 0.0) != 0.0
+        pulls |= tl.load(strength[1] + point, is_point, 0.0) != 0.0
+        pulls |= tl.load(strength[2] + point, is_point, 0.0) != 0.0
+        groups = tl.max(tl.reshape(pulls.to(tl.int32), (32, GROUP)), axis=1)
+        pulling = tl.sum(groups << tl.arange(0, 32))
+        for group in range(32):
+            if (pulling >> group) & 1:
+                first = start + group * GROUP
+                for p in tl.range(first, tl.minimum(first + GROUP, num_points), loop_unroll_factor=4):
+                    total = _added(total, frame, pos, strength, p)
+    return total
+
+
+@triton.jit
+def _added(total, frame, pos, strength, p):
+    """Return the sum with one point more."""
+    x, y, z = tl.load(pos[0] + p), tl.load(pos[1] + p), tl.load(pos[2] + p)
+    at_u, at_v, u, v = frame
+    along_u = at_u - u[0] * x - u[1] * y - u[2] * z
+    along_v = at_v - v[0] * x - v[1] * y - v[2] * z
     fall = tl.exp2(-along_u * along_u - along_v * along_v)
     return (
-        total[0] + fall * tl.load(strength[0]), total[1] + fall * tl.load(strength[1]),
-        total[2] + fall * tl.load(strength[2]),
+        total[0] + fall * tl.load(strength[0] + p), total[1] + fall * tl.load(strength[1] + p),
+        total[2] + fall * tl.load(strength[2] + p),
     )  # fmt: skip
