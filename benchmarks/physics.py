@@ -2,6 +2,7 @@
 
     python benchmarks/physics.py artefacts out/physics                                # where documents can be compiled
     python benchmarks/physics.py run out/physics --out out/physics.json [--warm]      # on the machine with the GPU
+    python benchmarks/physics.py run out/physics --out out/physics.json --profile --scenes hand-med --modules elastomer
     python benchmarks/physics.py plot out/physics.json --out docs/images/physics.png
 
 Scenes: the pyramid of ten cubes (examples/pyramid.yaml) and the XHand1 with a cube (examples/xhand1_palm.yaml) at 199 and 667
@@ -11,7 +12,7 @@ taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo
 A scene is first stepped once without sensors, and some instants are kept. From each of them every module's control step is
 timed again and again, in turn with one without sensors: physics does the same work each time. Times are medians by CUDA events:
 `plain` is the step without sensors, `step` the same with touch in the same CUDA graph, `module` a graph of the module alone, on
-that state, and `read` one that gathers the state too.
+that state, and `read` one that gathers the state too. `--profile` lists the kernels of `module` as well, the longest first.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ import torch
 from gpu import sharing_processors
 from physics_scenes import MODULES, PLAIN, SCENES, Scene, artefact, make_artefacts
 from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
 
 import tgdsl
 from tgdsl.errors import SimulationError
@@ -180,6 +182,20 @@ def paired(plain: WarpSimulation, sim: WarpSimulation, instants: Instants, repea
     return first, second
 
 
+def profiled(call: Callable[[], Any], device: torch.device, calls: int = 5, most: int = 30) -> str:
+    """Return the kernels of a call as text: time of each in a call [ms], how often it runs, and its name."""
+    on_gpu = device.type == "cuda"
+    with profile(activities=[ProfilerActivity.CUDA if on_gpu else ProfilerActivity.CPU]) as found:
+        for _ in range(calls):
+            call()
+        synchronize(device)
+    rows = [(e.self_device_time_total if on_gpu else e.self_cpu_time_total, e.count, e.key) for e in found.key_averages()]
+    rows = sorted((row for row in rows if row[0] > 0), reverse=True)
+    times = [f"{time / 1e3 / calls:14.4f}{count / calls:7.1f}  {name[:100]}" for time, count, name in rows[:most]]
+    total = f"{sum(row[0] for row in rows) / 1e3 / calls:14.4f}{sum(row[1] for row in rows) / calls:7.1f}  in all"
+    return "\n".join([total, *times])
+
+
 def simulation(touch: TactileModule, scene: Scene, num_envs: int, options: argparse.Namespace) -> WarpSimulation:
     """Return environments of a scene; what goes wrong is asked for in the end, so that it does not disturb the timing."""
     model = scene_model(touch.plan.scene)
@@ -215,7 +231,10 @@ def measure(
     fault = fault_of(sim)
     contacts = int(sim.warp_data.nacon.numpy()[0]) / sim.num_envs
     state = sim.state()
-    alone = median_of(replayed(lambda: touch(state), device), options.repeats, device)
+    graph = replayed(lambda: touch(state), device)
+    alone = median_of(graph, options.repeats, device)
+    if options.profile:
+        print(profiled(graph, device), flush=True)
     read = median_of(replayed(lambda: touch(sim.state()), device), options.repeats, device)
     rows = touch.outputs[0].shape[0] if module != "link_contact" else len(touch.taxels["s0"]["link"])
     return Row(name, module, plain.num_envs, scene.substeps, rows, before, step, alone, read, contacts, fault)
@@ -274,7 +293,7 @@ def write(path: Path, rows: list[Row], versions: dict[str, str]) -> None:
 def command(options: argparse.Namespace, scenes: Sequence[str], modules: Sequence[str], envs: Sequence[int]) -> list[str]:
     """Return the command line that runs some modules of some scenes."""
     own = [sys.executable, "-u", __file__, "run", str(options.folder), "--device", options.device]
-    own += ["--native-ccd"] if options.native_ccd else []
+    own += [f"--{flag}".replace("_", "-") for flag in ("native_ccd", "profile") if getattr(options, flag)]
     own += ["--repeats", str(options.repeats), "--instants", str(options.instants), *(["--eager"] if options.eager else [])]
     return [*own, "--scenes", *scenes, "--modules", *modules, "--envs", *map(str, envs)]
 
@@ -354,6 +373,7 @@ def parsed() -> argparse.Namespace:
     running.add_argument("--instants", type=int, default=4)
     running.add_argument("--eager", action="store_true", help="neither compiled modules nor CUDA graphs")
     running.add_argument("--native-ccd", action="store_true", help="boxes meet by MuJoCo Warp's own way, not by MuJoCo's")
+    running.add_argument("--profile", action="store_true", help="list each module's kernels too")
     running.add_argument("--warm", action="store_true", help="compile all kernels, time nothing")
     running.add_argument("--jobs", type=int, default=6, help="processes of --warm")
     running.set_defaults(call=run)

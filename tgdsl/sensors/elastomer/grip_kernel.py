@@ -30,7 +30,7 @@ from tgdsl.geometry.skin_kernel import cells, is_felt, is_within, measured, near
 WORD = 32
 """Points that are taken together, by a program of one warp, and whose bits are one number."""
 LINKS = 4
-"""Links of a program: of single ones there would be so many that to start them takes longer than what most have to do."""
+"""Links of a program: at most of them there is nothing to do but to see that."""
 MANY = 256
 """Most points that are looked at at once, for which there are registers."""
 TINY = tl.constexpr(1e-24)
