@@ -9,7 +9,7 @@ object differs between environments, `node` nodes of all grids.
 """
 
 # What a kernel's types are only Triton's compiler knows.
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations
 

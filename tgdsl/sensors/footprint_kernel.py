@@ -11,6 +11,9 @@ is next to them.
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """
 
+# What a kernel's types are only Triton's compiler knows.
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
