@@ -56,7 +56,7 @@ def cases():
     found = {
         "one environment": grip(rng, 1, 8, [pad(3)], steps=4),
         "several bodies": grip(rng, 9, 3, [pad(3), pad(2)[:3], pad(2)[:1]]),
-        "at the edge": grip(rng, 400, 4, [pad()], half=0.03),
+        "at the edge": grip(rng, 100, 4, [pad()], half=0.03),
         "by depth alone": grip(rng, 3, 2, [pad(3)], steps=0),
         "no contacts": grip(rng, 3, 0, [pad(3)]),
         "all beyond reach": grip(rng, 3, 4, [pad(3) + 1.0]),
