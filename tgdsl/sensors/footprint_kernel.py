@@ -131,15 +131,9 @@ def footprint_kernel(
             if is_any:
                 strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
-                away, is_beside = _away(box, point, force, inverse)
-                if is_beside:
-                    captured, norm, top, mean, covariance = _moments(
-                        pos, weights, num_own, point, slope, inverse, away, IS_LONG, True
-                    )
-                else:
-                    captured, norm, top, mean, covariance = _moments(
-                        pos, weights, num_own, point, slope, inverse, away, IS_LONG, False
-                    )
+                captured, norm, top, mean, covariance = _moments(
+                    pos, weights, num_own, box, point, force, slope, inverse, IS_LONG
+                )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
                 excess = _add3(excess, _unmet(captured, mean, force, torque))
@@ -157,15 +151,7 @@ def footprint_kernel(
         if is_any | (start == 0):
             strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
-            away, is_beside = _away(box, point, force, inverse)
-            if is_beside:
-                captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_own, point, slope, inverse, away, IS_LONG, True
-                )
-            else:
-                captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_own, point, slope, inverse, away, IS_LONG, False
-                )
+            captured, norm, top, mean, covariance = _moments(pos, weights, num_own, box, point, force, slope, inverse, IS_LONG)
             unmet = _add3(unmet, _unmet(captured, mean, force, torque))
             each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
             carried = _add3(carried, _summed(_scale3(norm, each)))
@@ -265,8 +251,19 @@ def _away(box, point, force, inverse):
 
 
 @triton.jit
-def _moments(pos, weights, num_own, point, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
+def _moments(pos, weights, num_own, box, point, force, slope, inverse, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
+    away, is_beside = _away(box, point, force, inverse)
+    if is_beside:
+        found = _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG, True)
+    else:
+        found = _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG, False)
+    return found
+
+
+@triton.jit
+def _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
+    """Return what `_moments` does; sums are about the contacts, or beside the box about what is `away` from them."""
     zero = tl.zeros_like(point[0])
     top = zero
     if IS_LONG:
