@@ -1,18 +1,23 @@
 """The Triton kernel by which points take hold of links, run on the CPU by Triton's interpreter, against the torch code."""
 
+import json
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
 from kernels import interpreted, needs_triton
 from meetings import NUM_ENVS, made
 
+import tgdsl
+from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.geometry.points import met_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import Law
 from tgdsl.sensors.elastomer.point_anchors import PLANES, advance, gripped
 
+PALM = Path(__file__).parents[2] / "examples" / "xhand1_palm.yaml"
 STICKS, SLIDES = Law(1e-3, 1e-5, 1e-3, None), Law(1e-3, 1e-5, 1e-3, 0.4)
 LAWS = {"sticks": STICKS, "slides": SLIDES}
 CASES = ("one link", "cubes", "many points")
@@ -152,6 +157,22 @@ def compare() -> None:
 @needs_triton
 def test_the_kernel_is_the_torch_code():
     interpreted(__file__)
+
+
+def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
+    """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
+    sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
+    touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
+    (shape,), below = touch.plan.skin.shapes, []
+    random = torch.Generator().manual_seed(0)
+    nums, firsts, cells, values = (touch.constants[f"links/0/{name}"] for name in ("num", "first", "cell", "values"))
+    for num, first, cell in zip(nums, firsts, cells.double(), strict=True):
+        nodes = values[first : first + num.prod()].double().view(*num)
+        at = torch.rand((100_000, 3), generator=random, dtype=torch.float64) * (num - 1)
+        grid = one_grid(nodes, torch.zeros(3, dtype=torch.float64), cell)
+        distance, _ = METHODS[shape](vec((cell * at).T), grid)
+        below.append(float((nodes[tuple((at + 0.5).long().T)] - distance).max() / cell))
+    assert 0.5 < max(below) < 0.95
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -227,7 +227,7 @@ def _is_beyond(place, num):
 
 @triton.jit
 def nearest(skin, at, is_in):
-    """Return the distance at the node next to places in cells [m]: theirs is within a cell of it."""
+    """Return the distance at the node next to places in cells [m]: theirs is less than a cell below it."""
     num, nodes = skin[4], skin[5]
     x, y, z = _rounded(at[0], num[0]), _rounded(at[1], num[1]), _rounded(at[2], num[2])
     return tl.load(nodes + ((x * num[1] + y) * num[2] + z), is_in, float("inf"))
