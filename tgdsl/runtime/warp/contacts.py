@@ -31,7 +31,8 @@ _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", 
 class PairContacts:
     """Contacts of the pairs that a module wants, on the device. Only what the module wants is found and kept.
 
-    Pairs whose link and object are the same bodies are found once.
+    Pairs whose link and object are the same bodies are found once. Contacts fill slots in no certain order; if there are more
+    than slots, which are kept is not certain either, but the net force is that of all.
 
     Attributes:
         arrays: Live tensors (env, row, …) of the fields of a state, float32; a row is a pair of bodies. Where slots are wanted,

@@ -180,7 +180,7 @@ def _compact(value: Float[np.ndarray, "end channel row"]) -> np.ndarray:
 
 
 def _kernels(values: Mapping[str, np.ndarray], layout: Layout) -> dict[str, np.ndarray]:
-    """Return each link's operator W; G alone where χ or σ is a range: of the lower end, and what the upper one adds."""
+    """Return each link's operator W, (σ, from, to); G alone where χ or σ is a range: the lower end's, then the rest."""
     found: dict[str, np.ndarray] = {}
     strength, (low, high) = values["crosstalk_strength"][:, 0], values["crosstalk_sigma"][:, 0]
     is_wider = bool((low != high).any())
