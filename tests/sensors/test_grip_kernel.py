@@ -66,9 +66,9 @@ def by_kernel(meeting, law, state):
     return launch(grip_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
 
 
-def unpacked(pulling, num_points):
-    """Return whether each point pulls, (env, link, point)."""
-    return (((pulling[..., None] >> torch.arange(32)) & 1) != 0).flatten(2)[..., :num_points]
+def first_ones(count, num_points):
+    """Return which columns of (env, link, point) hold a point that pulls."""
+    return torch.arange(num_points) < count[..., None]
 
 
 def check(case, law):
@@ -81,13 +81,15 @@ def check(case, law):
     for step in range(STEPS):
         before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
         (pull,), expected = advance([met_points(moved(exact, step))], of(law, torch.float64), before)
-        found, pulling = by_kernel(moved(meeting, step), of(law, torch.float32), state)
+        found, count = by_kernel(moved(meeting, step), of(law, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
             torch.testing.assert_close(plane[:, BEFORE:].double(), expected[name], rtol=0, atol=PLACE)
         pulls = torch.stack(pull.strength).ne(0).any(dim=0)
-        assert torch.equal(unpacked(pulling, pulls.shape[2]), pulls), (case, step)
-        apart = (found.double() - torch.stack([*pull.pos, *pull.strength]))[:, pulls].abs()
+        assert torch.equal(count, pulls.sum(dim=-1)), (case, step)
+        apart = (
+            found[:, first_ones(count, pulls.shape[2])].double() - torch.stack([*pull.pos, *pull.strength])[:, pulls]
+        ).abs()
         assert not apart.numel() or (apart[:3].max() <= PLACE and apart[3:].max() <= STRENGTH), (case, step)
         held, after = before["held"] > 0, expected["held"] > 0
         dragged = held & after & (expected["anchor_x"] != before["anchor_x"])
@@ -102,20 +104,20 @@ def check_strange_poses():
     for step in range(2):
         by_kernel(moved(meeting, step), law, state)
     num_points = meeting.source.points[0].shape[2]
-    clean, pulling = by_kernel(moved(meeting, 1), law, {name: plane.clone() for name, plane in state.items()})
-    own, others = slice(BEFORE, BEFORE + num_points), torch.ones(pulling.shape[:2], dtype=torch.bool)
+    clean, count = by_kernel(moved(meeting, 1), law, {name: plane.clone() for name, plane in state.items()})
+    own, others = slice(BEFORE, BEFORE + num_points), torch.ones(count.shape, dtype=torch.bool)
     others[2, 0] = False
     for gate in (0.0, -torch.inf, torch.nan):
         broken, after = moved(meeting, 1), {name: plane.clone() for name, plane in state.items()}
         pair = int(broken.source.pair[0])
         broken.pairs.offset[1][2, pair], broken.pairs.gate[2, pair] = torch.nan, gate
         found, told = by_kernel(broken, law, after)
-        assert unpacked(told, num_points)[2, 0].all() and found[0, 2, 0].isnan().all()
+        assert told[2, 0] == num_points and found[0, 2, 0].isnan().all()
         for name, plane in after.items():
             expected = state[name][2, own] if gate != -torch.inf else torch.zeros(num_points)
             assert torch.equal(plane[2, own], expected) or name != "held"
-        assert torch.equal(told[others], pulling[others])
-        pulls = unpacked(told, num_points) & others[..., None]
+        assert torch.equal(told[others], count[others])
+        pulls = first_ones(told, num_points) & others[..., None]
         assert torch.equal(found[:, pulls], clean[:, pulls])
 
 
@@ -183,7 +185,7 @@ def test_without_a_kernel_all_objects_are_advanced_by_torch(law):
         state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
         (pull,), after = gripped([meeting], of(LAWS[law], torch.float64), state)
         (expected,), wanted = advance([met_points(meeting)], of(LAWS[law], torch.float64), state)
-        assert pull.pulling is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
+        assert pull.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
         assert torch.equal(torch.stack(pull.strength), torch.stack(expected.strength))
 
 

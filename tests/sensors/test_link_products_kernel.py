@@ -22,6 +22,7 @@ CASES = {
     "two tiles, small links": (140, [3, 90, 1], 3),
     "many links": (70, [20, 33, 1, 15, 16, 17, 60, 2], 2),
     "a rest in some": (9, [65, 4, 100, 64], 3),
+    "half a block": (70, [35, 16, 20, 12, 20], 2),
     "too large to hold": (65, [129, 3], 2),
     "a palm": (70, [219, 56, 40], 3),
     "the largest": (3, [256], 1),

@@ -56,11 +56,15 @@ def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
 
 
 def told(pull: Pull) -> Pull:
-    """Return points with a bit for each that pulls, and the others' numbers none at all."""
+    """Return points, those that pull first, and how many they are; the others' numbers are none at all."""
     pulls = torch.stack(pull.strength).ne(0).any(dim=0)
-    pos, strength = (vec(torch.where(pulls, part, torch.nan) for part in planes) for planes in (pull.pos, pull.strength))
-    bits = torch.nn.functional.pad(pulls.int(), (0, -pulls.shape[-1] % 32)).unflatten(-1, (-1, 32))
-    return pull._replace(pos=pos, strength=strength, pulling=(bits << torch.arange(32)).sum(dim=-1).to(torch.int32))
+    order = torch.argsort(pulls.int(), dim=-1, descending=True, stable=True)
+    count = pulls.sum(dim=-1, dtype=torch.int32)
+    is_one = torch.arange(pulls.shape[-1]) < count[..., None]
+    pos, strength = (
+        vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (pull.pos, pull.strength)
+    )
+    return pull._replace(pos=pos, strength=strength, count=count)
 
 
 def main() -> None:
@@ -68,7 +72,7 @@ def main() -> None:
     from tgdsl.sensors.elastomer.point_sum_kernel import launch, point_sum_kernel
 
     def run(pull: Pull, markers: Markers) -> torch.Tensor:
-        how = (pull.pulling, pull.tiles, tile_size(pull.taxels))
+        how = (pull.count, pull.tiles, tile_size(pull.taxels))
         return launch(point_sum_kernel, pull.pos, pull.strength, *how, markers.pos, markers.normal, markers.falloff)
 
     found = {}
@@ -108,7 +112,7 @@ def found() -> dict:
 
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_is_the_sum(found, name):
-    assert max(found[name]) < TOLERANCE  # of strengths, and of bits
+    assert max(found[name]) < TOLERANCE  # of strengths, and of how many there are
 
 
 def test_rows_may_lie_apart(found):

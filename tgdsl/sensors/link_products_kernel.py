@@ -26,9 +26,10 @@ from torch.library import triton_op, wrap_triton
 from tgdsl.sensors.link_products import LARGEST
 
 MIN_BLOCK, BLOCK, LINES = 16, 64, 64
-"""Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block."""
-HELD = 2 * BLOCK
-"""Most taxels of a link whose part of a matrix fits into registers and shared memory."""
+"""Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block.
+
+A tile holds its part of a matrix of up to twice as many taxels as it has outputs.
+"""
 NUM_PROGRAMS, MAX_STEPS = 768, 8
 """Programs that a GPU should have, three for each that an H200 runs at once, and most blocks of lines of a program.
 
@@ -59,8 +60,8 @@ def launch(
     found = lines.new_empty((num_planes, num_lines, num_rows))
     largest = max(len(matrix) for matrix in matrices)
     assert largest <= LARGEST
-    block, is_held = _padded(min(largest, BLOCK)), largest <= HELD
-    rest = _padded(largest - BLOCK) if is_held and largest > BLOCK else 0
+    block, is_held = _block([len(matrix) for matrix in matrices]), largest <= 2 * BLOCK
+    rest = _padded(largest - block) if is_held and largest > block else 0
     flat, tiles = _joined(matrices, block)
     num_tiles, num_blocks = len(tiles) // COLUMNS.value, triton.cdiv(num_lines, LINES)
     steps = 1 if not is_held else min(max(num_blocks * num_tiles // NUM_PROGRAMS, 1), MAX_STEPS)
@@ -76,6 +77,15 @@ def launch(
 def _padded(size: int) -> int:
     """Return along how many numbers a product of blocks goes."""
     return max(triton.next_power_of_2(size), MIN_BLOCK)
+
+
+def _block(sizes: Sequence[int]) -> int:
+    """Return how many outputs a tile has: half of the most if that pads less, as with a link of 35 taxels among some of 20."""
+    largest, half = max(sizes), BLOCK // 2
+    if largest <= half or largest > BLOCK:
+        return _padded(min(largest, BLOCK))
+    work = sum(triton.cdiv(size, half) for size in sizes) * half * (half + _padded(largest - half))
+    return half if work < len(sizes) * BLOCK * BLOCK else BLOCK
 
 
 def _tiles(sizes: Sequence[int], num_planes: int, tile: int) -> list[int]:

@@ -53,7 +53,7 @@ class Pull(NamedTuple):
         area: Surface of the object that each stands for [m²], (case, 1).
         pos: z_p [m].
         strength: (z_p − e_p) h_p [m²].
-        pulling: A bit for each point that pulls, see `grip_kernel`; the others' numbers then mean nothing. None: it shows.
+        count: How many points of each link pull, (env, link), which then come first; None: it shows in the strengths.
     """
 
     taxels: tuple[tuple[int, int], ...]
@@ -61,7 +61,7 @@ class Pull(NamedTuple):
     area: Tensor
     pos: Vec
     strength: Vec
-    pulling: Tensor | None = None
+    count: Tensor | None = None
 
 
 def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
@@ -77,9 +77,9 @@ def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) 
         places, tables = torch.stack(source.points)[:, :, 0], grid_tables(source.links, 0)
         is_cubic, pose = source.links.shapes[0] == "tricubic", [*pairs.rotation, *pairs.offset]
         planes_of = [state[name] for name in PLANES]
-        found, pulling = grip(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
+        found, count = grip(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
         x, y, z, *strength = found.unbind()
-        pulls.append(Pull(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), pulling))
+        pulls.append(Pull(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), count))
         first += source.pair.shape[0] * places.shape[2]
     return pulls, {}
 
@@ -131,7 +131,7 @@ def _summed(pull: Pull, markers: Markers) -> Vec:
         from tgdsl.sensors.elastomer.point_sum_kernel import point_sum
 
         size, where = tile_size(pull.taxels), (list(markers.pos), list(markers.normal))
-        found = point_sum(list(pull.pos), list(pull.strength), pull.pulling, pull.tiles, size, *where, markers.falloff)
+        found = point_sum(list(pull.pos), list(pull.strength), pull.count, pull.tiles, size, *where, markers.falloff)
         return planes.vec(found.unbind())
     num_taxels = markers.pos[0].shape[0]
     zero = markers.pos[0].new_zeros((pull.pos[0].shape[0], num_taxels))

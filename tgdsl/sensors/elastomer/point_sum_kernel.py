@@ -1,12 +1,12 @@
 """The sum over points of `point_anchors` as one Triton kernel, for a GPU in float32 without derivatives.
 
 A program takes one environment and some tiles of markers, each of one link, which its lanes hold; points come one after the
-other. Most of them pull at nothing: tiles and groups of those are passed over, so points that are near on the object should be
-near among all. The in-plane offset Π_n(x − z) is found along two tangents of each marker, scaled so that its square is the
-exponent of 2.
+other. Most of them pull at nothing: the kernel is told how many do, which then stand first, or passes over groups that do not,
+so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is found along two tangents of
+each marker, scaled so that its square is the exponent of 2.
 
-Shapes: `env` environments, `link` links that may meet an object, `point` points, `word` groups of 32 of them, `marker` markers
-of all links, `tile` tiles.
+Shapes: `env` environments, `link` links that may meet an object, `point` points, `marker` markers of all links, `tile`
+tiles.
 """
 
 # What a kernel's types are only Triton's compiler knows.
@@ -25,7 +25,7 @@ from torch.library import triton_op, wrap_triton
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
-"""Tiles of a program that is told what pulls: at most of them nothing does."""
+"""Tiles of a program that is told how many points pull: at most of them none does."""
 LOG2_E = tl.constexpr(1.4426950408889634)
 
 
@@ -33,7 +33,7 @@ LOG2_E = tl.constexpr(1.4426950408889634)
 def point_sum(
     pos: list[Tensor],
     strength: list[Tensor],
-    pulling: Tensor | None,
+    count: Tensor | None,
     tiles: Tensor,
     block: int,
     marker: list[Tensor],
@@ -41,14 +41,14 @@ def point_sum(
     falloff: Tensor,
 ) -> Tensor:
     """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker) [m²]; see `launch`."""
-    return launch(wrap_triton(point_sum_kernel), pos, strength, pulling, tiles, block, marker, normal, falloff)
+    return launch(wrap_triton(point_sum_kernel), pos, strength, count, tiles, block, marker, normal, falloff)
 
 
 def launch(
     run: Any,
     pos: list[Float[Tensor, "env link point"]],
     strength: list[Float[Tensor, "env link point"]],
-    pulling: Int[Tensor, "env link word"] | None,
+    count: Int[Tensor, "env link"] | None,
     tiles: Int[Tensor, "tile 3"],
     block: int,
     marker: list[Float[Tensor, " marker"]],
@@ -61,7 +61,7 @@ def launch(
         run: The kernel.
         pos: z_p, three planes in each link's frame [m].
         strength: s_p, likewise [m²]; all six lie in memory alike.
-        pulling: A bit for each point that pulls; the others' numbers mean nothing. None: it shows in the strengths.
+        count: How many points of each link pull; they come first. None: it shows in the strengths.
         tiles: What `points.point_tiles` returns; markers of no link read 0.
         block: `points.tile_size`.
         marker: x_j, three planes [m].
@@ -70,12 +70,12 @@ def launch(
     """
     num_envs, num_links, num_points = pos[0].shape
     found = pos[0].new_empty((3, num_envs, marker[0].shape[0]))
-    of_program = 1 if pulling is None else TILES
+    of_program = 1 if count is None else TILES
     planes = (*pos, *strength, *(part.contiguous() for part in (*marker, *normal)))
     run[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
-        *planes, falloff, found, tiles if pulling is None else pulling, tiles,
+        *planes, falloff, found, tiles if count is None else count, tiles,
         tiles.shape[0], num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
-        IS_TOLD=pulling is not None, TILES=of_program, BLOCK=block, num_warps=1,
+        IS_TOLD=count is not None, TILES=of_program, BLOCK=block, num_warps=1,
     )  # fmt: skip
     return found
 
@@ -90,17 +90,12 @@ def point_sum_kernel(
     env, first_tile = tl.program_id(0).to(tl.int64), tl.program_id(1) * TILES
     own = first_tile + tl.arange(0, TILES)
     links = tl.load(tiles + 3 * own, own < num_tiles, -1)
-    num_words = tl.cdiv(num_points, 32)
-    told += env * num_links * num_words
-    have_any = ((links >= 0) & (num_points > 0)).to(tl.int32)
+    told += env * num_links
+    are_links = links >= 0
+    num_pulling = tl.where(are_links, num_points, 0)
     if IS_TOLD:
-        have_any = tl.zeros((TILES,), tl.int32)
-        for start in range(0, num_words, 32):
-            word = start + tl.arange(0, 32)
-            is_word = (links >= 0)[:, None] & (word < num_words)[None, :]
-            words = tl.load(told + links[:, None] * num_words + word[None, :], is_word, 0)
-            have_any |= tl.max((words != 0).to(tl.int32), axis=1)
-    busy = tl.sum(have_any << tl.arange(0, TILES), axis=0)
+        num_pulling = tl.load(told + links, are_links, 0)
+    busy = tl.sum((num_pulling > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
     found += env * num_markers
     for i in range(tl.minimum(TILES, num_tiles - first_tile)):
@@ -115,7 +110,8 @@ def point_sum_kernel(
             at = env * stride_env + link * stride_link
             pos, strength = (z_x + at, z_y + at, z_z + at), (s_x + at, s_y + at, s_z + at)
             if IS_TOLD:
-                total = _sum_of_told(total, frame, pos, strength, told + link * num_words, num_words)
+                for p in tl.range(0, tl.load(told + link), loop_unroll_factor=4):
+                    total = _added(total, frame, pos, strength, p)
             else:
                 total = _sum_of_all(total, frame, pos, strength, num_points)
         place = found + marker
@@ -139,24 +135,6 @@ def _frame(pos, normal, marker, is_marker, falloff):
     x, y = tl.load(pos[0] + marker, is_marker, 0.0), tl.load(pos[1] + marker, is_marker, 0.0)
     z = tl.load(pos[2] + marker, is_marker, 0.0)
     return u[0] * x + u[1] * y + u[2] * z, v[0] * x + v[1] * y + v[2] * z, u, v
-
-
-@triton.jit
-def _sum_of_told(total, frame, pos, strength, told, num_words):
-    """Return the sum over the points whose bits are set."""
-    for start in range(0, num_words, 32):
-        word = start + tl.arange(0, 32)
-        words = tl.load(told + word, word < num_words, 0)
-        busy = tl.sum((words != 0).to(tl.int32) << tl.arange(0, 32), axis=0)
-        for w in range(tl.minimum(32, num_words - start)):
-            if (busy >> w) & 1:
-                bits = tl.load(told + start + w)
-                for group in range(4):
-                    if (bits >> (8 * group)) & 255:
-                        for bit in range(8 * group, 8 * group + 8):
-                            if (bits >> bit) & 1:
-                                total = _added(total, frame, pos, strength, 32 * (start + w) + bit)
-    return total
 
 
 @triton.jit
