@@ -1,13 +1,14 @@
 """The module alone on a GPU: time, error and bytes of every kind, by environments, taxels, objects, points and noise.
 
     python benchmarks/gpu.py artefacts out/gpu                              # where documents can be compiled
-    python benchmarks/gpu.py run out/gpu --out out/gpu.json [--warm]        # on the machine with the GPU
+    python benchmarks/gpu.py run out/gpu --out out/gpu.json --jobs 8        # on the machine with the GPU
     python benchmarks/gpu.py table out/gpu.json                             # for docs/performance.md
     python benchmarks/gpu.py plot out/gpu.json --out docs/images
     python benchmarks/gpu.py bytes out/gpu                                  # memory of every case, without a GPU
 
-`run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager` tries it out without a GPU. `run --warm` times
-nothing: it fills the compiler's cache, many cases at once. Every row is printed and written as soon as it is known.
+`run` needs torch and what `tgdsl.load` needs, no more; `--device cpu --eager` tries it out without a GPU. Each case has a
+process of its own, `--jobs` of them at once, and they take turns on the GPU: see turns.py. Rows are printed and written as
+processes end.
 
 Per row: first the error, float32 on the device in three calls in a row against a float64 module, over the largest magnitude of
 each channel. Then medians: of a replayed CUDA graph that holds calls on so many sets of inputs, state and readings that
@@ -21,15 +22,12 @@ import argparse
 import gc
 import json
 import math
-import os
 import statistics
-import subprocess
 import sys
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +35,7 @@ from typing import Any
 import gpu_plots
 import numpy as np
 import torch
+import turns
 from gpu_plots import HEAD, Row, load_rows
 from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, state_of
 from torch import Tensor
@@ -69,13 +68,15 @@ class Bench:
     device: torch.device
 
     @classmethod
-    def of(cls, case: Case, options: argparse.Namespace) -> Bench:
-        """Load an artefact; code is compiled at its first call."""
+    def of(cls, case: Case, turn: turns.Turn, options: argparse.Namespace) -> Bench:
+        """Load an artefact; code is compiled at its first call, and then takes the turn."""
         plan, device = load_plan(artefact(options.folder, case)), torch.empty(0, device=options.device).device
         touch = TactileModule(plan).to(device)
-        core = touch.advance if options.eager else touch.compile()._compiled
-        assert core is not None, "this machine cannot compile"
-        return cls(case, plan, core, device)
+        if options.eager:
+            return cls(case, plan, touch.advance, device)
+        turn.compile(touch)
+        assert touch._compiled is not None, "this machine cannot compile"
+        return cls(case, plan, touch._compiled, device)
 
     def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""
@@ -92,17 +93,10 @@ class Bench:
 # Correctness ----------------------------------------------------------------------------------------------------------------
 
 
-def errors(bench: Bench, num_envs: int, where: str) -> np.ndarray:
-    """Return the errors of all numbers read, each over the largest magnitude of its channel."""
-    exact, touch = TactileModule(bench.plan, dtype=torch.float64).to(where), bench.module()
-    wants: dict[str, list[np.ndarray]] = {}
-    founds: dict[str, list[np.ndarray]] = {}
-    for state in bench.states(num_envs, CALLS, seed=100):
-        for kept, readings in ((wants, exact(state.to(where, torch.float64))), (founds, touch(state.to(bench.device)))):
-            for name, value in readings.items():
-                kept.setdefault(name, []).append(value.double().cpu().numpy())
-    found, want = ({name: np.stack(kept) for name, kept in readings.items()} for readings in (founds, wants))
-    return full_scale_errors(exact.outputs, found, want)
+def readings_of(touch: TactileModule, states: Sequence[SceneState]) -> Arrays:
+    """Return the readings of a module in calls in a row, (call, env, …)."""
+    calls = [{name: value.double().cpu().numpy() for name, value in touch(state).items()} for state in states]
+    return {name: np.stack([call[name] for call in calls]) for name in calls[0]}
 
 
 def full_scale_errors(outputs: Sequence[Output], found: Arrays, want: Arrays) -> np.ndarray:
@@ -298,20 +292,22 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
 
 def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
     """Measure a case at each number of environments; one that fails is reported, and the others go on."""
-    torch.compiler.reset()
-    try:
-        bench = Bench.of(case, options)
-        with torch.no_grad():  # code is made for many environments, then checked on few
-            bench.module()(bench.states((options.envs or case.envs)[0], 1)[0].to(bench.device))
-            error = errors(bench, options.check_envs, options.exact_on)
-    except Exception:  # of one case: the others are wanted all the same
-        print(f"{case.name}: FAILED\n{traceback.format_exc()}", flush=True)
-        return
+    turn = turns.Turn(options.turn)
+    if options.eager or options.exact_on != "cpu":
+        turn.take()
+    bench = Bench.of(case, turn, options)
+    exact = TactileModule(bench.plan, dtype=torch.float64).to(options.exact_on)
+    with torch.no_grad():  # code is made for many environments, then checked on few
+        first, checked = bench.states((options.envs or case.envs)[0], 1)[0], bench.states(options.check_envs, CALLS, seed=100)
+        want = readings_of(exact, [state.to(options.exact_on, torch.float64) for state in checked])
+        bench.module()(first.to(bench.device))
+        found = readings_of(bench.module(), [state.to(bench.device) for state in checked])
+        error = full_scale_errors(exact.outputs, found, want)
     for num_envs in options.envs or case.envs:
         try:
             with torch.no_grad():
                 row = measure(bench, num_envs, error, options)
-        except Exception:
+        except Exception:  # of one number: the others are wanted all the same
             print(f"{case.name} × {num_envs}: FAILED\n{traceback.format_exc()}", flush=True)
         else:
             yield row
@@ -321,26 +317,22 @@ def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure cases and write each row down; stop in time and say what is left."""
-    if options.warm:
-        warm(options)
-        return
-    if options.compile_only:
-        for name in options.rows:
-            bench = Bench.of(CASES[name], options)
-            with torch.no_grad():
-                bench.module()(bench.states((options.envs or bench.case.envs)[0], 1)[0].to(bench.device))
-        return
+    """Measure cases and write their rows down; stop in time and say what is left."""
+    if options.child:
+        for row in rows_of(CASES[options.rows[0]], options):
+            print(row.line(), flush=True)
+            write(options.out, row, {})
+        turns.end()
     start, left = time.perf_counter(), []
     where = torch.cuda.get_device_name() if options.device != "cpu" else "CPU"
     versions = {"device": where, "torch": torch.__version__, "repeats": options.repeats}
     print(f"torch {torch.__version__}, {where}, float32, medians of up to {options.repeats}; times [ms]\n{HEAD}", flush=True)
-    for name in options.rows:
-        if time.perf_counter() - start > 60 * options.minutes:
+    for (name,), said, out in turns.children(options, ["--rows"], [(name,) for name in options.rows]):
+        if said is None:
             left.append(name)
             continue
-        for row in rows_of(CASES[name], options):
-            print(row.line(), flush=True)
+        print(said, end="", flush=True)
+        for row in load_rows([out]) if out.exists() else []:
             write(options.out, row, versions)
     print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {' '.join(left)}" if left else ""))
 
@@ -352,34 +344,9 @@ def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
     path.write_text(json.dumps({**versions, "rows": [asdict(other) for other in (*kept, row)]}, indent=1))
 
 
-def sharing_processors(jobs: int) -> dict[str, str]:
-    """Return the environment of one of several processes that compile at once: the processors are shared out."""
-    return {**os.environ, "TORCHINDUCTOR_COMPILE_THREADS": str(max(2, 2 * (os.cpu_count() or 1) // jobs))}
-
-
-def warm(options: argparse.Namespace) -> None:
-    """Fill the compiler's cache, each case in a process of its own."""
-    from torch._inductor.runtime.cache_dir_utils import cache_dir
-
-    own = [sys.executable, __file__, "run", str(options.folder), "--out", str(options.out), "--compile-only"]
-    own += ["--device", options.device, *(["--eager"] if options.eager else [])]
-    own += ["--envs", *map(str, options.envs)] if options.envs else []
-
-    def compile_one(name: str) -> str:
-        start = time.perf_counter()
-        done = subprocess.run([*own, "--rows", name], capture_output=True, text=True, env=sharing_processors(options.jobs))
-        account = "" if done.returncode == 0 else f"  FAILED\n{done.stdout[-1500:]}{done.stderr[-1500:]}"
-        return f"{name:<32}{time.perf_counter() - start:7.1f} s{account}"
-
-    with ThreadPoolExecutor(options.jobs) as pool:
-        for line in pool.map(compile_one, options.rows):
-            print(line, flush=True)
-    for path in Path(cache_dir()).rglob("*.best_config"):
-        path.unlink()  # chosen by timing while other processes ran
-
-
 def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line."""
+    """Return the command line, and in `arguments` what begins it anew."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     making = commands.add_parser("artefacts", help="compile all documents")
@@ -396,14 +363,11 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     running.add_argument("--repeats", type=int, default=30)
     running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
     running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
-    running.add_argument("--exact-on", default="cpu", help="where the float64 module runs")
-    running.add_argument("--minutes", type=float, default=math.inf, help="begin no case after so long")
-    running.add_argument("--warm", action="store_true", help="fill the compiler's cache, time nothing")
-    running.add_argument("--jobs", type=int, default=8, help="processes of --warm")
-    running.add_argument("--compile-only", action="store_true", help="compile the rows' cases in this process, time nothing")
+    running.add_argument("--exact-on", default="cpu", help="where the float64 module runs; on the CPU before the turn is taken")
+    turns.add_options(running)
     running.set_defaults(call=run)
     gpu_plots.add_commands(commands)
-    return parser.parse_args(arguments)
+    return parser.parse_args(arguments, argparse.Namespace(arguments=[__file__, *arguments]))
 
 
 if __name__ == "__main__":

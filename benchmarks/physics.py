@@ -1,16 +1,17 @@
 """Physics and touch end to end: MuJoCo Warp steps thousands of environments, the module reads them; what does touch cost?
 
     python benchmarks/physics.py artefacts out/physics                                # where documents can be compiled
-    python benchmarks/physics.py run out/physics --out out/physics.json [--warm]      # on the machine with the GPU
+    python benchmarks/physics.py run out/physics --out out/physics.json --jobs 8      # on the machine with the GPU
     python benchmarks/physics.py run out/physics --out out/physics.json --profile --scenes hand-med --modules elastomer
     python benchmarks/physics.py plot out/physics.json --out docs/images/physics.png
 
 Scenes: the pyramid of ten cubes (examples/pyramid.yaml) and the XHand1 with a cube (examples/xhand1_palm.yaml) at 199 and 667
-taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo Warp and what `tgdsl.load` needs, no more.
-`run --warm` times nothing: it fills the caches of compiled kernels, all modules at once.
+taxels, with its own elliptic cone or a pyramidal one. `run` needs torch, MuJoCo Warp and what `tgdsl.load` needs, no more. Each
+module of a scene has a process of its own, `--jobs` of them at once, and they take turns on the GPU: see turns.py. Rows are
+printed and written as processes end.
 
-A scene is first stepped once without sensors, and some instants are kept. From each of them every module's control step is
-timed again and again, in turn with one without sensors: physics does the same work each time. Times are medians by CUDA events:
+A scene is first stepped without sensors, and some instants are kept. From each of them the module's control step is timed again
+and again, alternately with one without sensors: physics does the same work each time. Times are medians by CUDA events:
 `plain` is the step without sensors, `step` the same with touch in the same CUDA graph, `module` a graph of the module alone, on
 that state, and `read` one that gathers the state too. `--profile` lists the kernels of `module` as well, the longest first.
 """
@@ -21,19 +22,17 @@ import argparse
 import gc
 import json
 import statistics
-import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import torch
-from gpu import sharing_processors
+import turns
 from physics_scenes import MODULES, PLAIN, SCENES, Scene, artefact, make_artefacts
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
@@ -219,14 +218,26 @@ def fault_of(sim: WarpSimulation) -> str:
     return ""
 
 
-def measure(
-    name: str, module: str, compiled: TactileModule, plain: WarpSimulation, instants: Instants, options: argparse.Namespace
-) -> Row:
-    """Time one module on the environments of a simulator without sensors."""
+def compile_in_turn(touch: TactileModule, scene: Scene, options: argparse.Namespace) -> None:
+    """Compile a module and physics, on as many environments as come first; only then the module's code takes the turn."""
+    sim = simulation(touch, scene, options.envs[0], options)
+    sim.step()
+    state = sim.state()
+    del sim
+    gc.collect()  # the turn may be long in coming, and others need the memory
+    turns.Turn(options.turn).compile(touch)
+    with torch.no_grad():
+        touch(state)
+
+
+def measure(name: str, module: str, compiled: TactileModule, num_envs: int, options: argparse.Namespace) -> Row:
+    """Time one module on so many environments."""
     scene, device = SCENES[name], torch.device(options.device)
-    touch = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
+    nothing, touch = (tgdsl.load(artefact(options.folder, scene, own), device=options.device) for own in (PLAIN, module))
+    plain = simulation(nothing, scene, num_envs, options)
+    instants = Instants(plain, scene, options.instants)
     touch._compiled = compiled._compiled  # code for one number of environments serves for all
-    sim = simulation(touch, scene, plain.num_envs, options)
+    sim = simulation(touch, scene, num_envs, options)
     before, step = paired(plain, sim, instants, options.repeats)
     fault = fault_of(sim)
     contacts = int(sim.warp_data.nacon.numpy()[0]) / sim.num_envs
@@ -237,88 +248,65 @@ def measure(
         print(profiled(graph, device), flush=True)
     read = median_of(replayed(lambda: touch(sim.state()), device), options.repeats, device)
     rows = touch.outputs[0].shape[0] if module != "link_contact" else len(touch.taxels["s0"]["link"])
-    return Row(name, module, plain.num_envs, scene.substeps, rows, before, step, alone, read, contacts, fault)
+    return Row(name, module, num_envs, scene.substeps, rows, before, step, alone, read, contacts, fault)
 
 
-def run_scene(name: str, options: argparse.Namespace, versions: dict[str, str]) -> None:
-    """Time a scene's modules and write each down; one that fails is reported, and the others go on."""
-    scene, rows = SCENES[name], []
-    touch = tgdsl.load(artefact(options.folder, scene, PLAIN), device=options.device)
-    sims = {num_envs: simulation(touch, scene, num_envs, options) for num_envs in options.envs}
-    instants = {num_envs: Instants(sim, scene, options.instants) for num_envs, sim in sims.items()}
-    print(f"\n{name}: control steps of {scene.substeps} physics steps, times [ms], shares of the step\n{HEAD}", flush=True)
-    for module in [module for module in scene.modules if module in options.modules]:
-        torch.compiler.reset()
-        compiled = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
-        if not options.eager:
-            compiled.compile()
-        for num_envs in options.envs:
-            try:
-                with torch.no_grad():
-                    row = measure(name, module, compiled, sims[num_envs], instants[num_envs], options)
-            except Exception:  # of one module: the others are wanted all the same
-                print(f"  {num_envs:>6} {module}: FAILED\n{traceback.format_exc()}", flush=True)
-            else:
-                rows.append(row)
-                print(row.line(), flush=True)
-                write(options.out, rows, versions)
-            gc.collect()
-            if options.device != "cpu":
-                torch.cuda.empty_cache()
+def rows_of(name: str, module: str, options: argparse.Namespace) -> Iterator[Row]:
+    """Time one module of a scene at each number of environments; one that fails is reported, and the others go on."""
+    scene = SCENES[name]
+    if options.eager:
+        turns.Turn(options.turn).take()
+    compiled = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
+    if not options.eager:
+        compile_in_turn(compiled, scene, options)
+    for num_envs in options.envs:
+        gc.collect()
+        if options.device != "cpu":
+            torch.cuda.empty_cache()
+        try:
+            with torch.no_grad():
+                row = measure(name, module, compiled, num_envs, options)
+        except Exception:  # of one number: the others are wanted all the same
+            print(f"  {num_envs:>6} {module}: FAILED\n{traceback.format_exc()}", flush=True)
+        else:
+            yield row
 
 
 def run(options: argparse.Namespace) -> None:
-    """Time scenes, each in a process of its own, and write what was measured."""
-    if options.warm:
-        warm(options)
-        return
-    if len(options.scenes) > 1:
-        for name in options.scenes:
-            subprocess.run([*command(options, [name], options.modules, options.envs), "--out", str(options.out)], check=False)
-        return
+    """Time scenes' modules and write what was measured; stop in time and say what is left."""
+    if options.child:
+        for row in rows_of(options.scenes[0], options.modules[0], options):
+            print(row.line(), flush=True)
+            write(options.out, [row], {})
+        turns.end()
+    start, last, left = time.perf_counter(), "", []
     where = torch.cuda.get_device_name() if options.device != "cpu" else "CPU"
-    print(f"torch {torch.__version__}, MuJoCo {mujoco.__version__}, {where}, medians of {options.repeats}")
-    run_scene(options.scenes[0], options, {"torch": torch.__version__, "mujoco": mujoco.__version__, "device": where})
+    versions = {"torch": torch.__version__, "mujoco": mujoco.__version__, "device": where}
+    print(f"torch {torch.__version__}, MuJoCo {mujoco.__version__}, {where}, medians of {options.repeats}", flush=True)
+    cases = [(name, module) for name in options.scenes for module in SCENES[name].modules if module in options.modules]
+    for (name, module), said, out in turns.children(options, ["--scenes", "--modules"], cases):
+        if said is None:
+            left.append(f"{name} {module}")
+            continue
+        if name != last:
+            print(f"\n{name}: control steps of {SCENES[name].substeps} physics steps, times [ms], shares of the step\n{HEAD}")
+        last = name
+        print(said, end="", flush=True)
+        if out.exists():
+            write(options.out, load_rows(out), versions)
+    print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {'; '.join(left)}" if left else ""))
+
+
+def load_rows(path: Path) -> list[Row]:
+    return [Row(**row) for row in json.loads(path.read_text())["rows"]]
 
 
 def write(path: Path, rows: list[Row], versions: dict[str, str]) -> None:
     """Write rows to a JSON file, in the place of those of the same measurements that it holds."""
-    kept = json.loads(path.read_text())["rows"] if path.exists() else []
     done = {(row.scene, row.module, row.num_envs) for row in rows}
-    kept = [row for row in kept if (row["scene"], row["module"], row["num_envs"]) not in done]
+    kept = [row for row in load_rows(path) if (row.scene, row.module, row.num_envs) not in done] if path.exists() else []
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**versions, "rows": kept + [asdict(row) for row in rows]}, indent=1))
-
-
-def command(options: argparse.Namespace, scenes: Sequence[str], modules: Sequence[str], envs: Sequence[int]) -> list[str]:
-    """Return the command line that runs some modules of some scenes."""
-    own = [sys.executable, "-u", __file__, "run", str(options.folder), "--device", options.device]
-    own += [f"--{flag}".replace("_", "-") for flag in ("native_ccd", "profile") if getattr(options, flag)]
-    own += ["--repeats", str(options.repeats), "--instants", str(options.instants), *(["--eager"] if options.eager else [])]
-    return [*own, "--scenes", *scenes, "--modules", *modules, "--envs", *map(str, envs)]
-
-
-def warm(options: argparse.Namespace) -> None:
-    """Compile all kernels: each module in a process of its own, some at a time, on few environments."""
-    scratch = options.out.with_suffix(".json")
-
-    def compile_one(job: tuple[str, str]) -> str:
-        out = scratch.with_stem("-".join((scratch.stem, *job)).replace(" ", "_").replace(",", ""))
-        own = [*command(options, [job[0]], [job[1]], [256]), "--out", str(out)]
-        start = time.perf_counter()
-        done = subprocess.run(own, capture_output=True, text=True, env=sharing_processors(options.jobs))
-        out.unlink(missing_ok=True)
-        has_failed = done.returncode != 0 or "FAILED" in done.stdout
-        account = f"\n{done.stdout[-1500:]}{done.stderr[-1500:]}" if has_failed else "ok"
-        return f"{job[0]:<20}{job[1]:<28}{time.perf_counter() - start:7.1f} s  {account}"
-
-    wanted = {name: [m for m in SCENES[name].modules if m in options.modules] for name in options.scenes}
-    first = [(name, modules[0]) for name, modules in wanted.items()]  # physics, which all of a scene's modules share
-    rest = [(name, module) for name, modules in wanted.items() for module in modules[1:]]
-    for jobs in (first, rest):
-        with ThreadPoolExecutor(options.jobs) as pool:
-            for line in pool.map(compile_one, jobs):
-                print(line, flush=True)
+    path.write_text(json.dumps({**versions, "rows": [asdict(row) for row in (*kept, *rows)]}, indent=1))
 
 
 # The plot -------------------------------------------------------------------------------------------------------------------
@@ -328,7 +316,7 @@ def plot(options: argparse.Namespace) -> None:
     """Draw throughput against environments, and what touch adds to a step, one column per scene."""
     from matplotlib.figure import Figure
 
-    rows = [Row(**row) for row in json.loads(options.results.read_text())["rows"]]
+    rows = load_rows(options.results)
     names = [name for name in SCENES if any(row.scene == name for row in rows)]
     figure = Figure(figsize=(4.6 * len(names), 8.2), layout="constrained")
     panels = figure.subplots(2, len(names), squeeze=False)
@@ -356,7 +344,7 @@ def plot(options: argparse.Namespace) -> None:
 
 
 def parsed() -> argparse.Namespace:
-    """Return the command line."""
+    """Return the command line, and in `arguments` what begins it anew."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     making = commands.add_parser("artefacts", help="compile all modules")
@@ -367,21 +355,20 @@ def parsed() -> argparse.Namespace:
     running.add_argument("--out", type=Path, required=True, help="JSON file; rows of an earlier run are kept")
     running.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     running.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
-    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384])
+    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384], help="code is for the first")
     running.add_argument("--device", default="cuda")
     running.add_argument("--repeats", type=int, default=6, help="timed steps from each instant")
     running.add_argument("--instants", type=int, default=4)
     running.add_argument("--eager", action="store_true", help="neither compiled modules nor CUDA graphs")
     running.add_argument("--native-ccd", action="store_true", help="boxes meet by MuJoCo Warp's own way, not by MuJoCo's")
     running.add_argument("--profile", action="store_true", help="list each module's kernels too")
-    running.add_argument("--warm", action="store_true", help="compile all kernels, time nothing")
-    running.add_argument("--jobs", type=int, default=6, help="processes of --warm")
+    turns.add_options(running)
     running.set_defaults(call=run)
     drawing = commands.add_parser("plot", help="draw what was measured")
     drawing.add_argument("results", type=Path)
     drawing.add_argument("--out", type=Path, default=Path("docs/images/physics.png"))
     drawing.set_defaults(call=plot)
-    return parser.parse_args()
+    return parser.parse_args(namespace=argparse.Namespace(arguments=sys.argv))
 
 
 if __name__ == "__main__":

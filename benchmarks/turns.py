@@ -1,0 +1,106 @@
+"""One process on the GPU at a time, while others trace and compile.
+
+To trace and compile a module takes several times as long as to time it. So each case has a process of its own, and some run at
+once. But what is timed needs the GPU for itself, and so do launch configurations, which are chosen by timing when code runs
+first. Right before that a process therefore takes its turn: a lock on a file that all share, which it holds until it ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fcntl
+import math
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NoReturn
+
+from torch.fx import GraphModule
+
+from tgdsl.module import TactileModule
+
+Case = tuple[str, ...]
+
+
+class Turn:
+    """A process's turn, taken once and held until it ends."""
+
+    def __init__(self, path: Path):
+        """Take nothing yet; the turn is the lock on a file."""
+        self._path = path
+        self._descriptor: int | None = None
+
+    def take(self) -> None:
+        """Wait for the turn; there is nothing to do once it is taken."""
+        if self._descriptor is None:
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT)  # which nothing closes
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+
+    def compile(self, touch: TactileModule) -> None:
+        """Compile a module as `touch.compile()` does; right before its code runs first, the turn is taken."""
+        touch.compile(backend=self._backend, options={"assert_indirect_indexing": "variant" in touch.inputs.fields})
+
+    def _backend(self, graph: GraphModule, inputs: list[Any], options: dict[str, Any]) -> Callable[..., Any]:
+        from torch._inductor.compile_fx import compile_fx  # takes seconds
+
+        call: Any = compile_fx(graph, inputs, config_patches=options)
+
+        def in_turn(*arguments: Any) -> Any:
+            if self._descriptor is None:
+                self.take()
+            return call(*arguments)
+
+        return in_turn
+
+
+def end() -> NoReturn:
+    """End this process and its turn at once: to tidy up takes seconds, for which others would wait."""
+    sys.stdout.flush()
+    os._exit(0)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add to a command what `children` asks for."""
+    parser.add_argument("--jobs", type=int, default=1, help="processes at once: one times, the others trace and compile")
+    parser.add_argument("--turn", type=Path, help="file of the turns, for runs at the same time that share them")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="begin nothing after so long")
+    parser.add_argument("--child", action="store_true", help="measure here, as `run` asks of each process that it begins")
+
+
+def children(options: argparse.Namespace, flags: list[str], cases: list[Case]) -> Iterator[tuple[Case, str | None, Path]]:
+    """Run a command again in a process per case, in turns.
+
+    Args:
+        options: What `add_options` added; and `arguments`, the script and its arguments.
+        flags: The options that say which case it is.
+        cases: Their values.
+
+    Yields:
+        As processes end, the case, what was printed (None: the time was up before it began), and where its rows are, if any.
+    """
+    start, threads = time.perf_counter(), max(1, (os.cpu_count() or 1) // options.jobs)
+    environment = {**os.environ, "TORCHINDUCTOR_COMPILE_THREADS": str(threads)}
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(options.jobs) as pool:
+        always = [sys.executable, *options.arguments, "--turn", str(options.turn or Path(folder, "turn")), "--child"]
+
+        def printed(case: Case, out: Path) -> str | None:
+            if time.perf_counter() - start > 60 * options.minutes:
+                return None
+            own = [text for pair in zip(flags, case, strict=True) for text in pair]
+            done = subprocess.run([*always, *own, "--out", str(out)], capture_output=True, text=True, env=environment)
+            if done.returncode == 0:
+                return done.stdout
+            return f"{done.stdout}{', '.join(case)}: FAILED, exit status {done.returncode}\n{done.stderr[-3000:]}"
+
+        outs = {case: Path(folder, f"{i}.json") for i, case in enumerate(cases)}
+        ended = {pool.submit(printed, case, out): case for case, out in outs.items()}
+        try:
+            for future in as_completed(ended):
+                yield ended[future], future.result(), outs[ended[future]]
+        finally:
+            pool.shutdown(cancel_futures=True)  # who is interrupted begins nothing more
