@@ -68,15 +68,14 @@ class Bench:
     device: torch.device
 
     @classmethod
-    def of(cls, case: Case, turn: turns.Turn, options: argparse.Namespace) -> Bench:
-        """Load an artefact; code is compiled at its first call, and then takes the turn."""
-        plan, device = load_plan(artefact(options.folder, case)), torch.empty(0, device=options.device).device
-        touch = TactileModule(plan).to(device)
+    def of(cls, case: Case, plan: Plan, turn: turns.Turn, options: argparse.Namespace) -> Bench:
+        """Load a plan; code is compiled at its first call, and takes the turn before it runs."""
+        touch = TactileModule(plan).to(options.device)
         if options.eager:
-            return cls(case, plan, touch.advance, device)
+            return cls(case, plan, touch.advance, touch.device)
         turn.compile(touch)
         assert touch._compiled is not None, "this machine cannot compile"
-        return cls(case, plan, touch._compiled, device)
+        return cls(case, plan, touch._compiled, touch.device)
 
     def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""
@@ -85,9 +84,10 @@ class Bench:
         touch._graphed = Graphed(self.core) if graph and self.device.type == "cuda" else None
         return touch
 
-    def states(self, num_envs: int, count: int, seed: int = 0) -> list[SceneState]:
-        """Return random states on the CPU."""
-        return [state_of(TactileModule(self.plan), num_envs, seed + i, self.case.contacts) for i in range(count)]
+
+def states_of(case: Case, plan: Plan, num_envs: int, count: int, seed: int = 0) -> list[SceneState]:
+    """Return random states on the CPU."""
+    return [state_of(TactileModule(plan), num_envs, seed + i, case.contacts) for i in range(count)]
 
 
 # Correctness ----------------------------------------------------------------------------------------------------------------
@@ -255,7 +255,7 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
     start = time.perf_counter()
     case, device = bench.case, bench.device
     size = bytes_of(TactileModule(bench.plan))
-    states = [state.to(device) for state in bench.states(num_envs, 4)]
+    states = [state.to(device) for state in states_of(case, bench.plan, num_envs, 4)]
     touch = bench.module()
     readings = [touch(state) for state in states][-1]
     active = next(iter(readings.values()))
@@ -292,15 +292,19 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
 
 def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
     """Measure a case at each number of environments; one that fails is reported, and the others go on."""
-    turn = turns.Turn(options.turn)
-    if options.eager or options.exact_on != "cpu":
-        turn.take()
-    bench = Bench.of(case, turn, options)
-    exact = TactileModule(bench.plan, dtype=torch.float64).to(options.exact_on)
+    plan, turn = load_plan(artefact(options.folder, case)), turns.Turn(options.turn)
+    (first,), checked = (
+        states_of(case, plan, (options.envs or case.envs)[0], 1),
+        states_of(case, plan, options.check_envs, CALLS, seed=100),
+    )
+    turn.take()
+    bench, exact = Bench.of(case, plan, turn, options), TactileModule(plan, dtype=torch.float64).to(options.exact_on)
+    touch, first = bench.module(), first.to(bench.device)
+    if options.exact_on == "cpu" and not options.eager:
+        turn.give_back()
     with torch.no_grad():  # code is made for many environments, then checked on few
-        first, checked = bench.states((options.envs or case.envs)[0], 1)[0], bench.states(options.check_envs, CALLS, seed=100)
         want = readings_of(exact, [state.to(options.exact_on, torch.float64) for state in checked])
-        bench.module()(first.to(bench.device))
+        touch(first)
         found = readings_of(bench.module(), [state.to(bench.device) for state in checked])
         error = full_scale_errors(exact.outputs, found, want)
     for num_envs in options.envs or case.envs:
@@ -363,7 +367,9 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     running.add_argument("--repeats", type=int, default=30)
     running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
     running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
-    running.add_argument("--exact-on", default="cpu", help="where the float64 module runs; on the CPU before the turn is taken")
+    running.add_argument(
+        "--exact-on", default="cpu", help="where the float64 module runs; on the CPU while others have the turn"
+    )
     turns.add_options(running)
     running.set_defaults(call=run)
     gpu_plots.add_commands(commands)

@@ -218,16 +218,30 @@ def fault_of(sim: WarpSimulation) -> str:
     return ""
 
 
-def compile_in_turn(touch: TactileModule, scene: Scene, options: argparse.Namespace) -> None:
-    """Compile a module and physics, on as many environments as come first; only then the module's code takes the turn."""
-    sim = simulation(touch, scene, options.envs[0], options)
+def compiled_module(scene: Scene, module: str, options: argparse.Namespace) -> TactileModule:
+    """Return a module whose code is compiled, for the most environments, and which has the turn."""
+    turn = turns.Turn(options.turn)
+    turn.take()
+    touch = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
+    if options.eager:
+        return touch
+    sim = simulation(touch, scene, max(options.envs), options)
     sim.step()
     state = sim.state()
     del sim
-    gc.collect()  # the turn may be long in coming, and others need the memory
-    turns.Turn(options.turn).compile(touch)
+    free_memory(options)
+    turn.give_back()
+    turn.compile(touch)
     with torch.no_grad():
         touch(state)
+    return touch
+
+
+def free_memory(options: argparse.Namespace) -> None:
+    """Free what nothing refers to: others need the memory."""
+    gc.collect()
+    if options.device != "cpu":
+        torch.cuda.empty_cache()
 
 
 def measure(name: str, module: str, compiled: TactileModule, num_envs: int, options: argparse.Namespace) -> Row:
@@ -253,16 +267,9 @@ def measure(name: str, module: str, compiled: TactileModule, num_envs: int, opti
 
 def rows_of(name: str, module: str, options: argparse.Namespace) -> Iterator[Row]:
     """Time one module of a scene at each number of environments; one that fails is reported, and the others go on."""
-    scene = SCENES[name]
-    if options.eager:
-        turns.Turn(options.turn).take()
-    compiled = tgdsl.load(artefact(options.folder, scene, module), device=options.device)
-    if not options.eager:
-        compile_in_turn(compiled, scene, options)
+    compiled = compiled_module(SCENES[name], module, options)
     for num_envs in options.envs:
-        gc.collect()
-        if options.device != "cpu":
-            torch.cuda.empty_cache()
+        free_memory(options)
         try:
             with torch.no_grad():
                 row = measure(name, module, compiled, num_envs, options)
@@ -355,7 +362,7 @@ def parsed() -> argparse.Namespace:
     running.add_argument("--out", type=Path, required=True, help="JSON file; rows of an earlier run are kept")
     running.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     running.add_argument("--modules", nargs="+", choices=MODULES, default=list(MODULES))
-    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384], help="code is for the first")
+    running.add_argument("--envs", nargs="+", type=int, default=[1024, 4096, 8192, 16384], help="code is for the most")
     running.add_argument("--device", default="cuda")
     running.add_argument("--repeats", type=int, default=6, help="timed steps from each instant")
     running.add_argument("--instants", type=int, default=4)

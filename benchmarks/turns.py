@@ -2,7 +2,9 @@
 
 To trace and compile a module takes several times as long as to time it. So each case has a process of its own, and some run at
 once. But what is timed needs the GPU for itself, and so do launch configurations, which are chosen by timing when code runs
-first. Right before that a process therefore takes its turn: a lock on a file that all share, which it holds until it ends.
+first. So a process has the turn, a lock on a file that all share, while it puts its inputs on the GPU; gives it back to trace
+and compile; and takes it again when its code runs first, to hold it until it ends. Calls from Python are timed too: processes
+should be fewer than half of the processors.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NoReturn
 
+import torch
 from torch.fx import GraphModule
 
 from tgdsl.module import TactileModule
@@ -28,18 +31,25 @@ Case = tuple[str, ...]
 
 
 class Turn:
-    """A process's turn, taken once and held until it ends."""
+    """A process's turn: only one of all has it at a time."""
 
     def __init__(self, path: Path):
         """Take nothing yet; the turn is the lock on a file."""
-        self._path = path
-        self._descriptor: int | None = None
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT)  # which nothing closes
+        self._is_taken = False
 
     def take(self) -> None:
-        """Wait for the turn; there is nothing to do once it is taken."""
-        if self._descriptor is None:
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT)  # which nothing closes
+        """Wait for the turn; there is nothing to do while it is taken."""
+        if not self._is_taken:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+            self._is_taken = True
+
+    def give_back(self) -> None:
+        """Let others have the turn once the GPU is done."""
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+        self._is_taken = False
 
     def compile(self, touch: TactileModule) -> None:
         """Compile a module as `touch.compile()` does; right before its code runs first, the turn is taken."""
@@ -51,7 +61,7 @@ class Turn:
         call: Any = compile_fx(graph, inputs, config_patches=options)
 
         def in_turn(*arguments: Any) -> Any:
-            if self._descriptor is None:
+            if not self._is_taken:
                 self.take()
             return call(*arguments)
 

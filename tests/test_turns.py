@@ -78,7 +78,7 @@ def test_when_the_time_is_up_nothing_begins(tmp_path):
 
 
 @pytest.mark.slow
-def test_compiled_code_takes_the_turn_when_it_runs_first_and_is_that_of_compile(tmp_path, monkeypatch):
+def test_the_turn_is_given_back_to_compile_and_taken_when_code_that_is_that_of_compile_runs(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)
     from torch._inductor import compile_fx
 
@@ -89,17 +89,21 @@ def test_compiled_code_takes_the_turn_when_it_runs_first_and_is_that_of_compile(
     def watched(*arguments, config_patches=None, **options):
         call = whole(*arguments, config_patches=config_patches, **options)
         if config_patches:
-            compiled.append((path.exists(), config_patches))
+            compiled.append((is_free(path), config_patches))
         return call
 
     monkeypatch.setattr(compile_fx, "compile_fx", watched)
     state = state_of(touch, 8, 0)
-    turns.Turn(path).compile(touch)
+    turn = turns.Turn(path)
+    turn.take()
+    assert not is_free(path)
+    turn.give_back()
+    turn.compile(touch)
     with torch.no_grad():
-        assert not path.exists()
+        assert is_free(path)
         found = touch(state)
         assert not is_free(path)
         expected = own.compile()(state)
-    (was_taken, options), (_, expected_options) = compiled
-    assert not was_taken and options == expected_options
+    (was_free, options), (_, expected_options) = compiled
+    assert was_free and options == expected_options
     assert all(torch.equal(found[name], expected[name]) for name in expected)
