@@ -321,13 +321,14 @@ def write(path: Path, rows: list[Row], versions: dict[str, str]) -> None:
 
 def plot(options: argparse.Namespace) -> None:
     """Draw throughput against environments, and what touch adds to a step, one column per scene."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     rows = load_rows(options.results)
     names = [name for name in SCENES if any(row.scene == name for row in rows)]
     figure = Figure(figsize=(4.6 * len(names), 8.2), layout="constrained")
     panels = figure.subplots(2, len(names), squeeze=False)
-    colours = [f"C{i % 10}" for i in range(len(MODULES))]
+    colours = [colormaps["tab20"](i) for i in range(len(MODULES))]
     for column, name in enumerate(names):
         own = [row for row in rows if row.scene == name]
         envs = sorted({row.num_envs for row in own})
@@ -344,7 +345,7 @@ def plot(options: argparse.Namespace) -> None:
         for panel in panels[:, column]:
             panel.grid(alpha=0.25, which="both")
             panel.set_xticks(envs, [f"{n:,}" for n in envs])
-            panel.minorticks_off()
+            panel.xaxis.minorticks_off()
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, dpi=110)
