@@ -99,11 +99,12 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     turn the cosine's sign. Both are their Taylor series there, to 3e-7.
     """
     share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
-    radius = torch.sqrt(-2.0 * torch.log(share))
+    square = -2.0 * torch.log(share)
+    radius = square * torch.rsqrt(square)
     angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (3.141592653589793 / 2048)
-    square = angle * angle
-    sine = angle * (1 + square * (-1 / 6 + square * (1 / 120 - square * (1 / 5040))))
-    cosine = 1 + square * (-1 / 2 + square * (1 / 24 + square * (-1 / 720 + square * (1 / 40320))))
+    turn = angle * angle
+    sine = angle * (1 + turn * (-1 / 6 + turn * (1 / 120 - turn * (1 / 5040))))
+    cosine = 1 + turn * (-1 / 2 + turn * (1 / 24 + turn * (-1 / 720 + turn * (1 / 40320))))
     along = radius * cosine * (1 - (word & 2)).to(dtype)
     across = radius * sine
     is_turned = (word & 1) == 1
