@@ -68,6 +68,12 @@ def test_no_number_is_at_an_end_or_infinite(dtype):
         assert (numbers.abs() <= np.sqrt(2 * np.log(2.0**21)) + 1e-5).all()
 
 
+def test_normal_numbers_of_eight_bits_are_numbers():
+    """A share then rounds to 1, whose logarithm is 0."""
+    for numbers in random.normal_pair(torch.arange(-(2**31), 2**31, 4099).to(torch.int32), torch.bfloat16):
+        assert numbers.isfinite().all() and numbers.abs().max() > 3
+
+
 def test_numbers_depend_on_nothing_else():
     """A batch in parts, more taxels and other environments change no number."""
     whole = batched(env=6, count=50, step=9)

@@ -100,7 +100,7 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     """
     share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
     square = -2.0 * torch.log(share)
-    radius = square * torch.rsqrt(square)
+    radius = square * torch.rsqrt(torch.clamp(square, min=2.0**-30))  # in 8 bits a share may be 1
     angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (3.141592653589793 / 2048)
     turn = angle * angle
     sine = angle * (1 + turn * (-1 / 6 + turn * (1 / 120 - turn * (1 / 5040))))
