@@ -293,10 +293,8 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
 def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
     """Measure a case at each number of environments; one that fails is reported, and the others go on."""
     plan, turn = load_plan(artefact(options.folder, case)), turns.Turn(options.turn)
-    (first,), checked = (
-        states_of(case, plan, (options.envs or case.envs)[0], 1),
-        states_of(case, plan, options.check_envs, CALLS, seed=100),
-    )
+    first = states_of(case, plan, (options.envs or case.envs)[0], 1)[0]
+    checked = states_of(case, plan, options.check_envs, CALLS, seed=100)
     turn.take()
     bench, exact = Bench.of(case, plan, turn, options), TactileModule(plan, dtype=torch.float64).to(options.exact_on)
     touch, first = bench.module(), first.to(bench.device)
