@@ -53,7 +53,7 @@ class Turn:
 
     def compile(self, touch: TactileModule) -> None:
         """Compile a module as `touch.compile()` does; right before its code runs first, the turn is taken."""
-        touch.compile(backend=self._backend, options={"assert_indirect_indexing": "variant" in touch.inputs.fields})
+        touch.compile(backend=self._backend, options=touch.inductor_options())
 
     def _backend(self, graph: GraphModule, inputs: list[Any], options: dict[str, Any]) -> Callable[..., Any]:
         from torch._inductor.compile_fx import compile_fx  # takes seconds

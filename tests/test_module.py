@@ -249,6 +249,38 @@ def test_kinds_of_your_own(document, tmp_path):
     assert isinstance(TactileModule(touch.plan, (*KINDS, INVERSE)), torch.nn.Module)
 
 
+TILES = {
+    "a depth": ({"kind": "contact_depth"}, True),
+    "a depth with noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False),
+    "a force": ({"kind": "force_taxel"}, True),
+    "a velocity": ({"kind": "kinematic_taxel"}, False),
+    "moments": ({"kind": "proximity"}, False),
+    "frames": ({"kind": "elastomer"}, False),
+}
+
+
+@pytest.mark.parametrize("name", TILES)
+def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
+    sensor, is_tiled = TILES[name]
+    document["sensors"] = {"mine": {**sensor, "links": "pad", "feels": ["item"]}}
+    options = tgdsl.compile(document).inductor_options()
+    assert options == {"assert_indirect_indexing": False, "triton.prefer_nd_tiling": is_tiled}
+
+
+def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+    wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'
+    scene = SCENE.replace('<geom type="box" size=".02 .02 .02"/>', '<geom type="mesh" mesh="wedge"/>')
+    (tmp_path / "scene.xml").write_text(scene.replace("<mujoco>", f"<mujoco>{wedge}"))
+    document["sensors"] = {"mine": {"kind": "contact_depth", "links": "pad", "feels": ["item"]}}
+    assert not tgdsl.compile(document).inductor_options()["triton.prefer_nd_tiling"]
+
+
+def test_the_index_of_a_variant_is_looked_at(document):
+    document["objects"]["item"]["variants"] = [{"type": "sphere", "size": [0.01]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]
+    assert tgdsl.compile(document).inductor_options()["assert_indirect_indexing"]
+
+
 def test_no_compiler_means_eager_and_a_warning(touch, monkeypatch):
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.warns(UserWarning, match=r"no C\+\+ compiler \(g\+\+, clang\+\+ or \$CXX\) was found: the module stays eager"):

@@ -23,6 +23,7 @@ from tgdsl.buffers import Constants
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
 from tgdsl.geometry.query import Felt, Probes
+from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
 from tgdsl.history import History, last_step
 from tgdsl.memory import Memory, store
@@ -311,12 +312,11 @@ class TactileModule(nn.Module):
     def compile(self, graph: bool = False, **options: Any) -> TactileModule:
         """Compile `advance` with `torch.compile` into fused kernels, in place; the first call then takes longer.
 
-        Kernels look at each index whether it is in range only where some index is given by the user: a variant's number.
-
         Args:
             graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph: the host
                 then has little to do, and readings lie in the same memory at each call, so copy what is to be kept.
-            **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`: one graph for every batch ≥ 2.
+            **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`, one graph for every batch ≥ 2, and
+                `options=inductor_options()`.
 
         Returns:
             The module.
@@ -330,11 +330,27 @@ class TactileModule(nn.Module):
             warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
             return self
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
-        if "variant" not in self.inputs.fields and not {"mode", "options", "backend"} & options.keys():
-            defaults["options"] = {"assert_indirect_indexing": False}
+        if not {"mode", "options", "backend"} & options.keys():
+            defaults["options"] = self.inductor_options()
         self._compiled = torch.compile(self.advance, **{**defaults, **options})
         self._graphed = Graphed(self._compiled) if graph else None
         return self
+
+    def inductor_options(self) -> dict[str, bool]:
+        """Return what `compile` asks of Inductor.
+
+        Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
+        taxels ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what there is
+        once per environment is loaded once per tile. With more to find such tiles take too many registers.
+        """
+        answers = [answer for query in self.plan.queries for answer in query.answers]
+        is_slight = (
+            all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
+            and not any(answer.moments or answer.points for answer in answers)
+            and not any(sensor.noise for sensor in self.plan.sensors)
+            and all(shape in SHAPES for target in self.plan.objects for shape in target.shapes)
+        )
+        return {"assert_indirect_indexing": "variant" in self.inputs.fields, "triton.prefer_nd_tiling": is_slight}
 
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03

@@ -40,7 +40,7 @@ def joined_signal(
         rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, stored(torch.stack(rows)).unbind(), strict=True))
     found, _ = kind.forward(felt, probes, of_taxels, {})
-    return _stacked(found, sensors[0])
+    return _stacked(found, "signal", sensors[0].signal)
 
 
 def read(
@@ -77,7 +77,7 @@ def read(
         felt = felt._replace(depth=gain * felt.depth)
     found, new = ({}, {}) if joined is not None else kind.forward(felt, probes, constants, _own(memory))
     new = dict(new)
-    signal = clean = _stacked(found, sensor) if joined is None else joined
+    signal = clean = _stacked(found, "signal", sensor.signal) if joined is None else joined
     if gain is not None and not kind.gains_depth:
         signal = gain[:, None] * clean
     if terms:
@@ -98,15 +98,16 @@ def read(
             new |= decided
         readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
-        readings[reading.name] = torch.stack([found[name] for name in reading.channels], dim=1).transpose(1, 2)
+        whole = reading.name.rpartition("/")[2] + "/signal"
+        readings[reading.name] = _stacked(found, whole, reading.channels).transpose(1, 2)
     if now is not None and now.period is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
     return readings, new
 
 
-def _stacked(found: Mapping[str, Tensor], sensor: PlannedSensor) -> Float[Tensor, "env channel row"]:
-    """Return the planes that a kind found as one signal."""
-    return found["signal"] if "signal" in found else torch.stack([found[name] for name in sensor.signal], dim=1)
+def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:
+    """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
+    return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 
 
 def _own(memory: Tensors) -> Tensors:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from kernels import interpreted, needs_triton
 
-from tgdsl.sensors.footprint import FAR, LEVENBERG, Bodies, box, shared_forces, unreached
+from tgdsl.sensors.footprint import LEVENBERG, Bodies, box, place, shared_forces, unreached
 
 RADIUS = 0.01
 TOLERANCE = 1e-5
@@ -48,7 +48,7 @@ def bodies_of(counts, is_active, pos):
     taxel[body, rank] = np.arange(first[-1])
     inverse_radius[body, rank] = is_active / 0.002
     boxes = np.array([box(pos[(body == b) & is_active]) for b in range(len(counts))])
-    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first, boxes)))
+    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first, boxes, place(pos, is_active))))
 
 
 def cases():
@@ -84,15 +84,14 @@ def by_kernel(case):
     """Return what `shared_forces` does; needs an interpreted Triton."""
     from tgdsl.sensors import footprint_kernel
 
-    bodies, pos, depth, *rest = case
+    bodies, _, depth, *rest = case
     own = bodies.inverse_radius.flatten()[bodies.row]
     weight = torch.tensor(depth) * own + unreached()
-    place = torch.where(own[:, None] > 0, torch.tensor(pos).T, FAR)
     planes = [tuple(torch.tensor(value, dtype=torch.float32)) for value in rest[:3]]
     radius, levenberg = (torch.tensor(value, dtype=torch.float32) for value in rest[3:])
-    arguments = (place.float(), weight.float(), *planes, radius, levenberg, bodies.first, bodies.box.float())
+    arguments = (bodies.place.float(), weight.float(), *planes, radius, levenberg, bodies.first, bodies.box.float())
     shared, sums = footprint_kernel.launch(footprint_kernel.footprint_kernel, *arguments)
-    return shared.transpose(0, 1), sums[:3], sums[3:]
+    return shared, sums[:, :3], sums[:, 3:]
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +107,8 @@ def test_the_kernel_is_the_torch_code(found, name):
     case = cases()[name]
     expected = by_torch(case)
     largest = max(1.0, float(np.nanmax(np.abs(case[4]), initial=0.0)))
-    for part, planes, scale in zip(found[name], expected[:3], (1, 1, RADIUS), strict=True):
-        torch.testing.assert_close(part.double(), torch.stack(planes), rtol=0, atol=TOLERANCE * scale * largest, equal_nan=True)
+    for part, exact, scale in zip(found[name], expected, (1, 1, RADIUS), strict=True):
+        torch.testing.assert_close(part.double(), exact, rtol=0, atol=TOLERANCE * scale * largest, equal_nan=True)
 
 
 if __name__ == "__main__":

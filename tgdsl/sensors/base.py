@@ -187,8 +187,8 @@ class Kind:
         lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels. May raise `LowerError`.
         forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel) or, of what has
             a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old. Where
-            the signal is one tensor (env, channel, row) already it is there too, as "signal". A kernel may write new state of
-            points over the old; it is then left out of what is returned.
+            all channels are one tensor (env, channel, row) already it stands for them, as "signal", or of a report as
+            "<report>/signal". A kernel may write new state of points over the old; it is then left out of what is returned.
         reference: `(spec, layout, touch, state) → (reading (row, channel), new state)` for one environment, in NumPy.
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
             `forward` returns is then the signal, which noise disturbs first.

@@ -44,7 +44,7 @@ from tgdsl.geometry.planes import Vec
 LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
 FAR = 1e3
-"""Where a kernel that does not know of inactive taxels has them [m]: beyond all contacts' reach."""
+"""Where inactive taxels are for a kernel that does not know of them [m]: beyond all contacts' reach."""
 
 
 def unreached() -> float:
@@ -127,6 +127,7 @@ class Bodies(NamedTuple):
         row: Place of each taxel in these, flattened.
         first: First taxel of each body, and the number of all.
         box: Least and largest coordinates of its active taxels [m].
+        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none.
     """
 
     taxel: Int[Tensor, "body padded"]
@@ -134,6 +135,7 @@ class Bodies(NamedTuple):
     row: Int[Tensor, " taxel"]
     first: Int[Tensor, " bodies_and_one"]
     box: Float[Tensor, "body 6"]
+    place: Float[Tensor, "taxel 3"]
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
@@ -141,20 +143,23 @@ def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
     return np.concatenate([pos.min(axis=0), pos.max(axis=0)]) if len(pos) else np.zeros(6)
 
 
+def place(pos: Float[np.ndarray, "taxel 3"], is_active: Bool[np.ndarray, " taxel"]) -> Float[np.ndarray, "taxel 3"]:
+    """Return the positions of taxels [m], `FAR` away if they cannot carry."""
+    return np.where(is_active[:, None], pos, FAR)
+
+
 class Shared(NamedTuple):
     """What contacts' forces become.
 
     Attributes:
-        force: Force on each taxel, Σ_c γ_c λ_cj f_c [N], planes (env, taxel).
-        carried: Their sum over each body's taxels [N], planes (env, body).
-        residual: What they leave of the moment [N·m], likewise.
-        stacked: The force as one tensor (env, 3, taxel), if it was made so.
+        force: Force on each taxel, Σ_c γ_c λ_cj f_c [N].
+        carried: Their sum over each body's taxels [N].
+        residual: What they leave of the moment [N·m].
     """
 
-    force: Vec
-    carried: Vec
-    residual: Vec
-    stacked: Tensor | None = None
+    force: Float[Tensor, "env 3 taxel"]
+    carried: Float[Tensor, "env 3 body"]
+    residual: Float[Tensor, "env 3 body"]
 
 
 def shared_forces(
@@ -185,10 +190,9 @@ def shared_forces(
 
         own = inverse_radius.flatten()[bodies.row]
         weight = depth * own + unreached()
-        place = torch.where(own[:, None] > 0, torch.stack(pos, dim=-1), FAR)
         args = radius, levenberg, bodies.first, bodies.box
-        shared, sums = footprint_kernel.shared_forces(place, weight, point, force, torque, *args)
-        return Shared(planes.vec(shared.unbind(1)), planes.vec(sums[:3].unbind()), planes.vec(sums[3:].unbind()), shared)
+        shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, *args)
+        return Shared(shared, sums[:, :3], sums[:, 3:])
     share, residual = footprint(
         planes.vec(part[taxel] for part in pos),
         inverse_radius > 0,
@@ -199,9 +203,8 @@ def shared_forces(
         radius,
         levenberg,
     )
-    padded = planes.vec((share * part[..., None]).sum(dim=2) for part in force)
-    each = planes.vec(part.flatten(1)[:, bodies.row] for part in padded)
-    return Shared(each, planes.vec(part.sum(dim=2) for part in padded), residual)
+    padded = torch.stack([(share * part[..., None]).sum(dim=2) for part in force], dim=1)
+    return Shared(padded.flatten(2)[:, :, bodies.row], padded.sum(dim=3), torch.stack(residual, dim=1))
 
 
 def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:

@@ -56,13 +56,13 @@ def shared_forces(
     first: Tensor,
     box: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the force on each taxel, (env, 3, taxel) [N], and two vectors of each body, (6, env, body).
+    """Return the force on each taxel, (env, 3, taxel) [N], and two vectors of each body, (env, 6, body).
 
     These are the sum of its taxels' forces [N], and what they leave of the moment [N·m].
 
     Args:
         pos: Taxel positions in their body's frame, (taxel, 3) [m]; inactive ones are far away.
-        weight: Depth of each probe over its radius, and `UNREACHED`, (env, taxel) [1].
+        weight: Depth of each probe over its radius, and `unreached()`, (env, taxel) [1].
         point: Contact points, three planes (env, body, contact) [m].
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
@@ -90,7 +90,7 @@ def launch(
     num_envs, num_bodies, num_contacts = point[0].shape
     num_taxels = weight.shape[1]
     shared = weight.new_empty((num_envs, 3, num_taxels))
-    sums = weight.new_empty((6, num_envs, num_bodies))
+    sums = weight.new_empty((num_envs, 6, num_bodies))
     planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque)]
     run[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
@@ -109,7 +109,6 @@ def footprint_kernel(
     body = tl.program_id(1)
     env = tl.program_id(0) * ENVS + tl.arange(0, ENVS).to(tl.int64)
     is_env = env < num_envs
-    all_envs = tl.full((), 0, tl.int64) + num_envs
     row = env * num_bodies + body
     first_taxel = tl.load(first + body)
     num_own = tl.load(first + body + 1) - first_taxel
@@ -178,14 +177,13 @@ def footprint_kernel(
                 _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_own, start)
                 _accumulate(out + 2 * num_taxels, _weighted(p0, p1, p2, p3, fz), is_own, start)
             tl.debug_barrier()
-    out = sums + row
-    plane = all_envs * num_bodies
+    out = sums + 6 * env * num_bodies + body
     tl.store(out, carried[0], is_env)
-    tl.store(out + plane, carried[1], is_env)
-    tl.store(out + 2 * plane, carried[2], is_env)
-    tl.store(out + 3 * plane, -unmet[0], is_env)
-    tl.store(out + 4 * plane, -unmet[1], is_env)
-    tl.store(out + 5 * plane, -unmet[2], is_env)
+    tl.store(out + num_bodies, carried[1], is_env)
+    tl.store(out + 2 * num_bodies, carried[2], is_env)
+    tl.store(out + 3 * num_bodies, -unmet[0], is_env)
+    tl.store(out + 4 * num_bodies, -unmet[1], is_env)
+    tl.store(out + 5 * num_bodies, -unmet[2], is_env)
 
 
 @triton.jit
@@ -267,7 +265,7 @@ def _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG: 
     zero = tl.zeros_like(point[0])
     top = zero
     if IS_LONG:
-        top += _highest(pos, weights, num_own, point, slope, inverse)
+        top += _highest(pos, num_own, point, slope, inverse)
     nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
@@ -326,7 +324,7 @@ def _weighted(p0, p1, p2, p3, force):
 
 
 @triton.jit
-def _highest(pos, weights, num_own, point, slope, inverse):
+def _highest(pos, num_own, point, slope, inverse):
     """Return the largest exponent of 2 among the taxels in reach, (env, contact)."""
     top = tl.full(point[0].shape, float("-inf"), tl.float32)
     for taxel in range(num_own):

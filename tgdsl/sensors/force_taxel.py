@@ -29,6 +29,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
+import torch
 from pydantic import Field, StrictInt
 from torch import Tensor
 
@@ -117,6 +118,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "first": first,
         "row": layout.body_id * counts.max() + rank,
         "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
+        "place": footprint.place(layout.pos, is_active),
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
     }
@@ -136,7 +138,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
+    """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
     contacts = felt.contacts
     assert contacts is not None
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
@@ -150,15 +152,13 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
         constants["footprint"],
         constants["levenberg"],
     )
-    missed = planes.sub(contacts.net, shared.carried)
-    readings: dict[str, Tensor] = {}
-    for name, vector in {"force": shared.force, "missed": missed, "residual": shared.residual}.items():
-        readings |= {f"{name}_{axis}": plane for axis, plane in zip("xyz", vector, strict=True)}
-    if "inward" in constants:
-        inward = planes.vec(constants["inward"])
-        readings["pressure"] = planes.dot(shared.force, inward).clamp(min=0)
-    elif shared.stacked is not None:
-        readings["signal"] = shared.stacked
+    missed = torch.stack(contacts.net, dim=1) - shared.carried
+    readings = {"missed/signal": missed, "residual/signal": shared.residual}
+    if "inward" not in constants:
+        return {"signal": shared.force, **readings}, {}
+    force = planes.vec(shared.force.unbind(1))
+    readings |= {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings["pressure"] = planes.dot(force, planes.vec(constants["inward"])).clamp(min=0)
     return readings, {}
 
 

@@ -30,6 +30,8 @@ MIN_BLOCK, BLOCK, LINES = 16, 64, 64
 
 A tile holds its part of a matrix of up to twice as many taxels as it has outputs.
 """
+DEPTH = 32
+"""Taxels that are multiplied at a time where a matrix is not held: half of a block pads less, and leaves more registers."""
 NUM_PROGRAMS, MAX_STEPS = 768, 8
 """Programs that a GPU should have, three for each that an H200 runs at once, and most blocks of lines of a program.
 
@@ -69,7 +71,7 @@ def launch(
     if lines.numel() > 0:
         run[(num_tiles * triton.cdiv(num_blocks, steps),)](
             lines, flat, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
-            LINES=LINES, SIZE=block, REST=rest, IS_HELD=is_held, num_warps=4, num_stages=stages,
+            LINES=LINES, SIZE=block, REST=rest, DEPTH=DEPTH, IS_HELD=is_held, num_warps=4, num_stages=stages,
         )  # fmt: skip
     return found
 
@@ -122,7 +124,7 @@ def _(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
 @triton.jit
 def link_products_kernel(
     lines, matrices, tiles, found, num_lines, num_rows, num_planes, num_tiles, steps,
-    LINES: tl.constexpr, SIZE: tl.constexpr, REST: tl.constexpr, IS_HELD: tl.constexpr,
+    LINES: tl.constexpr, SIZE: tl.constexpr, REST: tl.constexpr, DEPTH: tl.constexpr, IS_HELD: tl.constexpr,
 ):  # fmt: skip
     """Multiply `steps` blocks of lines by one tile of a link's matrix."""
     tiles += tl.program_id(0) % num_tiles * COLUMNS
@@ -154,8 +156,8 @@ def link_products_kernel(
                 total = tl.dot(part, rest, total, input_precision="tf32x3")
         else:
             total = tl.zeros((LINES, SIZE), tl.float32)
-            for low in range(0, size, SIZE):
-                those = low + link_from
+            for low in range(0, size, DEPTH):
+                those = low + tl.arange(0, DEPTH)
                 part = tl.load((lines + those)[None, :] + own, (those < size)[None, :], 0.0)
                 block = tl.load(matrices + (those * num_planes * size)[:, None], is_to & (those < size)[:, None], 0.0)
                 total = tl.dot(part, block, total, input_precision="tf32x3")
