@@ -251,8 +251,9 @@ def test_kinds_of_your_own(document, tmp_path):
 
 TILES = {
     "a depth": ({"kind": "contact_depth"}, True),
-    "a depth with noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False),
     "a force": ({"kind": "force_taxel"}, True),
+    "two links": ({"kind": "contact_depth", "links": "all"}, False),
+    "noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False),
     "a velocity": ({"kind": "kinematic_taxel"}, False),
     "moments": ({"kind": "proximity"}, False),
     "frames": ({"kind": "elastomer"}, False),
@@ -262,7 +263,7 @@ TILES = {
 @pytest.mark.parametrize("name", TILES)
 def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     sensor, is_tiled = TILES[name]
-    document["sensors"] = {"mine": {**sensor, "links": "pad", "feels": ["item"]}}
+    document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
     options = tgdsl.compile(document).inductor_options()
     assert options == {"assert_indirect_indexing": False, "triton.prefer_nd_tiling": is_tiled}
 

@@ -340,15 +340,16 @@ class TactileModule(nn.Module):
         """Return what `compile` asks of Inductor.
 
         Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
-        taxels ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what there is
-        once per environment is loaded once per tile. With more to find such tiles take too many registers.
+        taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels:
+        what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to
+        find a tile takes too many registers.
         """
         answers = [answer for query in self.plan.queries for answer in query.answers]
         is_slight = (
             all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
             and not any(answer.moments or answer.points for answer in answers)
             and not any(sensor.noise for sensor in self.plan.sensors)
-            and all(shape in SHAPES for target in self.plan.objects for shape in target.shapes)
+            and all(target.num_pairs == 1 and set(target.shapes) <= SHAPES.keys() for target in self.plan.objects)
         )
         return {"assert_indirect_indexing": "variant" in self.inputs.fields, "triton.prefer_nd_tiling": is_slight}
 
