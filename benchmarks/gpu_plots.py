@@ -142,7 +142,7 @@ def unmet(row: Row, clean: Row | None) -> list[str]:
     target = TARGETS.get(row.key, Target())
     most_bytes = CLEAN_BYTES if row.noise == "clean" else NOISY_BYTES
     found = {
-        f"graph {row.graph:.4g} ms > {target.limit} ms": target.limit is not None and row.graph > target.limit,
+        f"graph {row.graph:.5g} ms > {target.limit} ms": target.limit is not None and row.graph > target.limit,
         f"from Python {row.replayed:.4g} ms > {target.plain} ms": target.plain is not None and row.replayed > target.plain,
         f"{row.per_taxel:.1f} B per taxel > {most_bytes:g} B": row.per_taxel > most_bytes,
         f"{row.per_anchor:.1f} B per tracked point > {ANCHOR_BYTES:g} B": row.per_anchor > ANCHOR_BYTES,
