@@ -329,6 +329,7 @@ def plot(options: argparse.Namespace) -> None:
     figure = Figure(figsize=(4.6 * len(names), 8.2), layout="constrained")
     panels = figure.subplots(2, len(names), squeeze=False)
     colours = [colormaps["tab20"](i) for i in range(len(MODULES))]
+    lines: dict[str, Any] = {}
     for column, name in enumerate(names):
         own = [row for row in rows if row.scene == name]
         envs = sorted({row.num_envs for row in own})
@@ -336,17 +337,20 @@ def plot(options: argparse.Namespace) -> None:
         panels[0, column].plot(envs, [1e3 * n / ms for n, ms in zip(envs, plain, strict=True)], "k--", label="no sensors")
         for module, colour in zip(MODULES, colours, strict=True):
             found = sorted((row for row in own if row.module == module), key=lambda row: row.num_envs)
+            if not found:
+                continue
             at = [row.num_envs for row in found]
             style = {"color": colour, "marker": "o" if MODULES[module][1] is None else "^", "markersize": 4}
             panels[0, column].plot(at, [1e3 * row.num_envs / row.step for row in found], label=module, **style)
             panels[1, column].plot(at, [100 * row.module_alone / row.step for row in found], **style)
+        lines |= {line.get_label(): line for line in panels[0, column].get_lines()}
         panels[0, column].set(title=name, xscale="log", yscale="log", ylabel="environments' control steps per second")
         panels[1, column].set(xscale="log", yscale="log", xlabel="environments", ylabel="the module's time, % of the step")
         for panel in panels[:, column]:
             panel.grid(alpha=0.25, which="both")
             panel.set_xticks(envs, [f"{n:,}" for n in envs])
             panel.xaxis.minorticks_off()
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
+    figure.legend(lines.values(), lines, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, dpi=110)
 
