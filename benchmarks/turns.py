@@ -61,8 +61,7 @@ class Turn:
         call: Any = compile_fx(graph, inputs, config_patches=options)
 
         def in_turn(*arguments: Any) -> Any:
-            if not self._is_taken:
-                self.take()
+            self.take()
             return call(*arguments)
 
         return in_turn

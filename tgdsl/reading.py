@@ -98,8 +98,8 @@ def read(
             new |= decided
         readings[reading.name] = made.transpose(1, 2)
     for reading in sensor.readings[len(own) :]:
-        whole = reading.name.rpartition("/")[2] + "/signal"
-        readings[reading.name] = _stacked(found, whole, reading.channels).transpose(1, 2)
+        report = reading.name.rpartition("/")[2]
+        readings[reading.name] = _stacked(found, f"{report}/signal", reading.channels).transpose(1, 2)
     if now is not None and now.period is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
     return readings, new
