@@ -84,7 +84,6 @@ class Cost:
 
     def run(self) -> None:
         """Measure and print one table."""
-        torch._dynamo.config.recompile_limit = 256  # all modules share the code of one method
         where = torch.cuda.get_device_name() if self.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
         how = "eager" if self.eager else "compiled"
         print(f"torch {torch.__version__}, {where}, {self.num_envs} environments, float32, {how}, medians of {self.repeats}\n")

@@ -268,6 +268,27 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     assert options == {"assert_indirect_indexing": False, "triton.prefer_nd_tiling": is_tiled}
 
 
+def test_as_many_modules_as_one_likes_are_compiled(document, monkeypatch):
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", 2)
+    sensor = {"kind": "contact_depth", "links": "pad", "feels": ["item"]}
+    for count in (1, 2, 3):
+        document["sensors"] = {f"depth{i}": sensor for i in range(count)}
+        touch, plain = tgdsl.compile(document).compile(backend="eager"), tgdsl.compile(document)
+        state = touch.example_state(2)
+        found, expected = touch(state), plain(state)
+        assert len(found) == count and all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+def test_half_precision_is_refused(touch):
+    state = touch.example_state(2)
+    with pytest.raises(
+        TgdslError, match=r"this module is of torch\.float16, whose range is too small: touch\.to\(torch\.float32\)"
+    ):
+        touch.half()(state)
+    assert touch.to(torch.bfloat16)(state)["touch"].dtype == torch.bfloat16
+
+
 def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.util import find_spec
+from types import FunctionType, MethodType
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +24,18 @@ def stored(tensor: Tensor) -> Tensor:
             a view's strides would be wrong.
     """
     return tensor.as_strided(tensor.shape, tensor.stride())
+
+
+def of_its_own(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a bound method whose code is a copy.
+
+    Dynamo keeps what it made of a method with its code, for all objects together, looks through all of that at each call, and
+    refuses to make more than eight (`recompile_limit`).
+    """
+    assert isinstance(method, MethodType)
+    known = method.__func__
+    own = FunctionType(known.__code__.replace(), known.__globals__, known.__name__, known.__defaults__, known.__closure__)
+    return MethodType(own, method.__self__)
 
 
 def takes_kernel(*tensors: Tensor) -> bool:

@@ -22,6 +22,7 @@ from tgdsl import observations
 from tgdsl.buffers import Constants
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
+from tgdsl.fusion import of_its_own
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
@@ -166,8 +167,11 @@ class TactileModule(nn.Module):
 
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+            TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
         """
         dtype, device = self.dtype, self.device
+        if dtype == torch.float16:
+            raise TgdslError("this module is of torch.float16, whose range is too small: touch.to(torch.float32), or bfloat16")
         tensors = state.checked(self.inputs, device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
@@ -332,7 +336,7 @@ class TactileModule(nn.Module):
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
         if not {"mode", "options", "backend"} & options.keys():
             defaults["options"] = self.inductor_options()
-        self._compiled = torch.compile(self.advance, **{**defaults, **options})
+        self._compiled = torch.compile(of_its_own(self.advance), **{**defaults, **options})
         self._graphed = Graphed(self._compiled) if graph else None
         return self
 
