@@ -270,13 +270,13 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
 
 def test_as_many_modules_as_one_likes_are_compiled(document, monkeypatch):
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
-    monkeypatch.setattr(torch._dynamo.config, "recompile_limit", 2)
     sensor = {"kind": "contact_depth", "links": "pad", "feels": ["item"]}
     for count in (1, 2, 3):
         document["sensors"] = {f"depth{i}": sensor for i in range(count)}
         touch, plain = tgdsl.compile(document).compile(backend="eager"), tgdsl.compile(document)
         state = touch.example_state(2)
-        found, expected = touch(state), plain(state)
+        with torch._dynamo.config.patch(recompile_limit=2):
+            found, expected = touch(state), plain(state)
         assert len(found) == count and all(torch.equal(found[name], expected[name]) for name in expected)
 
 
