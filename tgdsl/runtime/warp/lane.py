@@ -76,9 +76,11 @@ class Lane:
             if self._stream is None:
                 yield
                 return
+            # What Warp's own stream did before is in no graph that torch is capturing.
+            after_warp = not self.is_capturing
             self._stream.wait_stream(torch.cuda.current_stream(self.device))
             try:
-                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream):
+                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream, sync_enter=after_warp):
                     yield
             finally:
                 torch.cuda.current_stream(self.device).wait_stream(self._stream)
