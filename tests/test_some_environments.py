@@ -65,10 +65,8 @@ def test_each_environment_is_as_if_it_were_alone(touch, seed):
             alone[env].reset()
         state = felt_state(touch, NUM_ENVS, 100 * seed + call)
         mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)
-        if len(read) == NUM_ENVS:
-            readings = touch(state)
-        else:
-            readings = touch(state, mask) if by_mask else touch(state, env_ids=read)
+        chosen = {} if len(read) == NUM_ENVS else {"mask": mask} if by_mask else {"env_ids": read}
+        readings = touch(state, **chosen)
         for env in range(NUM_ENVS):
             expected = alone[env](only(state, slice(env, env + 1))) if env in read else None
             for name, reading in readings.items():

@@ -19,9 +19,9 @@ from tgdsl.sensors.noise.random import Stream, sensor_key, streams
 class Clock(nn.Module):
     """Counts calls and episodes, of each environment alone. It holds nothing until `start`, nor if no sensor asks for it.
 
-    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); and per environment,
-    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and `ages` (env, call), how long before
-    the last call each one was [s], itself first.
+    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
+    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
+    (env, call), how long before the last call each one was [s], itself first.
 
     Attributes:
         home: Has device and dtype of counts that are loaded before the start.

@@ -1,7 +1,7 @@
 """What a sensor read at its last calls: a window over them, in order.
 
-A window is part of the state like any other: a pure function of the old one and the present reading, so it is compiled, captured
-in a CUDA graph, and advanced for some environments alone. It is copied once per call, as what is handed out is a copy too.
+A window is part of the state like any other: a pure function of the old one and the present reading. So it is compiled,
+captured in a CUDA graph, and advanced for some environments alone.
 
 Shapes: `env` environments, `step` calls, oldest first, `row` taxels or bodies, `channel` numbers per row.
 """

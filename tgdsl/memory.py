@@ -1,7 +1,7 @@
 """What a module carries from one call to the next: buffers of each sensor, windows over last readings, and its clock.
 
-Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, `row` taxels or bodies, `channel` numbers
-per row.
+Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, `row` taxels or bodies, `channel`
+numbers per row.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tgdsl.fusion import stored
 from tgdsl.plan import PlannedMemory, PlannedSensor
 
 WINDOW, KEPT = "history/", "kept/"
-"""Buffers `history/<reading>` (env, step, channel, row): its last calls. `kept/<reading>` (env, channel, row): as handed out last."""
+"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, channel, row), the last one."""
 
 
 class Memory(nn.Module):

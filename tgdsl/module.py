@@ -167,12 +167,12 @@ class TactileModule(nn.Module):
             env_ids: The same by indices.
 
         Returns:
-            Readings by name, as `outputs` lists them, in the module's dtype, of all environments. They are tensors of their own,
+            Readings of all environments by name, as `outputs` lists them, in the module's dtype. They are tensors of their own,
             but for a module that replays a CUDA graph (see `compile`), and histories that are declared as views.
 
         Raises:
-            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no such
-                environments, or some are to be left out before anything was handed out.
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
+                such environments, or some are to be left out before anything was handed out.
             TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
         """
         tensors, num_envs = self._tensors(state)

@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -190,8 +189,8 @@ class WarpSimulation:
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
         graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
-        captures; the graph is captured anew when the module holds other tensors than before: when it was moved, compiled, freed,
-        or given another dt.
+        captures; the graph is captured anew when the module holds other tensors than before: when it was moved, compiled,
+        freed, or given another dt.
 
         Args:
             control: As for `step`.
