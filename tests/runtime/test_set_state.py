@@ -10,6 +10,7 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch import BatchSimulation
 from tgdsl.runtime.state_values import INTEGRATED
+from tgdsl.runtime.warp.lane import Lane
 
 DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata", "qacc", "geom_xpos")
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
@@ -146,6 +147,31 @@ def test_quaternions_are_of_unit_length_by_mujocos_rule(tmp_path, simulator):
     unit = sim.qpos.clone()
     sim.set_state(qpos=unit)  # what is of unit length stays as it is, bit for bit
     assert torch.equal(sim.qpos, unit)
+
+
+@BOTH
+def test_bodies_that_are_led_by_hand(tmp_path, simulator):
+    """A mocap body, and a ball joint: their quaternions are of unit length too, and zero ones are refused."""
+    led = (
+        '<body name="led" mocap="true" pos="1 0 0"><geom size=".01"/></body>'
+        '<body name="ball" pos="-1 0 0"><joint type="ball"/><geom size=".01"/></body></worldbody>'
+    )
+    text = SCENE[: SCENE.index("<keyframe>")] + "</mujoco>"
+    sim = simulator(module(tmp_path, text.replace("</worldbody>", led)), 2)
+    turn = np.array([0.0, 3.0, 0.0, -4.0])
+    qpos = sim.model.qpos0.copy()
+    qpos[sim.joints["ball"].qpos] = turn
+    sim.set_state([1], mocap_pos=[[0, 2, 0]], mocap_quat=turn[None], qpos=qpos)
+    pos, quat = sim.body_poses(1)
+    np.testing.assert_allclose(pos[sim.model.body("led").id], [0, 2, 0], atol=1e-7)
+    for name in ("led", "ball"):
+        np.testing.assert_allclose(quat[sim.model.body(name).id], turn / 5, atol=1e-7)
+    np.testing.assert_allclose(sim.qpos[1, sim.joints["ball"].qpos], turn / 5, atol=1e-7)
+    np.testing.assert_allclose(sim.body_poses(0)[0][sim.model.body("led").id], [1, 0, 0])
+    qpos[sim.joints["ball"].qpos] = 0
+    for name, zero in (("mocap_quat", np.zeros((1, 4))), ("qpos", qpos)):
+        with pytest.raises(SimulationError, match=rf"^{name} holds a quaternion of length 0 in environments 0, 1$"):
+            sim.set_state(**{name: zero})
 
 
 # both
@@ -311,3 +337,22 @@ def test_under_inference_mode(tmp_path, simulator):
     sim.set_state([0], qvel=torch.ones(8))
     sim.step()
     assert torch.isfinite(sim.qpos).all()
+
+
+def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypatch):
+    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated."""
+    sim, twin = (warp(module(tmp_path), 3, keyframe="home") for _ in range(2))
+    for one in (sim, twin):
+        one.step()
+    mask, qpos = torch.tensor([True, False, True]), sim.qpos + torch.eye(9)[2]
+    assert not sim._lane.is_capturing
+    monkeypatch.setattr(Lane, "is_capturing", property(lambda self: True))
+    monkeypatch.setattr(Lane, "work_in_capture", Lane.work)
+    sim.reset(mask, qpos=qpos)
+    found = {name: sim.arrays[name].clone() for name in ("xpos", "cvel", "geom_xpos")}
+    monkeypatch.undo()
+    twin.reset(mask, qpos=qpos)
+    assert not torch.equal(twin.arrays["xpos"], found["xpos"])  # there it waits for `state`
+    twin.state()
+    for name, value in found.items():
+        assert torch.equal(twin.arrays[name], value), name
