@@ -10,7 +10,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -191,8 +190,7 @@ class WarpSimulation:
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
         graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
         captures; the graph is captured anew when the module holds other tensors than before: when it was moved, compiled,
-        seeded or given another dt. A module that stacks or averages its last calls counts them on the host: it reads after the
-        graph, not in it.
+        freed, or given another dt.
 
         Args:
             control: As for `step`.
@@ -202,13 +200,10 @@ class WarpSimulation:
         """
         if self._touch.device != self._lane.device:
             raise SimulationError(f"the module is on {self._touch.device}, physics on {self._lane.device}; expected one device")
-        if len(self._touch.histories):
-            self.step(control)
-            with torch.no_grad():
-                return self._touch(self.state())
         self._forget_other_tensors()
         self._set_control(control)
         readings = self._step_and_read()
+        self._touch.hand_out(readings)
         self._finish_step()
         return readings
 
