@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from tgdsl import observations
-from tgdsl.buffers import Constants
+from tgdsl.buffers import Constants, check_dtype
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
 from tgdsl.fusion import of_its_own
@@ -75,10 +75,10 @@ class TactileModule(nn.Module):
         Args:
             plan: What to compute.
             kinds: The kinds that the plan's sensors are of.
-            dtype: Dtype of constants, state and readings.
+            dtype: Dtype of constants, state and readings, float32 or float64.
 
         Raises:
-            TgdslError: If the plan uses a kind that is not given.
+            TgdslError: If the plan uses a kind that is not given, or the dtype is another one.
         """
         super().__init__()
         self.plan = plan
@@ -173,7 +173,6 @@ class TactileModule(nn.Module):
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
                 such environments, or some are to be left out before anything was handed out.
-            TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
         """
         tensors, num_envs = self._tensors(state)
         step = "advance"
@@ -219,8 +218,6 @@ class TactileModule(nn.Module):
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
         """Return the fields of a state that are wanted, and the number of environments."""
-        if self.dtype == torch.float16:
-            raise TgdslError("this module is of torch.float16, whose range is too small: touch.to(torch.float32), or bfloat16")
         tensors = state.checked(self.inputs, self.device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
@@ -515,7 +512,12 @@ class TactileModule(nn.Module):
                 warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
-        """Move or cast all tensors; a captured graph has read the old ones."""
+        """Move or cast all tensors; a captured graph has read the old ones.
+
+        Raises:
+            TgdslError: If they are to be neither float32 nor float64.
+        """
+        check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
         super()._apply(fn, recurse)
         for graphed in self._graphed.values():
             graphed.forget()
