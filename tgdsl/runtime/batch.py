@@ -17,8 +17,9 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, listed
 from tgdsl.module import TactileModule
+from tgdsl.runtime.contact_sensors import ContactSensors
 from tgdsl.runtime.controls import control_tensor, refuse_unfinite
-from tgdsl.runtime.lookup import body_id, contact_sensor, env_indices, keyframe_id
+from tgdsl.runtime.lookup import body_id, env_indices, keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.warp import WarpSimulation
@@ -26,7 +27,6 @@ from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
 
 Array = np.ndarray
-_SLOT_SIZE = 16
 _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 _DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 
@@ -87,11 +87,9 @@ class BatchSimulation:
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
         self._body_ids = np.array([body_id(model, name) for name in touch.inputs.bodies], dtype=np.intp)
         self._root_ids = self.model.body_rootid[self._body_ids]
-        self._slots = [contact_sensor(model, pair, 0) for pair in touch.inputs.pairs]
-        nets = touch.inputs.pairs if "contact_netforce" in touch.inputs.fields else ()
-        self._nets = [contact_sensor(model, pair, 1) for pair in nets]
+        self._contacts = ContactSensors(model, touch.inputs)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
-        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
+        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name in _READERS}
         for name in _DERIVED:
             self.batch.bind(name)  # an array is filled only by calls that come after its first use
         if self._objects is not None:
@@ -207,9 +205,10 @@ class BatchSimulation:
             raise SimulationError(f"environments {which} diverged, and MuJoCo has started them anew; reset them to go on")
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = {}
-        for name, reader in self._readers.items():
-            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
+        arrays = {name: reader(self) for name, reader in self._readers.items()} | self._contacts.read(self.batch.sensordata)
+        values: dict[str, Any] = {
+            name: torch.from_numpy(np.ascontiguousarray(array)).to(self._touch.device) for name, array in arrays.items()
+        }
         if "dt" in self._touch.inputs.fields:
             values["dt"] = dt
         return SceneState(**values)
@@ -234,35 +233,12 @@ class BatchSimulation:
         angular, linear = self._body_angvel(), self.batch.cvel[:, self._body_ids, 3:]
         return linear + np.cross(angular, self._body_pos() - self.batch.subtree_com[:, self._root_ids])
 
-    def _contact_found(self) -> Float[Array, "env pair"]:
-        return self.batch.sensordata[:, [part.start for part in self._slots]]
-
-    def _slot_part(self, first: int) -> Float[Array, "env pair slot 3"]:
-        """Return three numbers of each slot: 1 force, 4 torque, 7 position, 10 normal, 13 tangent."""
-        slots = np.stack([self.batch.sensordata[:, part.start : part.stop] for part in self._slots], axis=1)
-        return slots.reshape(*slots.shape[:2], -1, _SLOT_SIZE)[..., first : first + 3]
-
-    def _in_world(self, first: int) -> Float[Array, "env pair slot 3"]:
-        """Rotate a vector from the contact's frame (normal, tangent, their cross product) to the world."""
-        normal, tangent = self._slot_part(10), self._slot_part(13)
-        axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=-2)
-        return np.einsum("...i,...ij->...j", self._slot_part(first), axes)
-
-    def _contact_netforce(self) -> Float[Array, "env pair 3"]:
-        return np.stack([self.batch.sensordata[:, part.start + 1 : part.start + 4] for part in self._nets], axis=1)
-
 
 _READERS: dict[str, Callable[[BatchSimulation], Array]] = {
     "body_pos": BatchSimulation._body_pos,
     "body_quat": BatchSimulation._body_quat,
     "body_linvel": BatchSimulation._body_linvel,
     "body_angvel": BatchSimulation._body_angvel,
-    "contact_found": BatchSimulation._contact_found,
-    "contact_pos": lambda sim: sim._slot_part(7),
-    "contact_force": lambda sim: sim._in_world(1),
-    "contact_torque": lambda sim: sim._in_world(4),
-    "contact_normal": lambda sim: sim._slot_part(10),
-    "contact_netforce": BatchSimulation._contact_netforce,
     "variant": lambda sim: _present(sim._objects).variant,
     "object_size": lambda sim: _present(sim._objects).object_size,
 }
