@@ -7,6 +7,7 @@ import torch
 from warp_cases import warp
 
 import tgdsl
+from tgdsl.compiler.usd_export import export_usd
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.plan import ContactPart
 
@@ -35,22 +36,24 @@ MUG = """
 MODELS = ("mujoco", "warp")
 
 
-def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", **document):
+def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", as_usd=False):
     """Return a module of a pad of 6 × 6 taxels under some bodies."""
     (folder / "scene.xml").write_text(
         f'<mujoco><option timestep=".002"/>{extra}<worldbody><body name="pad"><geom name="pad" type="box" size=".06 .06 .01"/>'
         f"</body>{bodies}</worldbody></mujoco>"
     )
+    model = folder / ("scene.usda" if as_usd else "scene.xml")
+    if as_usd:
+        export_usd(folder / "scene.xml", model)
     line = np.linspace(-0.025, 0.025, 6)
     points = [{"pos": [float(x), float(y), 0.01], "normal": [0, 0, 1], "radius": 0.004} for x in line for y in line]
     layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}
     return tgdsl.compile(
         {
             "tgdsl": 1,
-            "robot": {"model": str(folder / "scene.xml"), "layout": layout},
+            "robot": {"model": str(model), "layout": layout},
             "objects": objects,
             "sensors": {name: {"links": "pad", **sensor} for name, sensor in sensors.items()},
-            **document,
         },
         dtype=dtype,
     )
@@ -233,6 +236,14 @@ def test_what_is_welded_to_an_objects_body_is_part_of_it(tmp_path, which, name):
     for kind in of_kinds([]):
         assert -float(readings[kind][0, :, 2].sum()) == pytest.approx(LOAD, rel=RESTING)
     assert ((readings["depth"][0, :, 0] > 0) == (outside + inside < 0.004)).all()
+
+
+def test_a_stage_with_fixed_joints_is_welded_as_well(tmp_path):
+    """The same mug as USD, where the handle is a rigid body on a fixed joint: it stands on the pad with its weight."""
+    text = MUG.format(z=40, name='name="handle"')
+    touch = compiled(tmp_path, text, {"mug": {"body": "mug"}}, of_kinds(["mug"]), as_usd=True)
+    assert touch.inputs.contacts_of == {"mug": (ContactPart("subtree", "mug"),)}
+    assert pressed(touch, "mujoco") == {name: pytest.approx(LOAD, rel=RESTING) for name in of_kinds([])}
 
 
 @pytest.mark.parametrize("which", MODELS)

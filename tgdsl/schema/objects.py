@@ -93,7 +93,8 @@ class ObjectSpec(SpecModel):
     name, is added to the scene. Bodies below it that have no joint are part of it, unless they are objects themselves; what is
     fixed to the world is no part of `world`."""
     geom: Variant | None = None
-    """Geom that the body has instead of its own, and of those of bodies that are part of it. What else the scene says of the body's first geom, such as friction, stays."""
+    """Geom that the body has instead of its own, and of those of bodies that are part of it. What else the scene says of the
+    body's first geom, such as friction, stays."""
     variants: Annotated[tuple[Variant, ...], Field(min_length=1)] | None = None
     """The same, of which each environment takes one: see `SceneState.variant`."""
     size: Literal["fixed", "per_env"] = "fixed"
