@@ -34,6 +34,7 @@ from tgdsl.reading import joined_signal, read
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
 
@@ -106,6 +107,7 @@ class TactileModule(nn.Module):
         self._graphed: Graphed | None = None
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
 
     @property
     def inputs(self) -> Inputs:
@@ -175,6 +177,9 @@ class TactileModule(nn.Module):
         tensors = state.checked(self.inputs, device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
             raise StateError(f"this module holds the state of {held} environments, the scene has {num_envs}")

@@ -17,7 +17,8 @@ Options, all off by default, in this order:
 
 with f_c the solver's forces on the body at its contacts c with the sensor's objects and m_c their normals: the taxels then
 press with what the solver presses with. Where Σ_j f_n,j is not positive there is nothing to scale: the body's taxels read
-zero, and the solver's force is not carried. Of contacts beyond `slots` nothing is known. `force_taxel` shares out forces.
+zero, and the solver's force is not carried. What contacts beyond `slots` carry acts at the centre of the others, and counts.
+`force_taxel` shares out forces.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 
@@ -71,7 +72,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     balance: Literal["none", "solver"] = "none"
     """`solver` scales a body's taxels so that they press with the solver's normal force; `none` as in the paper."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that `balance` counts [1]."""
+    """Contacts per pair of body and object whose normals `balance` takes [1]."""
 
     @model_validator(mode="after")
     def _is_used(self) -> KinematicTaxelSpec:

@@ -316,5 +316,6 @@ class WarpSimulation:
 
     def _finish_step(self) -> None:
         self._worlds.stepped()
+        self._touch.slot_watch.warn()
         if self._worlds.faults.have_shown():
             self.check()
