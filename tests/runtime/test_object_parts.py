@@ -8,8 +8,9 @@ from warp_cases import warp
 
 import tgdsl
 from tgdsl.compiler.usd_export import export_usd
-from tgdsl.errors import SimulationError, SpecError
+from tgdsl.errors import RobotError, SimulationError, SpecError
 from tgdsl.plan import ContactPart
+from tgdsl.runtime.batch import BatchSimulation
 
 G = 9.81
 LOAD = 0.3 * G
@@ -120,6 +121,27 @@ def test_two_objects_of_one_body_share_what_warp_finds_of_it_only_where_they_are
     assert found == {"low": pytest.approx(LOAD, rel=RESTING), "high": 0, "whole": found["low"]}
 
 
+def test_a_model_of_ones_own_is_given_the_parts_sensors(tmp_path):
+    """Instrumented with what a kept plan wants, it reads what the artefact's scene reads; a geom that it lacks is named."""
+    objects = {name: {"body": "item", "surface": name} for name in ("low", "high")}
+    sensors = {name: {"kind": "force_taxel", "feels": [name]} for name in objects}
+    tgdsl.save(compiled(tmp_path, TWO_GEOMS, objects, sensors), tmp_path / "module.safetensors")
+    touch = tgdsl.load(tmp_path / "module.safetensors", dtype=torch.float64)
+    assert touch.inputs.parts_of("low") == (ContactPart("geom", "low"),)
+    assert "contacts with low are those on geom low" in touch.explain()
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
+    sim = BatchSimulation(touch, 1, substeps=250, model=tgdsl.instrument(spec, touch.inputs).compile())
+    sim.step()
+    readings = touch(sim.state())
+    assert -float(readings["low"][0, :, 2].sum()) == pytest.approx(LOAD, rel=RESTING) and not readings["high"].any()
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
+    spec.geom("high").name = "top"
+    with pytest.raises(RobotError, match='this model has no geom "high", which the module wants contacts of'):
+        tgdsl.instrument(spec, touch.inputs)
+    with pytest.raises(SimulationError, match='the scene has no geom "high"'):
+        warp(touch, 1, model=spec.compile())
+
+
 def test_surfaces_that_overlap_cannot_be_counted_once(tmp_path):
     """Geoms a, b and b, c: no way to take both forces and b's once; of sensors apart, each has its own."""
     body = TWO_GEOMS.replace("</body>", '<geom name="mid" type="box" size=".02 .02 .021" mass="0"/></body>')
@@ -207,7 +229,7 @@ def test_a_sensor_that_does_not_say_how_far_is_refused(tmp_path):
     touch = compiled(tmp_path, GAPPED.format(z=".032", more='gap=".005"'), {"item": {"body": "item"}}, of_kinds(["item"]))
     text = touch.plan.scene.mjcf.replace("torque dist pos", "torque pos")
     with pytest.raises(SimulationError, match='the contact sensor "tgdsl/contact/pad/item" does not show dist; add them with'):
-        tgdsl.runtime.batch.BatchSimulation(touch, 1, model=mujoco.MjModel.from_xml_string(text))
+        BatchSimulation(touch, 1, model=mujoco.MjModel.from_xml_string(text))
 
 
 # Bodies welded of bodies
