@@ -201,6 +201,19 @@ def test_a_gap_is_no_contact(tmp_path, which, slots):
 
 
 @pytest.mark.parametrize("which", MODELS)
+def test_a_gap_of_two_geoms_alone_is_none_either(tmp_path, which):
+    """MuJoCo may be told of a gap for one pair of geoms: 2 mm above the pad nothing is in contact."""
+    extra = '<contact><pair geom1="pad" geom2="item" gap=".005"/></contact>'
+    sensors = {"depth": {"kind": "contact_depth", "feels": ["item"]}}
+    touch = compiled(tmp_path, GAPPED.format(z=".032", more=""), {"item": {"body": "item"}}, sensors, extra=extra)
+    sim = simulated(touch, which)
+    data = mujoco.MjData(sim.model)
+    mujoco.mj_forward(sim.model, data)
+    assert data.ncon == 4 and all(contact.exclude for contact in data.contact)
+    assert not sim.state().contact_found.any()
+
+
+@pytest.mark.parametrize("which", MODELS)
 def test_a_margin_is_a_contact(tmp_path, which):
     """Within the margin the solver pushes: 1 mm above the pad, with a margin of 3 mm and a gap of 5, there is a force."""
     body = GAPPED.format(z=".031", more='gap=".005" margin=".003"')
