@@ -47,8 +47,8 @@ class SlotWatch:
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
             wanted = found.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
-            wanted = torch.where(lacking > TOLERANCE * size, wanted, 0.0).amax(dim=0)
-            torch.maximum(self._wanted, wanted, out=self._wanted)
+            wanted = torch.where(lacking > TOLERANCE * size, wanted, 0.0)
+            self._wanted.copy_(torch.cat([self._wanted[None], wanted]).amax(dim=0))
 
     def warn(self) -> None:
         """Warn of what has been noted. A GPU is not waited for: what it notes may be seen a call or more later."""

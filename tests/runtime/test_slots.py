@@ -133,6 +133,11 @@ def test_anyones_own_state_is_looked_at_too(tmp_path, found, advice):
         touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -2], found))
 
 
+def test_no_environments_lack_nothing(tmp_path):
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    assert all(len(reading) == 0 for reading in touch(touch.example_state(0)).values())
+
+
 def test_each_pair_is_told_of_once(tmp_path):
     """Two pairs, the second later: two warnings, and then none, also for a module that is compiled."""
     objects = {"item": {"body": "item"}, "other": {"body": "other"}}
