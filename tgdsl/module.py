@@ -35,6 +35,7 @@ from tgdsl.selection import EnvIds, env_mask
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
 
@@ -103,6 +104,7 @@ class TactileModule(nn.Module):
         self._graphed: dict[str, Graphed] = {}
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
 
     @property
     def inputs(self) -> Inputs:
@@ -221,6 +223,9 @@ class TactileModule(nn.Module):
         tensors = state.checked(self.inputs, self.device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
             held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"

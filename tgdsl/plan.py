@@ -46,7 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 9
+FORMAT = 10
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -63,6 +63,14 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class ContactPart:
+    """Geoms whose contacts are an object's: those of a body, those of a body and of all bodies below it, or a single one."""
+
+    kind: Literal["body", "subtree", "geom"]
+    name: str
+
+
+@dataclass(frozen=True)
 class Inputs:
     """What a module wants of a scene, and in which order.
 
@@ -74,6 +82,7 @@ class Inputs:
         slots: Contacts per pair of the slotted contact fields; 0 if none is read.
         objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
         num_variants: How many variants each of these objects has; 1 if only its size differs.
+        contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
     """
 
     fields: tuple[str, ...]
@@ -83,6 +92,11 @@ class Inputs:
     slots: int
     objects: tuple[str, ...] = ()
     num_variants: tuple[int, ...] = ()
+    contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
+
+    def parts_of(self, name: str) -> tuple[ContactPart, ...]:
+        """Return the geoms whose contacts are an object's; no geom is in two of its parts."""
+        return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
 
 
 @dataclass(frozen=True)
@@ -366,6 +380,7 @@ class SceneObject:
         types: MuJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs.
         variants: Which of these geoms each variant has, and how; None where it lacks one.
         is_sized: Whether the size of its geom is chosen per environment.
+        others: Bodies that are other objects: they keep their geoms where they are welded to its body.
     """
 
     name: str
@@ -373,6 +388,7 @@ class SceneObject:
     types: tuple[str, ...]
     variants: tuple[tuple[SceneGeom | None, ...], ...]
     is_sized: bool
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -503,6 +519,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def contact_sensor_names(pair: Pair) -> tuple[str, str]:
-    """Return the names of the contact sensors of a pair: its point slots, and its net force."""
-    return f"tgdsl/contact/{pair.link}/{pair.object}", f"tgdsl/netforce/{pair.link}/{pair.object}"
+def contact_sensor_names(pair: Pair, part: int = 0) -> tuple[str, str]:
+    """Return the names of the contact sensors of a pair and a part of its object: the point slots, and the net force."""
+    end = f"{pair.link}/{pair.object}" + (f"/{part}" if part else "")
+    return f"tgdsl/contact/{end}", f"tgdsl/netforce/{end}"

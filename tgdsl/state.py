@@ -40,17 +40,22 @@ class SceneState:
     All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
     dtype and then cast, so that far from the origin nothing is lost.
 
+    A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
+    `contact_found` gates included. A slot is unused where force, torque and normal are all zero; where it is then does not
+    matter. A force whose normal is zero acts like any other, and what needs that normal is read as not-a-number.
+
     Attributes:
         body_pos: Position of each body's frame [m].
         body_quat: Orientation of each body, w, x, y, z.
         body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
         body_angvel: Angular velocity of the body [rad/s].
-        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive.
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive, as that
+            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`.
         contact_pos: Contact points [m].
         contact_force: Force on the link at each point [N].
         contact_torque: Torque on the link at each point [N·m].
         contact_normal: Unit normal out of the object at each point.
-        contact_netforce: The pair's whole force on the link [N].
+        contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
         variant: Which of its variants each object has, from 0; 0 for one that has none.
         object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
         dt: Time since the last state [s].

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from tgdsl import observations
 from tgdsl.compiler import passes
-from tgdsl.compiler.felt import settle
+from tgdsl.compiler.felt import contact_parts, settle
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.moment_tables import moment_tables
 from tgdsl.compiler.passes import Draft, DraftQuery, DraftSensor
@@ -93,6 +94,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
+    _settle_contacts(loaded, work)
     _settle(loaded, work)
     _settle_moments(loaded, work)
     _settle_points(loaded, resolved, work)
@@ -118,6 +120,23 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         arrays={name: _frozen(arrays[name]) for name in sorted(arrays)},
         scene=SceneFile("", {}, ()),
     )
+
+
+def _settle_contacts(loaded: Loaded, work: Draft) -> None:
+    """Decide which geoms' contacts are an object's; what cannot be told apart is a mistake."""
+    for name in sorted({pair.object for pair in work.gated}):
+
+        def report(what: str, hint: str, at: Path = ("objects", name, "surface")) -> None:
+            loaded.problems.append(loaded.problem(at, what, hint))
+
+        work.contacts_of[name] = contact_parts(work.scene, work.objects[name], report)
+    for sensor in (sensor for sensor in work.sensors if "contacts" in sensor.lowered.needs):
+        for (_, first), (i, second) in itertools.combinations(enumerate(sensor.feels), 2):
+            one, two = work.objects[first].touched, work.objects[second].touched
+            if one & two and not (one <= two or two <= one):
+                what = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
+                path: Path = ("sensors", sensor.sensor, "feels", i)
+                loaded.problems.append(loaded.problem(path, what, "give each a sensor of its own, or surfaces apart"))
 
 
 def _settle(loaded: Loaded, work: Draft) -> None:

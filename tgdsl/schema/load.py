@@ -224,6 +224,8 @@ def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
             if objects is not None and target not in objects:
                 hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
+            elif target in sensor.feels[:i]:
+                problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
         problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
     for group in names("observations") or []:
         terms = source.get(("observations", group))

@@ -276,6 +276,7 @@ class WarpSimulation(Simulation):
         self._worlds.stepped(is_evaluated)
         if self._lane.is_capturing:
             return
+        self._touch.slot_watch.warn()
         to_raise, totals = self._worlds.faults.shown()
         if to_raise:
             self.check()
