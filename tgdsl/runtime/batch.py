@@ -18,6 +18,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, listed
 from tgdsl.module import TactileModule
 from tgdsl.runtime.controls import control_tensor, refuse_unfinite
+from tgdsl.runtime.joints import JointPlaces, KeptJoints
 from tgdsl.runtime.lookup import body_id, contact_sensor, env_indices, keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.source import EnvIds
@@ -35,7 +36,8 @@ class BatchSimulation:
     """Environments in MuJoCo's `Batch`, read by one module.
 
     Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
-    start of the last substep, and so is the state. After `reset` they are those of the start.
+    start of the last substep, and so is the state, its joints included: `batch.qpos` is a substep later. After `reset` they are
+    those of the start.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
@@ -91,7 +93,8 @@ class BatchSimulation:
         nets = touch.inputs.pairs if "contact_netforce" in touch.inputs.fields else ()
         self._nets = [contact_sensor(model, pair, 1) for pair in nets]
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
-        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
+        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name in _READERS}
+        self._joints = KeptJoints(JointPlaces.of(touch.inputs, model), self.batch)
         for name in _DERIVED:
             self.batch.bind(name)  # an array is filled only by calls that come after its first use
         if self._objects is not None:
@@ -154,6 +157,7 @@ class BatchSimulation:
         ids = np.unique(env_indices(env_ids, self.num_envs))  # MuJoCo takes them in ascending order, each once
         if len(ids):
             self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
+            self._joints.keep(ids)
             self._touch.reset(torch.from_numpy(ids))
 
     def set_objects(
@@ -200,6 +204,11 @@ class BatchSimulation:
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
+        if self._joints.is_wanted:
+            if num_steps > 1:
+                self._run(lambda: self.batch.step(nstep=num_steps - 1))
+            self._joints.keep()
+            num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
         diverged = np.flatnonzero(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1))
         if len(diverged):
@@ -208,8 +217,9 @@ class BatchSimulation:
 
     def _state(self, dt: float) -> SceneState:
         values: dict[str, Any] = {}
-        for name, reader in self._readers.items():
-            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
+        arrays = {name: np.ascontiguousarray(reader(self)) for name, reader in self._readers.items()} | self._joints.read()
+        for name, array in arrays.items():
+            values[name] = torch.from_numpy(array).to(self._touch.device)
         if "dt" in self._touch.inputs.fields:
             values["dt"] = dt
         return SceneState(**values)
