@@ -91,6 +91,7 @@ class Connection:
         observe: Callable[[], dict[str, Float[Tensor, "env feature"]]],
         *,
         control: Callable[[Control], Control] = lambda control: control,
+        note: Callable[[Control], None] = lambda control: None,
         forget: Callable[[], None] = lambda: None,
         close: Callable[[], None] = lambda: None,
     ):
@@ -100,11 +101,12 @@ class Connection:
             source: The source.
             observe: Returns the observation groups of this instant.
             control: From controls in the order of the model's actuators to those of the source.
+            note: Takes note of the controls of a step that was made.
             forget: Forgets past observations; called with a reset.
             close: Lets go of the source.
         """
         self.source = source
-        self._observe, self._control, self._forget, self._close = observe, control, forget, close
+        self._observe, self._control, self._note, self._forget, self._close = observe, control, note, forget, close
         self._groups: dict[str, Tensor] | None = None
         self._is_read = True
 
@@ -136,6 +138,7 @@ class Connection:
         """
         self._groups, self._is_read = None, False
         self.source.step(self._control(control))
+        self._note(control)
         self._is_read = True
 
     def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
@@ -308,7 +311,7 @@ def _replay(
     source = ReplaySource(path, control_step=control_step, speed=speed, calibration=calibration)
     with ExitStack() as opened:
         opened.callback(source.close)
-        observer = HandObserver(touch, source.calibration, control_step)
+        observer = HandObserver(touch, source.calibration, control_step, is_log=True)
         warn_of_noise(touch.plan)
         opened.pop_all()
     return _hand_connection(source, observer, lambda control: None)
@@ -316,7 +319,12 @@ def _replay(
 
 def _hand_connection(source: HandSteps, observer: HandObserver, control: Callable[[Control], Control]) -> Connection:
     return Connection(
-        source, lambda: observer.observe(source.sample()), control=control, forget=observer.reset, close=source.close
+        source,
+        lambda: observer.observe(source.sample()),
+        control=control,
+        note=observer.note,
+        forget=observer.reset,
+        close=source.close,
     )
 
 
