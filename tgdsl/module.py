@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from tgdsl import observations
 from tgdsl.buffers import Constants, check_dtype
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
@@ -28,6 +27,7 @@ from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
 from tgdsl.history import last_step, pushed, reduced
 from tgdsl.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.observing import ObservationTerm, observation_terms, observe
 from tgdsl.plan import Inputs, Plan
 from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
@@ -45,7 +45,8 @@ class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
-    "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    "taxel"), or the bodies that carry it ("body"), which `bodies` lists. A reading that no sensor makes has its own name for
+    sensor and kind; its rows are those of `inputs.joints` ("joint") or `inputs.actuators` ("actuator").
     """
 
     name: str
@@ -114,7 +115,7 @@ class TactileModule(nn.Module):
     @property
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading."""
-        return tuple(
+        sensed = tuple(
             Output(
                 reading.name,
                 sensor.sensor,
@@ -128,6 +129,15 @@ class TactileModule(nn.Module):
             for sensor in self.plan.sensors
             for reading in sensor.readings
         )
+        return sensed + tuple(
+            Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
+            for r in self.plan.proprioception
+        )
+
+    @property
+    def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
+        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        return observation_terms(self.plan)
 
     @property
     def taxels(self) -> dict[str, Any]:
@@ -258,7 +268,7 @@ class TactileModule(nn.Module):
         if self._graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
             call = self._graphed[name]
         found = call(tensors, memory)
-        return {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
+        return {name: found[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
@@ -323,28 +333,17 @@ class TactileModule(nn.Module):
                 updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
                 found[reading.name] = reduced(updated[path], sensor.history.reduce)
             readings |= found
+        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
 
         Raises:
-            ObservationError: If an observation is one that only the real hand has.
+            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
         """
-        num_envs = next(iter(readings.values())).shape[0]
-        nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
-        groups: dict[str, list[Tensor]] = {}
-        for term in self.plan.observations:
-            features = nothing
-            if term.type in observations.HAND_ONLY:
-                raise observations.hand_only_error(term.group, term.index, term.type)
-            if term.reading is not None:
-                constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-                reading = readings[term.reading]
-                steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-                features = torch.cat([observations.observe(term.type, step, term.channels, constants) for step in steps], dim=1)
-            groups.setdefault(term.group, []).append(features)
-        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+        return observe(self.plan, self.constants, readings)
 
     def images(
         self, name: str, readings: Mapping[str, Tensor]
