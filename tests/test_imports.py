@@ -21,6 +21,7 @@ FLOORS = {
         "memory",
         "felt_objects",
         "taxels",
+        "env_ids",
         "example",
         "state",
         "scene",
@@ -28,7 +29,7 @@ FLOORS = {
         "explain",
     },
     2: {"sensors", "observations", "layout", "plan"},
-    1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "errors"},
+    1: {"geometry", "devices", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}
 EXEMPT = {

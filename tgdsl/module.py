@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from tgdsl import observations
 from tgdsl.buffers import Constants
+from tgdsl.env_ids import EnvIds, env_mask
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
 from tgdsl.fusion import of_its_own
@@ -169,6 +170,9 @@ class TactileModule(nn.Module):
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
             TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
         """
+        if not isinstance(state, SceneState):
+            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
+            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(self.inputs.fields)}")
         dtype, device = self.dtype, self.device
         if dtype == torch.float16:
             raise TgdslError("this module is of torch.float16, whose range is too small: touch.to(torch.float32), or bfloat16")
@@ -275,23 +279,23 @@ class TactileModule(nn.Module):
             images[link] = torch.where(masks[link], by_channel[:, :, place.clamp(min=0)], 0.0)
         return images, masks
 
-    def reset(self, env_ids: Tensor | Sequence[int] | None = None) -> None:
+    def reset(self, env_ids: EnvIds | None = None) -> None:
         """Begin a new episode in some environments (default: all); the others are left untouched.
 
         State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
         per episode are drawn anew.
 
         Args:
-            env_ids: Indices, or a boolean mask over environments.
+            env_ids: Indices, or a boolean mask over environments. Indices that lie on a GPU are not looked at, as that would
+                wait for it: there the kernel asserts.
+
+        Raises:
+            StateError: If there are no such environments.
         """
         if self.num_envs is None:
             return  # nothing is held yet, and the first call begins an episode
         with torch.no_grad():
-            chosen = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-            if env_ids is not None:
-                ids = torch.as_tensor(env_ids, device=self.device)
-                chosen = torch.zeros_like(chosen)
-                chosen[ids if ids.numel() else ids.long()] = True  # an empty list has no integers to tell its dtype by
+            chosen = env_mask(env_ids, self.num_envs, self.device, StateError, waits=False)
             self.memory.reset(chosen)
             for history in self.histories.values():
                 history.reset(chosen)  # type: ignore[operator]
@@ -303,12 +307,15 @@ class TactileModule(nn.Module):
         sensors or environments, the batch size, the device or the process.
 
         Args:
-            seed: Any integer.
+            seed: Any integer; those that differ by a multiple of 2⁶⁴ are the same.
             first_env: Number of this module's first environment among those of all processes; default: where torch runs
                 distributed, the process's rank times the number of its environments, else 0.
 
         Returns:
             The module.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is none that an environment can have.
         """
         self.memory.clock.seed_with(seed, first_env)
         return self

@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds, env_indices
 from tgdsl.errors import SimulationError, listed
 from tgdsl.module import TactileModule
 from tgdsl.runtime.controls import control_tensor, refuse_unfinite
-from tgdsl.runtime.lookup import body_id, contact_sensor, env_indices, keyframe_id
+from tgdsl.runtime.lookup import body_id, contact_sensor, keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
-from tgdsl.runtime.source import EnvIds
+from tgdsl.runtime.room import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
@@ -66,8 +67,8 @@ class BatchSimulation:
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, or if there
-                is nothing to step.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
+                bodies may sleep, if there is nothing to step, or more environments than this computer has memory for.
         """
         if num_envs < 1 or substeps < 1:
             raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
@@ -82,6 +83,10 @@ class BatchSimulation:
         self.model: mujoco.MjModel = model
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
+        if self.model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+            raise SimulationError(f'{what}; take <flag sleep="enable"/> out of its <option>')
+        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.substeps = substeps
         self._touch = touch
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)

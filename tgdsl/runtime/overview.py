@@ -16,6 +16,7 @@ from tgdsl.module import TactileModule
 from tgdsl.runtime.dots import Dots, dots_of
 from tgdsl.runtime.source import Simulator
 from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
+from tgdsl.schema.files import whole, writable
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -44,10 +45,11 @@ def overview(
 
     Raises:
         ViewError: If there is no such environment, or nothing to draw.
+        FileError: If the file cannot be written.
     """
     figure = drawing(touch, sim, readings, env=env, title=title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with whole(writable(path)) as file:
+        figure.savefig(file, format="png")
     return path
 
 

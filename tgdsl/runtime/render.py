@@ -22,7 +22,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from tgdsl.errors import did_you_mean
+from tgdsl.errors import FileError, did_you_mean
 from tgdsl.layout import Layout
 from tgdsl.runtime.discs import discs, group_of, legend, radii, taxels_of
 from tgdsl.runtime.dots import Pose, Taxels
@@ -42,6 +42,7 @@ from tgdsl.runtime.shot import (
     unit,
 )
 from tgdsl.runtime.view import FAINT, INK, ViewError, draw_ruler
+from tgdsl.schema.files import whole, writable
 
 Array = np.ndarray
 VIEWS = {"front": (6.0, 16.0), "back": (186.0, 16.0), "left": (-70.0, 10.0), "right": (70.0, 10.0), "iso": (36.0, 32.0)}
@@ -83,12 +84,13 @@ def render(
     Raises:
         ViewError: If there is no such keyframe or view, if there is nothing to draw, or if the file cannot be written.
     """
-    figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, format="png", pil_kwargs={"optimize": True})
-    except OSError as error:
-        raise ViewError(f"cannot write {out}: {error.strerror or error}") from error
+        writable(out)
+        figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
+        with whole(out) as file:
+            figure.savefig(file, format="png", pil_kwargs={"optimize": True})
+    except FileError as error:
+        raise ViewError(f"cannot write {error}") from error
     return out
 
 

@@ -5,8 +5,7 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` 
 
 from __future__ import annotations
 
-import os
-import tempfile
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,7 +19,9 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module import TactileModule
+from tgdsl.runtime.room import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
+from tgdsl.schema.files import whole
 
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
@@ -117,8 +118,14 @@ class Recorder:
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
-        """Make room for a rollout."""
+        """Make room for a rollout.
+
+        Raises:
+            SimulationError: If this computer has too little memory.
+        """
         self._outputs = touch.outputs
+        size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
+        refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)
         self._readings = {
             output.name: np.empty((num_steps, num_envs, *output.shape), dtype=np.float32) for output in self._outputs
         }
@@ -136,12 +143,5 @@ class Recorder:
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)
             arrays[f"{output.name}:units"] = np.array(output.units)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with whole(path) as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

@@ -32,6 +32,7 @@ from tgdsl.runtime.shot import (
     unit,
 )
 from tgdsl.runtime.source import Simulator
+from tgdsl.schema.files import whole, writable
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
@@ -74,6 +75,7 @@ def picture(
 
     Raises:
         ViewError: If there is no such reading or environment.
+        FileError: If the file cannot be written.
     """
     output = chosen_output(touch, readings, reading)
     if not 0 <= env < sim.num_envs:
@@ -92,8 +94,8 @@ def picture(
     parts += [output.kind, f"resolution {resolution}"] if resolution else [output.kind]
     parts += [f"{dots.is_read.sum()} of {len(table)} taxels touched", f"{dots.quantity} {dots.summary()}", f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with whole(writable(path)) as file:
+        figure.savefig(file, format="png")
     return path
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import tgdsl
+from tgdsl.errors import FileError
 
 _PACKAGE = Path(tgdsl.__file__).parent
 
@@ -48,16 +52,70 @@ def layout_file(model: Path) -> Path | None:
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
 
 
-def write_whole(target: Path, content: bytes) -> None:
-    """Write a file so that it appears whole or not at all; one that is there is replaced."""
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+def writable(target: Path) -> Path:
+    """Make the folder of a file that is to be written later, and see that it can be; what is there is left as it is.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    with _named(target):
+        in_the_way = next((part for part in target.parents if part.exists() and not part.is_dir()), None)
+        if in_the_way is not None:
+            raise FileError(f"{target}: {in_the_way} is a file, expected a folder")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _refuse_folder(target)
+        with tempfile.TemporaryFile(dir=target.parent):
+            return target
+
+
+@contextmanager
+def whole(target: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing that appears whole, when it is closed, or not at all; one that is there is replaced.
+
+    Raises:
+        FileError: If it cannot be written; the error names the file.
+    """
+    temporary = None
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        with _named(target):
+            _refuse_folder(target)
+            handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+            with os.fdopen(handle, "wb") as file:
+                yield file
+            umask = os.umask(0)
+            os.umask(umask)
+            os.chmod(temporary, 0o666 & ~umask)
+            os.replace(temporary, target)
+            temporary = None
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def write_whole(target: Path, content: bytes) -> None:
+    """Write a file so that it appears whole or not at all; one that is there is replaced.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    with whole(target) as file:
+        file.write(content)
+
+
+@contextmanager
+def _named(target: Path) -> Iterator[None]:
+    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile."""
+    try:
+        yield
+    except FileError:
         raise
+    except OSError as error:
+        raise FileError(f"{target}: {error.strerror or error}") from error
+
+
+def _refuse_folder(target: Path) -> None:
+    if target.is_dir():
+        raise FileError(f"{target}: this is a folder, expected a file's name")

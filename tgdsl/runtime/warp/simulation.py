@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds, env_indices, env_mask
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
-from tgdsl.runtime.lookup import env_indices, env_mask, keyframe_id
+from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import Values
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.warp.lane import Lane, Replay
 from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
