@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tgdsl.errors import TgdslError
-from tgdsl.schema.files import writable, write_whole
+from tgdsl.schema.files import with_folder, writable, write_whole
 
 if TYPE_CHECKING:
     from tgdsl.runtime.xhand1.calibration import Calibration
@@ -118,7 +118,7 @@ class TareHand:
         if spreads:
             what = f"the fingertips were not still over {self.frames} readings: {', '.join(spreads)} counts"
             raise TgdslError(f"{what}, expected at most {self.max_spread:g}; leave the hand untouched, or see --max-spread")
-        write_whole(self.out, base.with_tare(tare).text().encode())
+        write_whole(with_folder(self.out), base.with_tare(tare).text().encode())
         for name, mean, spread in zip(FINGERS, tare.mean, tare.spread, strict=True):
             print(f"{name:<7} tare {mean[0]:7.2f} {mean[1]:7.2f} {mean[2]:7.2f}   spread {max(spread):g} counts")
         print(f"calibration: {self.out}")
@@ -154,10 +154,9 @@ class Record:
             raise TgdslError(f"--seconds {self.seconds:g}: expected more than 0")
         calibration, found = _calibration(self.calibration), the_hand(self.port, self.hand_id)
         identity = identify(found)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
         view = HandView(calibration, str(identity))
         with (
-            LogWriter(self.out, identity=identity, calibration=calibration) as log,
+            LogWriter(with_folder(self.out), identity=identity, calibration=calibration) as log,
             XHand1.open(found.device, found.addresses) as hand,
         ):
             try:
@@ -230,7 +229,7 @@ class Hand:
 
 
 def refuse_to_replace(out: Path, is_forced: bool) -> None:
-    """Raise an error if a file cannot be written, or is there and may not be replaced; its folder is made.
+    """Raise an error if a file cannot be written, or is there and may not be replaced.
 
     Raises:
         TgdslError: If so.

@@ -22,6 +22,7 @@ from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout import Layout
 from tgdsl.module import TactileModule
 from tgdsl.plan import Origin, Plan
+from tgdsl.progress import Progress, silent
 from tgdsl.scene import portable
 from tgdsl.schema.load import Loaded, load
 from tgdsl.sensors import Kind, known_kinds
@@ -33,6 +34,7 @@ def compile_plan(
     document: Document,
     overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
 ) -> Plan:
     """Return the Plan of a document.
 
@@ -40,15 +42,17 @@ def compile_plan(
         document: A YAML file, or the same as a mapping.
         overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
         kinds: Sensor kinds of your own, beside those of tgdsl.
+        progress: Is told in a line what is being done, each time that something begins.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
     """
-    known = known_kinds(kinds)
+    known, tell = known_kinds(kinds), progress or silent
     loaded = load(document, overrides, known)
-    resolved = resolve(loaded)
-    plan = lower.plan(loaded, resolved, known, _origin(loaded))
+    resolved = resolve(loaded, tell)
+    plan = lower.plan(loaded, resolved, known, _origin(loaded), tell)
+    tell("compiling the scene")
     return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
 
 
@@ -96,6 +100,7 @@ def compile(
     kinds: Sequence[Kind] = (),
     dtype: torch.dtype | str = torch.float32,
     device: torch.device | str = "cpu",
+    progress: Progress | None = None,
 ) -> TactileModule:
     """Compile a document to a module.
 
@@ -106,6 +111,8 @@ def compile(
         kinds: Sensor kinds of your own, beside those of tgdsl.
         dtype: Dtype of the readings, float32 or float64; its name will do.
         device: Where the module lives.
+        progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
+            that are met for the first time take seconds.
 
     Returns:
         The module, not yet compiled by torch: call its `compile()` for fused kernels.
@@ -117,7 +124,7 @@ def compile(
     """
     dtype, device = dtype_of(dtype), device_of(device)
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, chosen, kinds)
+    plan = compile_plan(document, chosen, kinds, progress)
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)
 
 

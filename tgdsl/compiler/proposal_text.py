@@ -12,7 +12,7 @@ from tgdsl import units
 from tgdsl.compiler.propose import FACTORS, LinkProposal, Proposal, escaped, propose
 from tgdsl.compiler.robot import Model
 from tgdsl.errors import TgdslError, listed
-from tgdsl.schema.files import writable, write_whole
+from tgdsl.schema.files import with_folder, writable, write_whole
 
 WIDTH = 120
 """Lists of names are broken at this column."""
@@ -58,7 +58,7 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     writable(out)
     proposal = propose(robot, per_area, with_groups)
-    write_whole(out, layout_text(proposal, robot.file.name).encode())
+    write_whole(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),

@@ -16,7 +16,7 @@ from tgdsl.module import TactileModule
 from tgdsl.runtime.dots import Dots, dots_of
 from tgdsl.runtime.source import Simulator
 from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
-from tgdsl.schema.files import whole, writable
+from tgdsl.schema.files import whole, with_folder
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -48,7 +48,7 @@ def overview(
         FileError: If the file cannot be written.
     """
     figure = drawing(touch, sim, readings, env=env, title=title)
-    with whole(writable(path)) as file:
+    with whole(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
 

@@ -42,7 +42,7 @@ from tgdsl.runtime.shot import (
     unit,
 )
 from tgdsl.runtime.view import FAINT, INK, ViewError, draw_ruler
-from tgdsl.schema.files import whole, writable
+from tgdsl.schema.files import whole, with_folder, writable
 
 Array = np.ndarray
 VIEWS = {"front": (6.0, 16.0), "back": (186.0, 16.0), "left": (-70.0, 10.0), "right": (70.0, 10.0), "iso": (36.0, 32.0)}
@@ -87,7 +87,7 @@ def render(
     try:
         writable(out)
         figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
-        with whole(out) as file:
+        with whole(with_folder(out)) as file:
             figure.savefig(file, format="png", pil_kwargs={"optimize": True})
     except FileError as error:
         raise ViewError(f"cannot write {error}") from error

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module import TactileModule
+from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.room import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
 from tgdsl.schema.files import whole
@@ -45,7 +46,8 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
         control_step: Duration of a control step [s].
 
     Raises:
-        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive.
+        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive, or takes more steps
+            than there is memory for.
     """
     if not keyframes or not 0 < seconds < np.inf:
         raise SimulationError(f"{len(keyframes)} keyframes held for {seconds:g} s: expected at least one, and more than 0 s")
@@ -53,7 +55,7 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     for name in keyframes:
         if name not in known:
             raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}')
-    steps = max(round(seconds / control_step), 1)
+    steps = _num_steps(model, seconds, control_step, 2 * len(keyframes) - 1)
     targets = [model.key_ctrl[model.key(name).id] for name in keyframes]
     parts = [np.tile(targets[0], (steps, 1))]
     for start, end in pairwise(targets):
@@ -77,18 +79,25 @@ def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) ->
         control_step: Duration of a control step [s].
 
     Raises:
-        SimulationError: If the duration is not positive.
+        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
     """
     if not 0 < seconds < np.inf:
         raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
-    return np.zeros((max(round(seconds / control_step), 1), model.nu))
+    return np.zeros((_num_steps(model, seconds, control_step), model.nu))
+
+
+def _num_steps(model: mujoco.MjModel, seconds: float, control_step: float, times: int = 1) -> int:
+    """Return how many control steps a duration has, at least one; controls of so many, `times` over, fit into memory."""
+    steps = max(round(seconds / control_step), 1)
+    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * model.nu)
+    return steps
 
 
 def recorded_controls(path: Path) -> Controls:
     """Return the array `ctrl` of an `.npz` file, (step, actuator) or (step, env, actuator).
 
     Raises:
-        SimulationError: If the file cannot be read or holds no such array.
+        SimulationError: If the file cannot be read or holds no such array, or a number in it is not finite.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -100,13 +109,25 @@ def recorded_controls(path: Path) -> Controls:
             f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, "
             "expected floats (step, actuator) or (step, env, actuator)"
         )
+    if len(bad := np.argwhere(~np.isfinite(controls))):
+        place = ", ".join(map(str, bad[0]))
+        more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise SimulationError(f"{path}: `ctrl[{place}]` is {controls[tuple(bad[0])]}{more}: expected finite numbers")
     return controls.astype(np.float64)
 
 
 def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
-    """Step a scene through controls and yield the readings after each control step."""
+    """Step a scene through controls and yield the readings after each control step.
+
+    Raises:
+        SimulationError: If the controls do not fit the scene, or a step fails: then it says which one, from 0.
+    """
+    control_tensor(controls[0], sim.num_envs, sim.model.nu)
     for index, control in enumerate(controls):
-        sim.step(control)
+        try:
+            sim.step(control)
+        except SimulationError as error:
+            raise SimulationError(f"control step {index} of {len(controls)}: {error}") from error
         yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
 
 

@@ -32,7 +32,7 @@ from tgdsl.runtime.shot import (
     unit,
 )
 from tgdsl.runtime.source import Simulator
-from tgdsl.schema.files import whole, writable
+from tgdsl.schema.files import whole, with_folder
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
@@ -94,7 +94,7 @@ def picture(
     parts += [output.kind, f"resolution {resolution}"] if resolution else [output.kind]
     parts += [f"{dots.is_read.sum()} of {len(table)} taxels touched", f"{dots.quantity} {dots.summary()}", f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
-    with whole(writable(path)) as file:
+    with whole(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
 

@@ -53,7 +53,7 @@ def layout_file(model: Path) -> Path | None:
 
 
 def writable(target: Path) -> Path:
-    """Make the folder of a file that is to be written later, and see that it can be; what is there is left as it is.
+    """See that a file can be written, before the work that leads to it; nothing is made, its folder neither.
 
     Returns:
         The file.
@@ -61,14 +61,24 @@ def writable(target: Path) -> Path:
     Raises:
         FileError: If it cannot be written.
     """
+    there = next(part for part in target.absolute().parents if part.exists())
+    if not there.is_dir():
+        raise FileError(f"{target}: {there} is a file, expected a folder")
     with _named(target):
-        in_the_way = next((part for part in target.parents if part.exists() and not part.is_dir()), None)
-        if in_the_way is not None:
-            raise FileError(f"{target}: {in_the_way} is a file, expected a folder")
-        target.parent.mkdir(parents=True, exist_ok=True)
         _refuse_folder(target)
-        with tempfile.TemporaryFile(dir=target.parent):
+        with tempfile.TemporaryFile(dir=there):
             return target
+
+
+def with_folder(target: Path) -> Path:
+    """Make the folder of a file that is written next; return the file.
+
+    Raises:
+        FileError: If it cannot be made.
+    """
+    with _named(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    return target
 
 
 @contextmanager
