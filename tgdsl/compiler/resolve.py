@@ -89,7 +89,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, FeltBody] = {}
     own = OwnObjects()
-    if robot is not None and loaded.layout is not None:
+    if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
         _check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
@@ -131,6 +131,17 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
         what = f'there is no file "{loaded.spec.scene.model}"'
         loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
     return robot, scene
+
+
+def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
+    """Return whether a layout is for another robot, which is then one mistake: none of its links is on this one."""
+    keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
+    if len(keys) < 2 or any(_matched(robot, key) for key in keys):
+        return False
+    what = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
+    hint = f"the layout has {listed(keys, 4)}; the robot has {listed([b for b in robot.bodies if b != 'world'], 4)}"
+    loaded.problems.append(loaded.problem(("robot", "layout"), what, hint))
+    return True
 
 
 def _names(robot: Model) -> list[list[str]]:
