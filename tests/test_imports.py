@@ -29,7 +29,7 @@ FLOORS = {
         "explain",
     },
     2: {"sensors", "observations", "layout", "plan"},
-    1: {"geometry", "devices", "progress", "units", "fields", "fusion", "graphed", "regions", "errors"},
+    1: {"geometry", "devices", "progress", "tables", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}
 EXEMPT = {

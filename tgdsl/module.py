@@ -36,6 +36,7 @@ from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.state import SceneState
+from tgdsl.tables import Outputs, TaxelTable, TaxelTables
 from tgdsl.taxels import image_indices, taxel_table
 
 
@@ -108,6 +109,11 @@ class TactileModule(nn.Module):
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
 
+    def __repr__(self) -> str:
+        layout, origin = self.plan.layout(), self.plan.origin
+        where = f"{layout.num_taxels} taxels on {len(layout.links)} links of {origin.robot.rpartition('/')[2]}"
+        return f"TactileModule({where} at resolution {origin.resolution}, {self.dtype}, {self.device})\n{self.outputs}"
+
     @property
     def inputs(self) -> Inputs:
         """What the module reads of a scene, and in which order."""
@@ -115,8 +121,8 @@ class TactileModule(nn.Module):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Name, shape, channels and units of each reading."""
-        return tuple(
+        """Name, shape, channels and units of each reading; a tuple that prints as a table."""
+        return Outputs(
             Output(
                 reading.name,
                 sensor.sensor,
@@ -132,9 +138,9 @@ class TactileModule(nn.Module):
         )
 
     @property
-    def taxels(self) -> dict[str, Any]:
+    def taxels(self) -> dict[str, TaxelTable]:
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
-        return {sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors}
+        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors})
 
     @property
     def dtype(self) -> torch.dtype:

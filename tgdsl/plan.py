@@ -45,6 +45,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
+from tgdsl.tables import listing, spelled
 
 FORMAT = 9
 """Version of the Plan; a reader refuses any other."""
@@ -83,6 +84,10 @@ class Inputs:
     slots: int
     objects: tuple[str, ...] = ()
     num_variants: tuple[int, ...] = ()
+
+    def __repr__(self) -> str:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return "Inputs\n" + listing((name, spelled(value)) for name, value in values.items() if value)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ from tgdsl.runtime.room import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
 from tgdsl.schema.files import whole
 
+PLACES = ("link", "body", "pos", "normal", "area")
+"""What is kept of each taxel, as `taxels.taxel_table` calls it."""
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
@@ -135,7 +137,9 @@ class Recorder:
     """Keeps the readings of a rollout and writes them as one `.npz` file.
 
     The file holds `time` (step,) [s], `ctrl` (step, …, actuator), each reading by its name (step, env, taxel, channel) as
-    float32, and its channels' names and units under `<name>:channels` and `<name>:units`.
+    float32, and its channels' names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under
+    `<name>:link`, `<name>:body`, `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings
+    of bodies there is `<name>:body` alone.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
@@ -144,7 +148,7 @@ class Recorder:
         Raises:
             SimulationError: If this computer has too little memory.
         """
-        self._outputs = touch.outputs
+        self._outputs, self._taxels = touch.outputs, touch.taxels
         size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
         refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)
         self._readings = {
@@ -164,5 +168,9 @@ class Recorder:
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)
             arrays[f"{output.name}:units"] = np.array(output.units)
+            if output.rows == "body":
+                arrays[f"{output.name}:body"] = np.array(output.bodies)
+            elif output.rows == "taxel":
+                arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
         with whole(path) as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
