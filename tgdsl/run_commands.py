@@ -45,14 +45,20 @@ class Run:
     """Folder for readings.npz, picture.png and, where there are several readings, overview.png."""
     compiled: bool = False
     """Fuse the module with torch.compile first."""
+    view: str | None = None
+    """From where the pictures are seen: front (what the taxels face), back, left, right, top (from beyond the fingertips),
+    bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of what is touched."""
     set: Overrides = ()
     """Override a value of the document, as in `--set resolution=high`; may be repeated."""
 
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
+        from tgdsl.runtime.cameras import angles_of
         from tgdsl.runtime.rollout import Recorder
         from tgdsl.schema.files import with_folder, writable
 
+        if self.view is not None:
+            angles_of(self.view)
         files = {name: writable(self.out / f"{name}.{ending}") for name, ending in _FILES.items()}
         with StatusLine() as progress:
             touch = module_of(self.document, self.set, progress)
@@ -108,10 +114,11 @@ class Run:
         with StatusLine() as progress:
             if any(output.rows == "taxel" for output in touch.outputs):
                 progress("drawing the picture")
-                drawn.append(f"picture:  {picture(touch, sim, readings, files['picture'])}")
+                drawn.append(f"picture:  {picture(touch, sim, readings, files['picture'], view=self.view)}")
             if len(touch.outputs) > 1 or all(output.rows == "body" for output in touch.outputs):
                 progress("drawing the overview")
-                drawn.append(f"overview: {overview(touch, sim, readings, files['overview'], title=self.document.stem)}")
+                path = overview(touch, sim, readings, files["overview"], title=self.document.stem, view=self.view)
+                drawn.append(f"overview: {path}")
         print("\n".join(drawn))
 
 
@@ -128,7 +135,7 @@ class Render:
     keyframe: str | None = None
     """Keyframe that gives the pose; default: the model's own initial state."""
     view: str = "front"
-    """From where: front (what the taxels face), back, left, right or iso."""
+    """From where: front (what the taxels face), back, left, right, top, bottom, iso, or AZIMUTH,ELEVATION in degrees."""
     size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
     """Pixels of the picture; default: 750 rows, and as many columns as the hand needs."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
