@@ -46,6 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
+from tgdsl.tables import listing, spelled
 
 FORMAT = 10
 """Version of the Plan; a reader refuses any other."""
@@ -102,6 +103,10 @@ class Inputs:
     def parts_of(self, name: str) -> tuple[ContactPart, ...]:
         """Return the geoms whose contacts are an object's; no geom is in two of its parts."""
         return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
+
+    def __repr__(self) -> str:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return "Inputs\n" + listing((name, spelled(value)) for name, value in values.items() if value)
 
 
 @dataclass(frozen=True)

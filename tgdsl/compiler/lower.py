@@ -30,6 +30,7 @@ from tgdsl.plan import (
     PlannedSensor,
     SceneFile,
 )
+from tgdsl.progress import Progress, silent
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
@@ -38,11 +39,12 @@ from tgdsl.sensors.base import Channel
 from tgdsl.sensors.noise.lower import LoweredNoise
 
 
-def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...]) -> Draft:
+def draft(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], progress: Progress = silent) -> Draft:
     """Lower every sensor of a document; nothing is shared or dropped yet."""
     by_name = {kind.name: kind for kind in kinds}
     sensors: list[DraftSensor] = []
     for name, spec in loaded.spec.sensors.items():
+        progress(f"lowering sensor {name}")
         try:
             sensors += _ways(loaded, resolved, name, by_name[spec.kind])  # type: ignore[attr-defined]
         except LowerError as error:
@@ -81,23 +83,30 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
     return ways
 
 
-def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin) -> Plan:
+def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Origin, progress: Progress = silent) -> Plan:
     """Return the Plan of a document, its scene still empty.
+
+    Args:
+        loaded: The document.
+        resolved: What it means on its robot.
+        kinds: The kinds that it may use.
+        origin: What it was made of.
+        progress: Is told what is done.
 
     Raises:
         SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
             should.
     """
-    work = draft(loaded, resolved, kinds)
+    work = draft(loaded, resolved, kinds, progress)
     for name, target in passes.prune(work):
         sensor = name.removesuffix("/clean")
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
     _settle_contacts(loaded, work)
-    _settle(loaded, work)
-    _settle_moments(loaded, work)
-    _settle_points(loaded, resolved, work)
+    _settle(loaded, work, progress)
+    _settle_moments(loaded, work, progress)
+    _settle_points(loaded, resolved, work, progress)
     loaded.raise_problems()
     passes.join(work)
     queries, answer_of = passes.share(work)
@@ -149,7 +158,7 @@ def _with_joints(inputs: Inputs, seen: Observed) -> Inputs:
     return dataclasses.replace(inputs, fields=tuple(fields), joints=seen.joints, actuators=seen.actuators)
 
 
-def _settle(loaded: Loaded, work: Draft) -> None:
+def _settle(loaded: Loaded, work: Draft, progress: Progress) -> None:
     """Decide how the distance to each geom is found; a mesh that no grid within its budget suits is a mistake."""
     for name, felt in work.objects.items():
         target = loaded.spec.objects[name]
@@ -157,14 +166,17 @@ def _settle(loaded: Loaded, work: Draft) -> None:
         if margin is None:
             continue
         try:
-            work.settled[name] = tuple(
-                tuple(settle(geom, target, margin, f"object {name}") for geom in geoms) for geoms in felt.variants
-            )
+            rows = []
+            for i, geoms in enumerate(felt.variants):
+                which = f" ({i + 1} of {len(felt.variants)} variants)" if len(felt.variants) > 1 else ""
+                progress(f"object {name}: distances{which}")
+                rows.append(tuple(settle(geom, target, margin, f"object {name}") for geom in geoms))
+            work.settled[name] = tuple(rows)
         except BakeError as error:
             loaded.problems.append(loaded.problem(("objects", name), str(error)))
 
 
-def _settle_moments(loaded: Loaded, work: Draft) -> None:
+def _settle_moments(loaded: Loaded, work: Draft, progress: Progress) -> None:
     """Compute the moments of objects beforehand; an object that has none, or too large ones, is a mistake."""
     for sensor in work.sensors:
         request = sensor.lowered.moments
@@ -176,6 +188,7 @@ def _settle_moments(loaded: Loaded, work: Draft) -> None:
             radii = sorted({float(r) for s in users for r in passes.reach_of(work, s) if r > 0})
             try:
                 if (request, name) not in work.moments and radii:
+                    progress(f"object {name}: moments of its surface")
                     work.moments[request, name] = moment_tables(work.objects[name], request, radii)
             except LowerError as error:
                 loaded.problems.append(loaded.problem((*path, *(["feels", i] if error.field else [])), error.what, error.hint))
@@ -185,7 +198,7 @@ def _settle_moments(loaded: Loaded, work: Draft) -> None:
             loaded.problems.append(loaded.problem(path, what, "give `reference_area`, or feel an object that is no plane"))
 
 
-def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft) -> None:
+def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft, progress: Progress) -> None:
     """Sample objects, and decide how distances to the links that they meet are found; what has no surface is a mistake."""
     for sensor in (sensor for sensor in work.sensors if sensor.lowered.points is not None):
         request, path = sensor.lowered.points, ("sensors", sensor.name)
@@ -193,12 +206,14 @@ def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft) -> None:
         for i, name in enumerate(sensor.feels):
             try:
                 if (request.num_points, name) not in work.clouds:
+                    progress(f"object {name}: points on its surface")
                     work.clouds[request.num_points, name] = cloud(work.objects[name], request.num_points)
             except LowerError as error:
                 loaded.problems.append(loaded.problem((*path, "feels", i), error.what, error.hint))
         for link in work.layout.take(sensor.taxels).links:
             if link.name in work.skins:
                 continue
+            progress(f"link {link.name}: distances")
             margin = _skin_margin(work, link)
             geoms = own_geoms(resolved, link.name)
             try:

@@ -14,15 +14,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from tgdsl.env_ids import EnvIds, env_indices
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch_reading import BatchReader
 from tgdsl.runtime.faults import DIVERGED, EnvFaults, OnFault
 from tgdsl.runtime.joint_fields import JointPlaces, KeptJoints
-from tgdsl.runtime.lookup import env_indices, keyframe_id
+from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
+from tgdsl.runtime.room import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene import SceneModels
@@ -72,8 +73,9 @@ class BatchSimulation(Simulation):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if there is
-                nothing to step, or if the module's state is another simulation's or of other environments.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
+                bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
+                module's state is another simulation's or of other environments.
         """
         refuse_unfit(touch, num_envs, substeps, model)
         self._objects: EnvObjects | None = None
@@ -84,6 +86,10 @@ class BatchSimulation(Simulation):
         self.model: mujoco.MjModel = model
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
+        if self.model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+            raise SimulationError(f'{what}; take <flag sleep="enable"/> out of its <option>')
+        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.substeps = substeps
         self._touch = touch
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.errors import HandError, ObservationError, SimulationError, TgdslError, listed
 from tgdsl.module import TactileModule
 from tgdsl.observations import HAND_ONLY, hand_only_error
 from tgdsl.runtime.batch import BatchSimulation, simulate
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
 from tgdsl.runtime.xhand1.driver import XHand1

@@ -9,8 +9,8 @@ from contextlib import ExitStack
 import numpy as np
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.errors import StateError
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.errors import HandError, MotionError, StaleReadingError
