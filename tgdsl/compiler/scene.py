@@ -8,48 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
-import numpy as np
 
+from tgdsl.compiler.compare import differing
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
-from tgdsl.errors import RobotError
+from tgdsl.errors import RobotError, listed
 from tgdsl.plan import SLOT_FIELDS, Asset, Inputs, SceneFile, contact_sensor_names
-from tgdsl.scene import compiled, portable
+from tgdsl.scene import compiled, muted_mujoco, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
 """MuJoCo's ways to reduce contacts, in the order of its numbers."""
-COMPARED = (
-    "body_pos",
-    "body_quat",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "geom_pos",
-    "geom_quat",
-    "geom_size",
-    "geom_friction",
-    "geom_solref",
-    "geom_contype",
-    "geom_conaffinity",
-    "mesh_vert",
-    "jnt_axis",
-    "jnt_range",
-    "jnt_pos",
-    "dof_damping",
-    "dof_armature",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
-    "actuator_ctrlrange",
-    "key_qpos",
-    "key_ctrl",
-    "exclude_signature",
-    "eq_data",
-    "tendon_range",
-)
-"""Arrays of the compiled model that a kept scene must reproduce."""
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
 """Elements of an MJCF file's `<asset>` that name a file."""
 FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
@@ -141,7 +111,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
         again = compiled(scene, kept.contents)
     except ValueError as error:
         raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
-    _compare(model, again)
+    _compare(model, inputs, again)
     return scene
 
 
@@ -228,13 +198,13 @@ def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) ->
     raise RobotError(f'{file}: the file "{name}" that it names was not found')
 
 
-def _compare(model: Model, again: mujoco.MjModel) -> None:
-    """Refuse a kept scene that is not the loaded one: same elements, same numbers to the digits MuJoCo writes."""
-    for kind, count in {"body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu", "keyframe": "nkey"}.items():
-        names = [[getattr(m, kind)(i).name for i in range(getattr(m, count))] for m in (model.compiled, again)]
-        if names[0] != names[1]:
-            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: names of {kind}s differ")
-    for name in COMPARED:
-        loaded, kept = getattr(model.compiled, name), getattr(again, name)
-        if loaded.shape != kept.shape or not np.allclose(loaded, kept, rtol=1e-4, atol=1e-6):
-            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: {name} differs")
+def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
+    """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted.
+
+    Raises:
+        RobotError: If any field of its compiled model differs: see `compare.differing`.
+    """
+    with muted_mujoco():
+        loaded = instrument(model.spec.copy(), inputs).compile()
+    if names := differing(loaded, again, model.is_urdf):
+        raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")
