@@ -13,6 +13,7 @@ from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError
 from tgdsl.module import TactileModule
+from tgdsl.places import check_scene
 from tgdsl.plan import Plan
 from tgdsl.schema.files import write_whole
 from tgdsl.sensors import KINDS, Kind
@@ -61,10 +62,11 @@ def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
 
 
 def load_plan(path: str | PathLike[str]) -> Plan:
-    """Read a plan.
+    """Read a plan. Only the artefact itself is opened: no file that it names.
 
     Raises:
-        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+        ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
+            of an artefact cannot be.
     """
     try:
         with safe_open(str(path), framework="numpy") as file:
@@ -77,6 +79,8 @@ def load_plan(path: str | PathLike[str]) -> Plan:
     for array in arrays.values():
         array.flags.writeable = False
     try:
-        return Plan.from_json(metadata[METADATA_KEY], arrays)
+        plan = Plan.from_json(metadata[METADATA_KEY], arrays)
+        check_scene(plan.scene)
+        return plan
     except ArtifactError as error:
         raise ArtifactError(f"{path}: {error}") from error

@@ -13,6 +13,7 @@ from tgdsl.compiler.compare import differing
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
+from tgdsl.places import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.plan import SLOT_FIELDS, Asset, Inputs, SceneFile, contact_sensor_names
 from tgdsl.scene import compiled, muted_mujoco, portable
 
@@ -24,8 +25,6 @@ ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
 """Elements of an MJCF file's `<asset>` that name a file."""
 FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
 """How they name it: the sides of a cube's texture have one each."""
-FOLDER_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")
-"""Attributes of `<compiler>` that say in which folder assets lie."""
 
 
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
@@ -170,6 +169,8 @@ class _Kept:
         return key
 
     def _asset(self, path: Path) -> str:
+        if path.suffix.lower() not in ENDINGS:
+            raise RobotError(f"{path}: a mesh, texture, height field or skin has one of the endings {listed(ENDINGS)}")
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()
         key = f"{digest[:32]}{path.suffix.lower()}"

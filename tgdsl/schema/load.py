@@ -109,6 +109,8 @@ def load(
         source, folder = yaml.from_mapping(document, "<mapping>"), FilePath.cwd()
     else:
         source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
+    if source.value is None:
+        raise SpecError(source.problems)
     for dotted, text in (overrides or {}).items():
         source.set(dotted, text)
     model = document_model(kinds, needs_sensors)
@@ -154,7 +156,11 @@ def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tupl
 
 def _read_file(path: FilePath, name: str) -> Source:
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(yaml.MAX_BYTES + 1)
+        if large := yaml.too_large(content, name):
+            raise SpecError([large])
+        text = content.decode("utf-8")
     except OSError as error:
         raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
     except UnicodeDecodeError as error:
