@@ -159,7 +159,7 @@ def _settle_moments(loaded: Loaded, work: Draft) -> None:
 def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft) -> None:
     """Sample objects, and decide how distances to the links that they meet are found; what has no surface is a mistake."""
     for sensor in (sensor for sensor in work.sensors if sensor.lowered.points is not None):
-        request, path = sensor.lowered.points, ("sensors", sensor.name)
+        request, path = sensor.lowered.points, ("sensors", sensor.sensor)
         assert request is not None
         for i, name in enumerate(sensor.feels):
             try:
