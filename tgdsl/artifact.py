@@ -16,7 +16,8 @@ from tgdsl.module import TactileModule
 from tgdsl.places import check_scene
 from tgdsl.plan import Plan
 from tgdsl.schema.files import write_whole
-from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
 
 METADATA_KEY = "tgdsl"
 
@@ -43,15 +44,15 @@ def load(
 
     Args:
         path: The artefact.
-        kinds: Sensor kinds of your own, if it was compiled with any.
+        kinds: Sensor kinds of your own, if it was compiled with any that no installed package brings.
         dtype: Dtype of the readings, float32 or float64.
         device: Where the module lives.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, or is of another version.
-        TgdslError: If it uses a kind that is not given.
+        TgdslError: If it uses a kind that is neither installed nor given.
     """
-    return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
+    return TactileModule(load_plan(path), known_kinds(kinds), dtype).to(device)
 
 
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:

@@ -34,6 +34,7 @@ from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel
+from tgdsl.sensors.known import check_names
 from tgdsl.sensors.noise.lower import LoweredNoise
 
 
@@ -57,6 +58,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
     taxels = resolved.layout.taxels_of(resolved.links[name])
     layout = resolved.layout.take(taxels)
     clean = kind.lower(spec, layout, resolved.surface_of)
+    check_names(kind, clean)
     if spec.readout == "clean":
         return [DraftSensor(name, kind.name, spec, taxels, clean, f"sensors/{name}", (name,), None, kind.is_pointwise)]
     knobs = knobs_of(loaded, resolved, name, layout, kind)

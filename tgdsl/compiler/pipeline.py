@@ -23,7 +23,8 @@ from tgdsl.module import TactileModule
 from tgdsl.plan import Origin, Plan
 from tgdsl.scene import portable
 from tgdsl.schema.load import Loaded, load
-from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
 
 Document = str | PathLike[str] | Mapping[str, Any]
 
@@ -34,13 +35,13 @@ def compile_plan(document: Document, overrides: Mapping[str, str] | None = None,
     Args:
         document: A YAML file, or the same as a mapping.
         overrides: YAML text by dotted path, set before anything is read: `{"resolution": "high"}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
     """
-    known = (*KINDS, *kinds)
+    known = known_kinds(kinds)
     loaded = load(document, overrides, known)
     resolved = resolve(loaded)
     plan = lower.plan(loaded, resolved, known, _origin(loaded))
@@ -59,7 +60,7 @@ def layouts(
         document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
         overrides: YAML text by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
 
     Returns:
         The model of the scene, or of the robot if there is no scene, and the layouts by resolution.
@@ -69,7 +70,7 @@ def layouts(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If the layout has no such resolution.
     """
-    chosen, known = overrides or {}, (*KINDS, *kinds)
+    chosen, known = overrides or {}, known_kinds(kinds)
     loaded = load(document, chosen, known, needs_sensors=False)
     if loaded.layout is None:
         return resolve(loaded).scene.compiled, {}  # which says all that is wrong
@@ -98,7 +99,7 @@ def compile(
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
         resolution: Instead of the document's own.
         overrides: YAML text by dotted path, such as `{"sensors.touch.normal_stiffness": "400"}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         dtype: Dtype of the readings, float32 or float64.
         device: Where the module lives.
 
@@ -111,7 +112,7 @@ def compile(
     """
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
     plan = compile_plan(document, chosen, kinds)
-    return TactileModule(plan, (*KINDS, *kinds), dtype).to(device)
+    return TactileModule(plan, known_kinds(kinds), dtype).to(device)
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -64,7 +64,7 @@ def _of_objects(branches: Sequence[Schema], definitions: Mapping[str, Schema], d
     chain: Schema = {}
     if key := discriminator.get("propertyName"):
         mapping: Mapping[str, str] = discriminator["mapping"]
-        for value, reference in reversed(mapping.items()):
+        for value, reference in reversed(list(mapping.items())):
             chain = _if({"properties": {key: {"const": value}}, "required": [key]}, {"$ref": reference}, chain)
         return {"type": "object", "properties": {key: {"enum": list(mapping)}}, "required": [key]} | chain
     needed = [set(_target(branch, definitions).get("required", ())) for branch in branches]
