@@ -15,6 +15,7 @@ from tgdsl.schema import files, yaml
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.faults import read_as
 from tgdsl.schema.placement import LayoutSpec
+from tgdsl.schema.unusual import warn_of_unusual
 from tgdsl.schema.yaml import Path, Source
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
@@ -122,6 +123,9 @@ def load(
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
     loaded.layout = _layout(loaded)
     problems += _name_problems(loaded, kinds)
+    warn_of_unusual(source, spec)
+    if loaded.layout is not None and loaded.layout.source is not source:
+        warn_of_unusual(loaded.layout.source, loaded.layout.spec)
     return loaded
 
 

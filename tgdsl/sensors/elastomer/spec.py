@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictInt, model_validator
 
-from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Radius, SpecModel
+from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
 from tgdsl.regions import Region
 from tgdsl.sensors.base import ContactProbeSpec
 
@@ -64,19 +64,19 @@ class ElastomerSpec(ContactProbeSpec):
     """α, power of the depth in the bulge [1] (gaussian)."""
     compressibility: Annotated[NonNegative, AfterValidator(_at_most_one)] = 1.0
     """c, 1 for a local Gaussian spread, 0 for one that falls off as 1/r [1] (gaussian)."""
-    reference_area: Area = 6e-6
+    reference_area: Annotated[Area, Usual("area", high=0.01)] = 6e-6
     """Area of a taxel that counts once [m²] (gaussian)."""
-    thickness: PositiveLength | None = None
+    thickness: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Thickness of the elastomer [m] (gaussian: length ε, default the taxel spacing; bonded_layer)."""
     poissons_ratio: Annotated[NonNegative, AfterValidator(_at_most_half)] = 0.5
     """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
-    youngs_modulus: Positive | None = None
-    """E [Pa] (half_space, bonded_layer)."""
+    youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=1e11)] = None
+    """E [Pa], also as `0.2 MPa` (half_space, bonded_layer)."""
     normal_stiffness: Positive | None = None
     """K_n, pressure per depth [Pa/m] (half_space, bonded_layer)."""
-    marker_depth: Radius = 0.0
+    marker_depth: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""
-    standoff: Radius = 0.0
+    standoff: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """s, height of the undeformed skin above the taxels [m]."""
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
@@ -85,9 +85,9 @@ class ElastomerSpec(ContactProbeSpec):
     (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""
-    enter: Radius = 1e-5
+    enter: Annotated[Radius, Usual("length", high=0.1)] = 1e-5
     """Depth at which a taxel takes hold of an object, or a point of the skin [m]."""
-    exit: Radius = 1e-4
+    exit: Annotated[Radius, Usual("length", high=0.1)] = 1e-4
     """Distance at which it lets go [m]."""
     boundary: BoundarySpec | None = None
     """An edge that is clamped, for the in-plane dilation (gaussian); needs `thickness`."""
