@@ -27,7 +27,7 @@ FLOORS = {
         "artifact",
         "explain",
     },
-    2: {"sensors", "observations", "layout", "plan"},
+    2: {"sensors", "observations", "layout", "plan", "places"},
     1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}

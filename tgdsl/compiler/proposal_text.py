@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -34,8 +35,8 @@ _ABOUT = {
 }
 _NO_PALM = "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n"
 
-USUAL_DENSITY = (100.0, 1e8)
-"""Taxels per area beyond which another unit was most likely meant [1/m²]: one per square decimetre, and a hundred per mm²."""
+USUAL_DENSITY = (100.0, math.inf)
+"""Taxels per area below which another unit was most likely meant [1/m²]: one per square decimetre."""
 
 
 def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool) -> list[str]:
