@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tgdsl"
 FLOORS = {
-    5: {"cli", "calibrate_commands", "hand_commands", "robot_commands", "rl", "report"},
+    5: {"cli", "cache_commands", "calibrate_commands", "hand_commands", "robot_commands", "rl", "report"},
     4: {"compiler", "runtime"},
     3: {
         "schema",

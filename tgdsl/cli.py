@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from tgdsl.cache_commands import Cache
 from tgdsl.calibrate_commands import Calibrate
 from tgdsl.errors import SpecError, TgdslError, did_you_mean
 from tgdsl.hand_commands import Hand
@@ -261,6 +262,7 @@ Command = (
     | Annotated[LayoutNew, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
+    | Annotated[Cache, tyro.conf.subcommand("cache")]
     | Annotated[Hand, tyro.conf.subcommand("hand")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
 )
