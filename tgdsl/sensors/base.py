@@ -154,6 +154,7 @@ class Lowered:
         slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
         moments: How moments are found, if `needs` has "moments".
         points: Which points, if `needs` has "points".
+        notes: What an account of the sensor says of its parameters, line by line.
         signal: What `forward` returns, if the kind decides: what noise acts on.
     """
 
@@ -168,6 +169,7 @@ class Lowered:
     slots: int = 0
     moments: MomentsRequest | None = None
     points: PointsRequest | None = None
+    notes: tuple[str, ...] = ()
     signal: tuple[Channel, ...] | None = None
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import re
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, StrictInt, model_validator
+from pydantic import AfterValidator, Field, StrictInt, WithJsonSchema, model_validator
 
 from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
 from tgdsl.regions import Region
 from tgdsl.sensors.base import ContactProbeSpec
+from tgdsl.sensors.elastomer import skins
 
 
 def _at_most_half(value: float) -> float:
@@ -46,6 +48,8 @@ class ElastomerSpec(ContactProbeSpec):
 
     kind: Literal["elastomer"]
     """Displacement of the markers in a soft skin [m]."""
+    like: Annotated[str | None, AfterValidator(skins.known), WithJsonSchema({"enum": [*skins.SKINS]})] = None
+    """Skin whose values hold where none is given here: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
     kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
     """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
@@ -95,6 +99,33 @@ class ElastomerSpec(ContactProbeSpec):
     """How the fixed operator is applied; `auto` takes the cheapest that is exact, or within `tolerance` if that is given."""
     tolerance: Annotated[Positive, AfterValidator(_is_fraction)] | None = None
     """Relative error that a truncated operator may have [1]; svd: 1e-3 if not given."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _upon_skin(cls, value: object, info: Any) -> object:
+        """Fill in the fields of a skin; an error still finds the mapping that the document has."""
+        if not isinstance(value, dict) or not isinstance(value.get("like"), str) or value["like"] not in skins.SKINS:
+            return value
+        if isinstance(info.context, dict):
+            info.context[id(value)] = cls
+        return skins.with_skin(value, UNUSED)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the skin that it is like came to, and which of its values are the sensor's own."""
+        if self.like is None:
+            return ()
+        skin = skins.SKINS[self.like]
+        parts = []
+        shown = {*skin, "normal_stiffness"} & self.model_fields_set
+        for name, field in type(self).model_fields.items():
+            if name in shown:
+                value = getattr(self, name)
+                unit = re.search(r"\[(.+?)\]", field.description or "")
+                text = f"{value:g}" if isinstance(value, float) else str(value)
+                text += f" {unit[1]}" if unit and unit[1] != "1" else ""
+                parts.append(f"{name} {text}{' (own)' if name in skin and value != skin[name] else ''}")
+        return (f"like {self.like}: {', '.join(parts)}",)
 
     @property
     def has_shear(self) -> bool:
