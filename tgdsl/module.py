@@ -82,7 +82,6 @@ class TactileModule(nn.Module):
         for sensor in plan.sensors:
             if sensor.kind not in known:
                 hint = did_you_mean(sensor.kind, known, "kinds")
-                hint += "; install the package that brings it, or name it in `kinds`"
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
         self._queries = Queries(plan)
