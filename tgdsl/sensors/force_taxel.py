@@ -35,7 +35,7 @@ from pydantic import Field, StrictInt
 from torch import Tensor
 
 from tgdsl.errors import LowerError
-from tgdsl.fields import PositiveLength
+from tgdsl.fields import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
@@ -55,7 +55,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     """Force [N] or pressure [Pa] of each taxel, which sum to the solver's contact force."""
     outputs: Annotated[tuple[Literal["force", "pressure"], ...], Field(min_length=1)] = ("force",)
     """What a reading holds, force before pressure."""
-    footprint: PositiveLength | None = None
+    footprint: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Radius r_f around a contact in which taxels carry it [m]; a contact further than r_f/2 from the nearest taxel is partly
     missed. Default: on each body 3 times the taxels' spacing, the root of their mean area."""
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
