@@ -28,7 +28,7 @@ FLOORS = {
         "explain",
     },
     2: {"sensors", "observations", "layout", "plan"},
-    1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "errors"},
+    1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "selection", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}
 EXEMPT = {

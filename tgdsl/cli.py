@@ -141,6 +141,7 @@ class Run:
             print(f"the scene has no keyframes rest and squeeze: its initial state is held for {self.seconds:g} s")
         else:
             controls = scripted_controls(sim.model, keyframes, self.seconds, sim.control_step)
+            sim.close()
             sim = simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0])
         self.out.mkdir(parents=True, exist_ok=True)
         recorder, live = Recorder(touch, len(controls), self.num_envs), LiveTable()

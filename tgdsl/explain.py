@@ -135,7 +135,7 @@ def _remembers(touch: TactileModule, sensor: PlannedSensor) -> str:
     """Return what a sensor carries from one call to the next, and its size; the clock, which all share, is not in it."""
     fixed, ring = _sizes(touch, sensor)
     own = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
-    if _rings(sensor):
+    if sensor.windows:
         own.append("history")
     if not own:
         return "remembers the clock alone" if sensor.is_timed else "no state"
@@ -152,16 +152,9 @@ def _sizes(touch: TactileModule, sensor: PlannedSensor) -> tuple[int, int]:
     size = torch.finfo(touch.dtype).bits // 8
     fixed = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if not memory.past)
     ring = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if memory.past)
-    return fixed + sum(count * size + 1 for count in _rings(sensor)), ring
-
-
-def _rings(sensor: PlannedSensor) -> list[int]:
-    """Return how many numbers the history of each reading holds, see `history.History`."""
-    history = sensor.history
-    if history is None or history.reduce == "last":
-        return []
-    own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
-    return [2 * history.length * reading.num_rows * len(reading.channels) for reading in own]
+    steps = 0 if sensor.history is None else sensor.history.length
+    windows = sum(steps * reading.num_rows * len(reading.channels) for reading in sensor.windows)
+    return fixed + size * windows, ring
 
 
 _OF_READING = "unit of the reading"
@@ -294,8 +287,8 @@ def _inputs(touch: TactileModule) -> list[str]:
     return [*lines, ""]
 
 
-_CLOCK_BYTES = 16
-"""What the clock holds of each environment: two int64, see `clock.Clock`."""
+_CLOCK_BYTES = 24
+"""What the clock holds of each environment beside the ages of calls: three int64, see `clock.Clock`."""
 
 
 def _costs(touch: TactileModule) -> list[str]:

@@ -252,10 +252,11 @@ class PlannedNoise:
 
 @dataclass(frozen=True)
 class PlannedHistory:
-    """How many calls a reading holds or is made of, and how."""
+    """How many calls a reading holds or is made of, how, and whether a stack of them is handed out as a view of the memory."""
 
     length: int
     reduce: Literal["stack", "last", "median", "mean"]
+    view: bool = False
 
 
 @dataclass(frozen=True)
@@ -302,6 +303,16 @@ class PlannedSensor:
     def is_timed(self) -> bool:
         """Whether it wants to know when a reading is made: for chance, for what its noise remembers, or for its own rate."""
         return bool(self.noise and self.noise.streams) or any("/" in name for name in self.state)
+
+    @property
+    def own_readings(self) -> tuple[PlannedReading, ...]:
+        """Its readings without reports: the measured one, the clean one, or both."""
+        return tuple(reading for reading in self.readings if reading.name in (self.name, f"{self.name}/clean"))
+
+    @property
+    def windows(self) -> tuple[PlannedReading, ...]:
+        """Those of its readings whose last calls are remembered."""
+        return () if self.history is None or self.history.reduce == "last" else self.own_readings
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ def _sensor(
         readings=(*readings, *reports),
         noise=None if part.noise is None else _noise(part.noise),
         period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
-        history=None if history is None else PlannedHistory(history.length, history.reduce),
+        history=None if history is None else PlannedHistory(history.length, history.reduce, history.view),
     )
 
 

@@ -7,7 +7,7 @@ inactive probes into constants, `pack` numbers bodies and pairs and writes the i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -147,12 +147,8 @@ class DraftQuery:
     planned: PlannedQuery = field(init=False)
 
 
-def prune(work: Draft) -> Iterator[tuple[str, str]]:
-    """Set the pairs that are needed, and drop those that can never meet.
-
-    Yields:
-        Sensor and object of each wish that can never come true.
-    """
+def prune(work: Draft) -> list[tuple[str, str]]:
+    """Set the pairs that are needed, drop those that can never meet; return sensors that can never feel an object of theirs."""
     wanted: set[Pair] = set()
     gated: set[Pair] = set()
     never: set[Pair] = set()
@@ -174,7 +170,7 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
         work.dropped.append((f"pair {pair.link} – {pair.object}", "they can never be in contact"))
     work.pairs = sorted(wanted, key=_order)
     work.gated = sorted(gated, key=_order)
-    yield from hopeless
+    return hopeless
 
 
 def _order(pair: Pair) -> tuple[str, str]:

@@ -245,7 +245,7 @@ def _simulation(touch: TactileModule, num_envs: int, control_step: float, keyfra
         if term.type in HAND_ONLY:
             raise hand_only_error(term.group, term.index, term.type)
     sim = _scene(touch, num_envs, control_step, keyframe)
-    return Connection(sim, lambda: touch.observe(touch(sim.state())))
+    return Connection(sim, lambda: touch.observe(touch(sim.state())), close=sim.close)
 
 
 def _scene(touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None) -> BatchSimulation:

@@ -62,6 +62,12 @@ def keyframe_id(model: mujoco.MjModel, name: str) -> int:
         raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}') from error
 
 
+def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
+    """Return whether environments are named by a mask; a tensor's numbers are not looked at."""
+    found = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
+    return found.dtype == torch.bool and found.shape == (num_envs,)
+
+
 def env_indices(env_ids: EnvIds | None, num_envs: int) -> Int[np.ndarray, " n"]:
     """Return environments as indices, in the order in which they are named.
 
@@ -95,7 +101,9 @@ def env_mask(env_ids: EnvIds | None, num_envs: int, device: torch.device) -> Boo
     Raises:
         SimulationError: If there are no such environments.
     """
-    if isinstance(env_ids, Tensor) and env_ids.dtype == torch.bool and env_ids.shape == (num_envs,):
+    if env_ids is None:
+        return torch.ones(num_envs, dtype=torch.bool, device=device)
+    if isinstance(env_ids, Tensor) and is_env_mask(env_ids, num_envs):
         return env_ids.to(device)
     mask = np.zeros(num_envs, dtype=bool)
     mask[env_indices(env_ids, num_envs)] = True
