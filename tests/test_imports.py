@@ -24,6 +24,7 @@ FLOORS = {
         "example",
         "state",
         "scene",
+        "slot_watch",
         "artifact",
         "explain",
     },
