@@ -1,7 +1,8 @@
 """The state of a scene: what a module reads of simulators and hardware.
 
 Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
-pair, `object` objects of its `inputs.objects`.
+pair, `object` objects of its `inputs.objects`, `joint` joints of its `inputs.joints`, `actuator` actuators of its
+`inputs.actuators`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "contact_netforce": ("pair", 3),
     "variant": ("object",),
     "object_size": ("object", 3),
+    "joint_pos": ("joint",),
+    "joint_vel": ("joint",),
+    "joint_effort": ("joint",),
+    "last_action": ("actuator",),
 }
 """Shape of each tensor of a `SceneState`, after the leading `env`."""
 
@@ -58,6 +63,10 @@ class SceneState:
         contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
         variant: Which of its variants each object has, from 0; 0 for one that has none.
         object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
+        joint_pos: Position of each joint, of the same instant as the bodies' poses [rad; slides: m].
+        joint_vel: Velocity of each joint, of that instant [rad/s; slides: m/s].
+        joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
+        last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
         dt: Time since the last state [s].
     """
 
@@ -73,6 +82,10 @@ class SceneState:
     contact_netforce: Float[Tensor, "env pair 3"] | None = None
     variant: Int[Tensor, "env object"] | None = None
     object_size: Float[Tensor, "env object 3"] | None = None
+    joint_pos: Float[Tensor, "env joint"] | None = None
+    joint_vel: Float[Tensor, "env joint"] | None = None
+    joint_effort: Float[Tensor, "env joint"] | None = None
+    last_action: Float[Tensor, "env actuator"] | None = None
     dt: float | None = None
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
@@ -117,7 +130,14 @@ def _check_variants(variant: Tensor, inputs: Inputs) -> None:
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
     """Return the shape that a field has for a module, after the leading `env`."""
-    sizes = {"body": len(inputs.bodies), "pair": len(inputs.pairs), "slot": inputs.slots, "object": len(inputs.objects)}
+    sizes = {
+        "body": len(inputs.bodies),
+        "pair": len(inputs.pairs),
+        "slot": inputs.slots,
+        "object": len(inputs.objects),
+        "joint": len(inputs.joints),
+        "actuator": len(inputs.actuators),
+    }
     return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
 
 

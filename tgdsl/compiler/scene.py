@@ -79,8 +79,11 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
         The same model.
 
     Raises:
-        RobotError: If the model lacks a body.
+        RobotError: If the model lacks a body, or is compiled already.
     """
+    if not isinstance(spec, mujoco.MjSpec):
+        what = f"tgdsl.instrument wants a mujoco.MjSpec, found {type(spec).__name__}: a compiled model takes no more sensors"
+        raise RobotError(f"{what}; read it with mujoco.MjSpec.from_file, and compile it afterwards")
     present = {sensor.name for sensor in spec.sensors}
     for own in _contact_sensors(inputs, spec):
         if own.name not in present:

@@ -14,14 +14,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
+from tgdsl.env_ids import EnvIds, env_indices
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch_reading import BatchReader
 from tgdsl.runtime.faults import DIVERGED, EnvFaults, OnFault
-from tgdsl.runtime.lookup import env_indices, keyframe_id
+from tgdsl.runtime.joint_fields import JointPlaces, KeptJoints
+from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
+from tgdsl.runtime.room import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene import SceneModels
@@ -35,8 +37,8 @@ class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch`, read by one module.
 
     Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
-    start of the last substep, and so is the state. After `reset`, `set_state` and `forward` they are of where the environments
-    are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory.
+    start of the last substep, and so is the state, its joints included. After `reset`, `set_state` and `forward` they are of
+    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory, and of now.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
@@ -71,8 +73,9 @@ class BatchSimulation(Simulation):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if there is
-                nothing to step, or if the module's state is another simulation's or of other environments.
+            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
+                bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
+                module's state is another simulation's or of other environments.
         """
         refuse_unfit(touch, num_envs, substeps, model)
         self._objects: EnvObjects | None = None
@@ -83,11 +86,16 @@ class BatchSimulation(Simulation):
         self.model: mujoco.MjModel = model
         if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
+        if self.model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+            what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+            raise SimulationError(f'{what}; take <flag sleep="enable"/> out of its <option>')
+        refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.substeps = substeps
         self._touch = touch
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
+        self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
@@ -171,9 +179,15 @@ class BatchSimulation(Simulation):
     def _evaluate(self, ids: Int[Array, " n"]) -> None:
         if len(ids):
             self._run(lambda: self.batch.forward(ids))
+            self._kept.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
+        if self._kept.is_wanted:
+            if num_steps > 1:
+                self._run(lambda: self.batch.step(nstep=num_steps - 1))
+            self._kept.keep()
+            num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.settle()
@@ -186,7 +200,7 @@ class BatchSimulation(Simulation):
         self._faults.warn_once()
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = dict(self._reader.read())
+        values: dict[str, Any] = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
         tensors: dict[str, Any] = {name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}

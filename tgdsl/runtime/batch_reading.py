@@ -45,8 +45,8 @@ class BatchReader:
 
     def read(self) -> dict[str, Array]:
         """Return the fields, each an array of its own."""
-        found = {name: reader(self) for name, reader in self._readers.items()} | self._contacts.read(self._batch.sensordata)
-        return {name: np.ascontiguousarray(array) for name, array in found.items()}
+        arrays = {name: reader(self) for name, reader in self._readers.items()} | self._contacts.read(self._batch.sensordata)
+        return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
     def _body_pos(self) -> Float[Array, "env body 3"]:
         return self._batch.xpos[:, self._body_ids]

@@ -18,12 +18,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
 from tgdsl.runtime.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.joints import Joints
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.state_values import Rows, StateTable, StateValues
 from tgdsl.state import SceneState
 

@@ -15,9 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds, env_indices, is_env_mask
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.runtime.lookup import env_indices, is_env_mask
-from tgdsl.runtime.source import EnvIds
 
 Numbers = Tensor | np.ndarray | Sequence[Any] | float
 """Numbers of any dtype, on any device."""

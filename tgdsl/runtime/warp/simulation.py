@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds, env_indices, env_mask
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.faults import OnFault
-from tgdsl.runtime.lookup import env_indices, env_mask, keyframe_id
+from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import Values
 from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.state_values import Rows, StateTable
 from tgdsl.runtime.warp.lane import Lane, Replay
 from tgdsl.runtime.warp.meshed import MeshedModels
@@ -120,7 +120,7 @@ class WarpSimulation(Simulation):
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
             self._objects.tell(self._worlds)
-        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.contacts)
+        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
         self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
         self._substep = Replay(self._lane, lambda: self._worlds.step(1))
         self._step_and_read = Replay(self._lane, self._physics_and_touch)
