@@ -36,6 +36,7 @@ FLOORS = {
         "example",
         "state",
         "scene",
+        "slot_watch",
         "artifact",
         "explain",
     },

@@ -15,6 +15,7 @@ from tgdsl.layout import Layout, Link
 from tgdsl.sensors.force_taxel import FORCE_TAXEL, ForceTaxelSpec, lower, reference_reports
 from tgdsl.state import SceneState
 from tgdsl.testing import KindConformance
+from tgdsl.testing.reference import assert_agrees
 
 G = 9.81
 ROUNDING = 1e-12
@@ -36,6 +37,15 @@ class TestForceTaxel(KindConformance):
                 np.testing.assert_allclose(readings["s/residual"][env], residual, atol=1e-12)
             assert readings["s/missed"].abs().max() > 0.1
             assert readings["s/residual"].abs().max() > 1e-4
+
+    @pytest.mark.filterwarnings("ignore:contacts of")
+    def test_what_slots_lack_is_shared_out_as_in_the_reference(self, scene):
+        """Pairs whose net force is that of more contacts than are shown: the definition adds it up one contact at a time."""
+        module, reference = self.build(self.document(scene), torch.float64)
+        for state in self.states(module):
+            lacking = torch.randn(state.contact_netforce.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+            state = dataclasses.replace(state, contact_netforce=state.contact_netforce + lacking)
+            assert_agrees(module(state)["s"], reference, state, self.float64_tolerance)
 
 
 class TestForceTaxelWithPressure(KindConformance):
