@@ -46,7 +46,7 @@ from pydantic import TypeAdapter, ValidationError
 from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 
-FORMAT = 9
+FORMAT = 10
 """Version of the Plan; a reader refuses any other."""
 
 
