@@ -6,12 +6,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TORCH_INDEX ?=
+PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: demo test lint bench soak clean
 
 demo: $(READY)
+	@echo "compiling examples/xhand1_palm.yaml"
 	@$(BIN)/tgdsl compile examples/xhand1_palm.yaml -o out/xhand1_palm.safetensors
+	@echo "stepping its scene: the hand squeezes a cube"
 	@$(BIN)/tgdsl run out/xhand1_palm.safetensors --out out
 
 # One process per core, each with one thread of its own: most of the time goes into compiling kernels.
@@ -34,8 +37,13 @@ soak: $(READY)
 clean:
 	rm -rf $(VENV) out
 
+# On a terminal pip shows what it downloads: torch alone may take minutes.
 $(READY): pyproject.toml constraints.txt
+	@echo "making $(VENV) with $$($(PYTHON) --version)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/pip install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -c constraints.txt torch
-	@$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	@echo "installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX)): the largest part, once"
+	@$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -c constraints.txt torch
+	@echo "installing tgdsl and all else that its examples and tests need"
+	@$(PIP) -c constraints.txt -e '.[dev]'
 	@touch $(READY)
+	@echo "$(VENV) is ready"

@@ -12,9 +12,10 @@ import tgdsl
 from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout import Layout, Link
+from tgdsl.runtime.cameras import VIEWS, camera_of, pose_of
 from tgdsl.runtime.discs import discs, group_of, legend, radii, taxels_of
 from tgdsl.runtime.dots import Pose
-from tgdsl.runtime.render import FEWEST, HEIGHT, VIEWS, camera_of, drawing, pose_of, render
+from tgdsl.runtime.render import FEWEST, HEIGHT, drawing, render
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -261,7 +262,7 @@ def test_size_and_frame(hand: Drawn, tmp_path: Path) -> None:
     ("chosen", "message"),
     [
         ({"view": "frnt"}, r'^there is no view "frnt"; did you mean "front"\?$'),
-        ({"view": "x"}, r'^there is no view "x"; known views: back, front, iso, left, right$'),
+        ({"view": "x"}, r'^there is no view "x"; known views: back, bottom, front, iso, left, right, top$'),
         ({"keyframe": "bend"}, r'^the scene has no keyframe "bend"; did you mean "bent"\?$'),
         ({"size": (500, 20)}, rf"^a picture of 500 × 20 pixels is too small, expected at least {FEWEST} of each$"),
     ],

@@ -9,15 +9,18 @@ readings = touch(sim.state())
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tgdsl import testing as testing
     from tgdsl.artifact import load as load
     from tgdsl.artifact import save as save
     from tgdsl.compiler.pipeline import compile as compile
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
         ArtifactError,
+        FileError,
         HandError,
         ObservationError,
         RobotError,
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "ArtifactError": "errors",
     "BatchSimulation": "runtime.batch",
+    "FileError": "errors",
     "HandError": "errors",
     "ObservationError": "errors",
     "RobotError": "errors",
@@ -57,6 +61,7 @@ _PLACES = {
 __all__ = [
     "ArtifactError",
     "BatchSimulation",
+    "FileError",
     "HandError",
     "ObservationError",
     "RobotError",
@@ -73,11 +78,21 @@ __all__ = [
     "load",
     "save",
     "simulate",
+    "testing",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used, so that no command waits for what it does not need."""
+    if name == "__version__":
+        return version("tgdsl")
+    if name == "testing":
+        return import_module("tgdsl.testing")
     if name not in _PLACES:
         raise AttributeError(f"module 'tgdsl' has no attribute {name!r}")
     return getattr(import_module(f"tgdsl.{_PLACES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, all of them and no others."""
+    return sorted([*__all__, "__version__"])

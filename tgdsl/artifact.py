@@ -11,12 +11,12 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialized
 
-from tgdsl.buffers import check_dtype
-from tgdsl.errors import ArtifactError
+from tgdsl.devices import device_of, dtype_of
+from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
 from tgdsl.schema.files import write_whole
-from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors import Kind, known_kinds
 
 METADATA_KEY = "tgdsl"
 
@@ -28,7 +28,13 @@ def save(touch: TactileModule, path: str | PathLike[str]) -> int:
 
     Returns:
         Bytes written.
+
+    Raises:
+        FileError: If the file cannot be written.
+        TgdslError: If it is no module.
     """
+    if not isinstance(touch, TactileModule):
+        raise TgdslError(f"tgdsl.save writes a module that tgdsl.compile returned, found {type(touch).__name__}")
     return save_plan(touch.plan, path)
 
 
@@ -36,7 +42,7 @@ def load(
     path: str | PathLike[str],
     *,
     kinds: Sequence[Kind] = (),
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | str = torch.float32,
     device: torch.device | str = "cpu",
 ) -> TactileModule:
     """Return the module of an artefact. Neither MuJoCo nor any file that it was compiled from is needed.
@@ -44,15 +50,15 @@ def load(
     Args:
         path: The artefact.
         kinds: Sensor kinds of your own, if it was compiled with any.
-        dtype: Dtype of the readings, float32 or float64, as for `compile`.
+        dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
         device: Where the module lives.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, or is of another version.
-        TgdslError: If it uses a kind that is not given, or the dtype is neither float32 nor float64.
+        TgdslError: If it uses a kind that is not given, or there is no such dtype or device.
     """
-    check_dtype(dtype)
-    return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
+    dtype, device = dtype_of(dtype), device_of(device)
+    return TactileModule(load_plan(path), known_kinds(kinds), dtype).to(device)
 
 
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:

@@ -8,21 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tgdsl.errors import TgdslError
-
-DTYPES = (torch.float32, torch.float64)
-"""What a module can be of. A narrower float knows places on a hand to a tenth of a millimetre, too coarse for a depth."""
-
-
-def check_dtype(dtype: torch.dtype) -> None:
-    """Refuse a dtype that no module can be of.
-
-    Raises:
-        TgdslError: If it is not one of `DTYPES`.
-    """
-    if dtype not in DTYPES:
-        hint = "readings can be cast afterwards, a module computes depths that a narrower float cannot hold"
-        raise TgdslError(f"a module cannot be of {dtype}, expected torch.float32 or torch.float64; {hint}")
+from tgdsl.devices import check_dtype
 
 
 class Constants(nn.Module):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tgdsl.errors import TgdslError
-from tgdsl.hand_commands import CalibrationFile, refuse_to_replace, write_whole
+from tgdsl.hand_commands import CalibrationFile, refuse_to_replace
+from tgdsl.schema.files import with_folder, write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,11 +95,9 @@ class Calibrate:
         notes = [f"# {name}: fitted to {self.log.name}; {fit_text(fit)}\n" for name, fit in fits.items()]
         origin = f"scale and rotation are those of {self.others}" if self.others else "as in the calibration before"
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
-        for file in (self.out, self.plot):
-            file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(self.out, "".join(notes) + result.text())
+        write_whole(with_folder(self.out), ("".join(notes) + result.text()).encode())
         print(f"calibration: {self.out}")
-        print(f"picture:     {picture(fits, self.plot, f'{self.log.name}: fingertip forces')}")
+        print(f"picture:     {picture(fits, with_folder(self.plot), f'{self.log.name}: fingertip forces')}")
 
     def _frames(self, record: TipRecord) -> dict[str, Frames]:
         """Return the frames to fit to, by finger."""
@@ -149,11 +148,9 @@ class Calibrate:
         return {name: frames_under_forces(record, name, time + offset, forces[name]) for name in loaded}
 
     def _known_forces(self, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        import tgdsl
+        from tgdsl.arguments import module_of
         from tgdsl.runtime.xhand1.loads import known_tip_forces, simulated_tip_forces
 
         if self.document is None:
             return known_tip_forces(path)
-        is_artefact = self.document.suffix == ".safetensors"
-        touch = tgdsl.load(self.document) if is_artefact else tgdsl.compile(self.document)
-        return simulated_tip_forces(path, touch, self.reading, depth_scale=self.depth_scale)
+        return simulated_tip_forces(path, module_of(self.document), self.reading, depth_scale=self.depth_scale)

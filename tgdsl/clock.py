@@ -6,14 +6,19 @@ Shapes: `env` environments.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from tgdsl.errors import TgdslError
 from tgdsl.plan import PlannedSensor
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
+
+_INT64 = 2**63
+"""First number beyond an int64."""
 
 
 class Clock(nn.Module):
@@ -75,8 +80,17 @@ class Clock(nn.Module):
             delattr(self, name)
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
-        """Choose other random numbers, from the next call on; environments are counted from `first_env`."""
-        self._seed, self._first_env = seed, first_env
+        """Choose other random numbers, from the next call on; environments are counted from `first_env`.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is negative or no int64.
+        """
+        if not isinstance(seed, Integral):
+            raise TgdslError(f"seed is {seed!r}, expected an integer")
+        if first_env is not None and not (isinstance(first_env, Integral) and 0 <= first_env < _INT64):
+            raise TgdslError(f"first_env is {first_env!r}, expected an integer from 0 to 2**63 - 1")
+        # It is kept as an int64: whoever loads a state dict draws the same numbers.
+        self._seed, self._first_env = (int(seed) + _INT64) % (2 * _INT64) - _INT64, first_env
         if self.num_envs is not None:
             self._count_anew()
 

@@ -31,6 +31,10 @@ class ObservationError(TgdslError):
     """An observation that its source cannot give."""
 
 
+class FileError(TgdslError, OSError):
+    """A file that cannot be written; also caught as the system's own error."""
+
+
 class HandError(TgdslError):
     """Base of every error of a real (or emulated) hand; `tgdsl.runtime.xhand1.errors` has the others."""
 

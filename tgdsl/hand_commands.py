@@ -7,9 +7,6 @@ no current: its reply is the only reading of touch that is known.
 from __future__ import annotations
 
 import math
-import os
-import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tgdsl.errors import TgdslError
+from tgdsl.schema.files import with_folder, writable, write_whole
 
 if TYPE_CHECKING:
     from tgdsl.runtime.xhand1.calibration import Calibration
@@ -120,8 +118,7 @@ class TareHand:
         if spreads:
             what = f"the fingertips were not still over {self.frames} readings: {', '.join(spreads)} counts"
             raise TgdslError(f"{what}, expected at most {self.max_spread:g}; leave the hand untouched, or see --max-spread")
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(self.out, base.with_tare(tare).text())
+        write_whole(with_folder(self.out), base.with_tare(tare).text().encode())
         for name, mean, spread in zip(FINGERS, tare.mean, tare.spread, strict=True):
             print(f"{name:<7} tare {mean[0]:7.2f} {mean[1]:7.2f} {mean[2]:7.2f}   spread {max(spread):g} counts")
         print(f"calibration: {self.out}")
@@ -157,10 +154,9 @@ class Record:
             raise TgdslError(f"--seconds {self.seconds:g}: expected more than 0")
         calibration, found = _calibration(self.calibration), the_hand(self.port, self.hand_id)
         identity = identify(found)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
         view = HandView(calibration, str(identity))
         with (
-            LogWriter(self.out, identity=identity, calibration=calibration) as log,
+            LogWriter(with_folder(self.out), identity=identity, calibration=calibration) as log,
             XHand1.open(found.device, found.addresses) as hand,
         ):
             try:
@@ -229,34 +225,18 @@ class Hand:
 
     def run(self) -> None:
         """Do it; Ctrl-C ends it with the hand's port closed."""
-        try:
-            self.action.run()
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            sys.exit(130)
+        self.action.run()
 
 
 def refuse_to_replace(out: Path, is_forced: bool) -> None:
-    """Raise an error if a file is there and may not be replaced.
+    """Raise an error if a file cannot be written, or is there and may not be replaced.
 
     Raises:
         TgdslError: If so.
     """
-    if out.exists() and not is_forced:
+    if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or another name")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file of text; it appears whole or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    writable(out)
 
 
 def _tare(hand: XHand1, num_frames: int) -> Tare:

@@ -18,8 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from tgdsl import observations
-from tgdsl.buffers import Constants, check_dtype
+from tgdsl.buffers import Constants
+from tgdsl.devices import check_dtype
+from tgdsl.env_ids import EnvIds, env_mask
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
 from tgdsl.fusion import of_its_own
@@ -28,14 +29,16 @@ from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
 from tgdsl.history import last_step, pushed, reduced
 from tgdsl.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.observing import ObservationTerm, observation_terms, observe
 from tgdsl.plan import Inputs, Plan
 from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
-from tgdsl.selection import EnvIds, env_mask
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
+from tgdsl.tables import Outputs, TaxelTable, TaxelTables
 from tgdsl.taxels import image_indices, taxel_table
 
 
@@ -44,7 +47,8 @@ class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
-    "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    "taxel"), or the bodies that carry it ("body"), which `bodies` lists. A reading that no sensor makes has its own name for
+    sensor and kind; its rows are those of `inputs.joints` ("joint") or `inputs.actuators` ("actuator").
     """
 
     name: str
@@ -103,6 +107,12 @@ class TactileModule(nn.Module):
         self._graphed: dict[str, Graphed] = {}
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
+
+    def __repr__(self) -> str:
+        layout, origin = self.plan.layout(), self.plan.origin
+        where = f"{layout.num_taxels} taxels on {len(layout.links)} links of {origin.robot.rpartition('/')[2]}"
+        return f"TactileModule({where} at resolution {origin.resolution}, {self.dtype}, {self.device})\n{self.outputs}"
 
     @property
     def inputs(self) -> Inputs:
@@ -111,8 +121,8 @@ class TactileModule(nn.Module):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Name, shape, channels and units of each reading."""
-        return tuple(
+        """Name, shape, channels and units of each reading; a tuple that prints as a table."""
+        sensed = tuple(
             Output(
                 reading.name,
                 sensor.sensor,
@@ -126,11 +136,21 @@ class TactileModule(nn.Module):
             for sensor in self.plan.sensors
             for reading in sensor.readings
         )
+        joints = tuple(
+            Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
+            for r in self.plan.proprioception
+        )
+        return Outputs(sensed + joints)
 
     @property
-    def taxels(self) -> dict[str, Any]:
+    def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
+        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        return observation_terms(self.plan)
+
+    @property
+    def taxels(self) -> dict[str, TaxelTable]:
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
-        return {sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors}
+        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors})
 
     @property
     def dtype(self) -> torch.dtype:
@@ -218,9 +238,15 @@ class TactileModule(nn.Module):
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
         """Return the fields of a state that are wanted, and the number of environments."""
+        if not isinstance(state, SceneState):
+            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
+            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(self.inputs.fields)}")
         tensors = state.checked(self.inputs, self.device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
             held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
@@ -236,16 +262,13 @@ class TactileModule(nn.Module):
             raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
         if self.memory.num_kept is None:
             if not self._last:
-                raise StateError(
-                    "nothing was handed out yet for the environments left out: call the module without a mask first"
-                )
+                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
             stacks = {reading.name for sensor in self.plan.sensors for reading in sensor.windows if reading.steps}
             self.memory.keep({name: reading for name, reading in self._last.items() if name not in stacks})
-        if self.memory.num_kept not in (None, num_envs):
-            raise StateError(
-                f"readings of {self.memory.num_kept} environments were handed out before, the scene has {num_envs}"
-            )
-        return env_mask(mask if mask is not None else env_ids, num_envs, self.device)
+        kept = self.memory.num_kept
+        if kept not in (None, num_envs):
+            raise StateError(f"readings of {kept} environments were handed out before, the scene has {num_envs}")
+        return env_mask(mask if mask is not None else env_ids, num_envs, self.device, StateError, waits=False)
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
@@ -253,7 +276,7 @@ class TactileModule(nn.Module):
         if self._graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
             call = self._graphed[name]
         found = call(tensors, memory)
-        return {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
+        return {name: found[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
@@ -318,28 +341,17 @@ class TactileModule(nn.Module):
                 updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
                 found[reading.name] = reduced(updated[path], sensor.history.reduce)
             readings |= found
+        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
 
         Raises:
-            ObservationError: If an observation is one that only the real hand has.
+            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
         """
-        num_envs = next(iter(readings.values())).shape[0]
-        nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
-        groups: dict[str, list[Tensor]] = {}
-        for term in self.plan.observations:
-            features = nothing
-            if term.type in observations.HAND_ONLY:
-                raise observations.hand_only_error(term.group, term.index, term.type)
-            if term.reading is not None:
-                constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-                reading = readings[term.reading]
-                steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-                features = torch.cat([observations.observe(term.type, step, term.channels, constants) for step in steps], dim=1)
-            groups.setdefault(term.group, []).append(features)
-        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+        return observe(self.plan, self.constants, readings)
 
     def images(
         self, name: str, readings: Mapping[str, Tensor]
@@ -374,7 +386,8 @@ class TactileModule(nn.Module):
         per episode are drawn anew.
 
         Args:
-            env_ids: Indices, or a boolean mask over environments.
+            env_ids: Indices, or a boolean mask over environments. Indices that lie on a GPU are not looked at, as that would
+                wait for it: there the kernel asserts.
 
         Raises:
             StateError: If there are no such environments.
@@ -382,7 +395,7 @@ class TactileModule(nn.Module):
         if self.num_envs is None:
             return  # nothing is held yet, and the first call begins an episode
         with torch.no_grad():
-            self.memory.reset(env_mask(env_ids, self.num_envs, self.device))
+            self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))
 
     def seed(self, seed: int, first_env: int | None = None) -> TactileModule:
         """Choose the random numbers of noise; steps and episodes are counted from 0 again.
@@ -391,12 +404,15 @@ class TactileModule(nn.Module):
         sensors or environments, the batch size, the device or the process.
 
         Args:
-            seed: Any integer.
+            seed: Any integer; those that differ by a multiple of 2⁶⁴ are the same.
             first_env: Number of this module's first environment among those of all processes; default: where torch runs
                 distributed, the process's rank times the number of its environments, else 0.
 
         Returns:
             The module.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is none that an environment can have.
         """
         self.memory.clock.seed_with(seed, first_env)
         return self

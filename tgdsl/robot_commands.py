@@ -65,10 +65,11 @@ class Import:
     def run(self) -> None:
         """Write it."""
         from tgdsl.compiler.usd import usd_to_mjcf, write_mjcf
+        from tgdsl.schema.files import with_folder, writable
 
-        out = self.out or Path(self.stage.with_suffix(".xml").name)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        write_mjcf(usd_to_mjcf(self.stage), out)
+        out = writable(self.out or Path(self.stage.with_suffix(".xml").name))
+        text = usd_to_mjcf(self.stage)
+        write_mjcf(text, with_folder(out))
         print(out)
 
 
@@ -85,9 +86,9 @@ class ExportUsd:
         """Write it."""
         from tgdsl.compiler.links import robot_path
         from tgdsl.compiler.usd_export import export_usd
+        from tgdsl.schema.files import with_folder, writable
 
         file = robot_path(self.robot)
-        out = self.out or Path(file.with_suffix(".usda").name)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        export_usd(file, out)
+        out = writable(self.out or Path(file.with_suffix(".usda").name))
+        export_usd(file, with_folder(out))
         print(out)

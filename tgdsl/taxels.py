@@ -13,10 +13,11 @@ from jaxtyping import Int
 
 from tgdsl.errors import TgdslError
 from tgdsl.layout import Layout
+from tgdsl.tables import TaxelTable
 
 
-def taxel_table(layout: Layout) -> np.ndarray:
-    """Return a layout as a NumPy structured array, a row per taxel.
+def taxel_table(layout: Layout) -> TaxelTable:
+    """Return a layout as a NumPy structured array that prints as a table, a row per taxel.
 
     Columns: `link`, `body`, `pos` and `normal` and `tangent` (body frame), `radius` [m], `area` [m²], `row`, `column` (−1 where
     there is no grid), `groups` (names joined by commas).
@@ -37,7 +38,7 @@ def taxel_table(layout: Layout) -> np.ndarray:
     table = np.empty(layout.num_taxels, dtype=[(name, column.dtype, column.shape[1:]) for name, column in columns])
     for name, column in columns:
         table[name] = column
-    return table
+    return table.view(TaxelTable)
 
 
 def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]:

@@ -219,6 +219,36 @@ def test_a_group_right_inside_itself(folder):
     assert 'group "tips" contains itself' in found[0]
 
 
+def test_a_group_of_the_link_that_it_is_called_after(folder):
+    """`palm: [palm]` is the link, wherever the group is named; and the same as without the group."""
+    plain = resolved(folder)
+    grouped = resolved(folder, DOCUMENT.replace('tips: ["*_2"]', 'palm: [palm]\n      tips: ["*_2"]'))
+    assert dict(plain.links) == dict(grouped.links)
+    assert grouped.layout.groups == {**plain.layout.groups, "palm": ("palm",)}
+
+
+def test_a_layout_of_another_robot_is_one_mistake(folder):
+    """However many links, groups and sensors it has; one link that is there makes it this robot's."""
+    layout = {"groups": {"hand": ["a_*"], "tips": ["a_tip"]}, "resolutions": {"low": {"a_tip": POINT, "a_palm": POINT}}}
+    touch = {"kind": "contact_depth", "feels": ["cube"]}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(folder / "hand.xml"), "layout": layout},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"one": {**touch, "links": "hand"}, "two": {**touch, "links": "tips"}},
+    }
+    with pytest.raises(SpecError) as caught:
+        resolve(load(document))
+    assert str(caught.value) == (
+        "<mapping>: robot.layout: this layout is for another robot: hand.xml has none of its 2 links; "
+        "the layout has a_tip, a_palm; the robot has palm, index_1, index_2, thumb_1 and 6 more"
+    )
+    layout["resolutions"]["low"]["palm"] = POINT
+    with pytest.raises(SpecError) as caught:
+        resolve(load(document))
+    assert len(caught.value.problems) == 6
+
+
 def test_a_group_that_matches_nothing_is_told_where_it_is_defined(folder):
     assert problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", "*_tipp"]')) == [
         'd.yaml:6:21: robot.layout.groups.tips[1]: no link matches "*_tipp"; did you mean "tips"?'

@@ -150,7 +150,8 @@ def test_recorder_file(document, tmp_path, controls):
     with np.load(tmp_path / "r.npz", allow_pickle=False) as archive:
         found = dict(archive)
     units = {f"{name}:{part}" for name in kept for part in ("channels", "units")}
-    assert found.keys() == {"time", "ctrl", "touch", "touch/clean", "depth"} | units
+    places = {f"{name}:{part}" for name in kept for part in ("link", "body", "pos", "normal", "area")}
+    assert found.keys() == {"time", "ctrl", "touch", "touch/clean", "depth"} | units | places
     np.testing.assert_allclose(found["time"], [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(found["ctrl"], controls)
     for name, values in kept.items():
@@ -159,7 +160,23 @@ def test_recorder_file(document, tmp_path, controls):
     assert found["touch:channels"].tolist() == ["force_x", "force_y", "force_z"]
     assert found["touch/clean:units"].tolist() == ["N"] * 3
     assert (found["depth:channels"].tolist(), found["depth:units"].tolist()) == (["depth"], ["m"])
+    for name in kept:  # the points of the layout, by hand
+        assert found[f"{name}:link"].tolist() == found[f"{name}:body"].tolist() == ["pad"] * 3
+        np.testing.assert_allclose(found[f"{name}:pos"], [[0, 0, 0.01], [0.01, 0, 0.01], [0.025, 0, 0.01]])
+        np.testing.assert_allclose(found[f"{name}:normal"], [[0, 0, 1]] * 3)
+        np.testing.assert_allclose(found[f"{name}:area"], np.pi * 0.004**2)
     assert [path.name for path in tmp_path.iterdir()] == ["r.npz"]
+
+
+def test_a_recording_of_bodies_says_which(document, tmp_path):
+    sensors = {"solver": {"kind": "link_contact", "links": "pad", "feels": ["cube"]}}
+    touch = tgdsl.compile({**document, "sensors": sensors})
+    recorder = Recorder(touch, 1, 1)
+    recorder.add(Step(0, 0.1, {"solver": torch.zeros(1, 1, 4)}))
+    recorder.write(tmp_path / "r.npz", np.zeros((1, 2)))
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as found:
+        assert found["solver:body"].tolist() == ["pad"]
+        assert not {"solver:pos", "solver:link"} & set(found)
 
 
 def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):

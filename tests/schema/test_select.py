@@ -37,6 +37,28 @@ def test_a_group_counts_before_a_link_of_its_name():
     assert chosen(["palm"], groups={"palm": ["index_mid"]}) == ([2], [])
 
 
+def test_in_its_own_group_a_name_is_the_link():
+    """Whoever lists the link that a group is called after means the link, also from within other groups."""
+    assert chosen(["palm"], groups={"palm": ["palm"]}) == ([0], [])
+    assert chosen(["palm"], groups={"palm": ["palm", "index_mid"]}) == ([0, 2], [])
+    assert chosen(["hand"], groups={"palm": ["palm"], "hand": ["palm", "thumb_tip"]}) == ([0, 3], [])
+    assert chosen(["hand"], ["palm"], {"palm": ["palm"], "hand": ["*"]}) == ([1, 2, 3], [])
+
+
+def test_only_a_group_of_a_links_name_may_list_itself():
+    def said(groups, group):
+        named = {name: Selection(include=tuple(parts)) for name, parts in groups.items()}
+        found = []
+        select(named[group], LINKS, named, lambda where, what, hint: found.append((what, hint)), group)
+        return found
+
+    assert said({"palm": ["palm"]}, "palm") == []
+    assert said({"palm": ["palm", "tips"], "tips": ["palm"]}, "palm") == [
+        ('group "palm" contains itself', "palm → tips → palm")
+    ]
+    assert said({"tips": ["tips", "*_tip"]}, "tips") == [('group "tips" contains itself', "tips → tips")]
+
+
 def test_what_matches_nothing_is_named():
     assert chosen(["palm", "pam"]) == ([0], [("pam", 'no link matches "pam"', 'did you mean "palm"?')])
     hint = "known links: index_mesh, index_mid, index_tip, palm, thumb_mesh, thumb_tip, tips"

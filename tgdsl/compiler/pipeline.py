@@ -13,44 +13,52 @@ from typing import Any
 import mujoco
 import torch
 
-from tgdsl.buffers import check_dtype
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.robot import xml_files
 from tgdsl.compiler.scene import scene_file
+from tgdsl.devices import device_of, dtype_of
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout import Layout
 from tgdsl.module import TactileModule
 from tgdsl.plan import Origin, Plan
+from tgdsl.progress import Progress, silent
 from tgdsl.scene import portable
 from tgdsl.schema.load import Loaded, load
-from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors import Kind, known_kinds
 
 Document = str | PathLike[str] | Mapping[str, Any]
 
 
-def compile_plan(document: Document, overrides: Mapping[str, str] | None = None, kinds: Sequence[Kind] = ()) -> Plan:
+def compile_plan(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+) -> Plan:
     """Return the Plan of a document.
 
     Args:
         document: A YAML file, or the same as a mapping.
-        overrides: YAML text by dotted path, set before anything is read: `{"resolution": "high"}`.
+        overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
         kinds: Sensor kinds of your own, beside those of tgdsl.
+        progress: Is told in a line what is being done, each time that something begins.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
     """
-    known = (*KINDS, *kinds)
+    known, tell = known_kinds(kinds), progress or silent
     loaded = load(document, overrides, known)
-    resolved = resolve(loaded)
-    plan = lower.plan(loaded, resolved, known, _origin(loaded))
+    resolved = resolve(loaded, tell)
+    plan = lower.plan(loaded, resolved, known, _origin(loaded), tell)
+    tell("compiling the scene")
     return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
 
 
 def layouts(
     document: Document,
-    overrides: Mapping[str, str] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     resolutions: Sequence[str] = (),
     kinds: Sequence[Kind] = (),
 ) -> tuple[mujoco.MjModel, dict[str, Layout]]:
@@ -58,7 +66,7 @@ def layouts(
 
     Args:
         document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
-        overrides: YAML text by dotted path.
+        overrides: YAML text, or plain values, by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
         kinds: Sensor kinds of your own, beside those of tgdsl.
 
@@ -70,7 +78,7 @@ def layouts(
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
         TgdslError: If the layout has no such resolution.
     """
-    chosen, known = overrides or {}, (*KINDS, *kinds)
+    chosen, known = overrides or {}, known_kinds(kinds)
     loaded = load(document, chosen, known, needs_sensors=False)
     if loaded.layout is None:
         return resolve(loaded).scene.compiled, {}  # which says all that is wrong
@@ -88,21 +96,25 @@ def compile(
     document: Document,
     *,
     resolution: str | None = None,
-    overrides: Mapping[str, str] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | str = torch.float32,
     device: torch.device | str = "cpu",
+    progress: Progress | None = None,
 ) -> TactileModule:
     """Compile a document to a module.
 
     Args:
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
         resolution: Instead of the document's own.
-        overrides: YAML text by dotted path, such as `{"sensors.touch.normal_stiffness": "400"}`.
+        overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
         kinds: Sensor kinds of your own, beside those of tgdsl.
-        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64. Narrower floats are refused, as
-            their rounding of places is as large as the depths; cast the readings instead, `readings["s"].to(torch.bfloat16)`.
+        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
+            are refused, as their rounding of places is as large as the depths; cast the readings instead,
+            `readings["s"].to(torch.bfloat16)`.
         device: Where the module lives.
+        progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
+            that are met for the first time take seconds.
 
     Returns:
         The module, not yet compiled by torch: call its `compile()` for fused kernels.
@@ -110,12 +122,12 @@ def compile(
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
-        TgdslError: If the dtype is neither float32 nor float64.
+        TgdslError: If the dtype is neither float32 nor float64, there is no such device, or a kind is none.
     """
-    check_dtype(dtype)
+    dtype, device = dtype_of(dtype), device_of(device)
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, chosen, kinds)
-    return TactileModule(plan, (*KINDS, *kinds), dtype).to(device)
+    plan = compile_plan(document, chosen, kinds, progress)
+    return TactileModule(plan, known_kinds(kinds), dtype).to(device)
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -12,7 +12,7 @@ from tgdsl import units
 from tgdsl.compiler.propose import FACTORS, LinkProposal, Proposal, escaped, propose
 from tgdsl.compiler.robot import Model
 from tgdsl.errors import TgdslError, listed
-from tgdsl.schema.files import write_whole
+from tgdsl.schema.files import with_folder, writable, write_whole
 
 WIDTH = 120
 """Lists of names are broken at this column."""
@@ -45,7 +45,8 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         is_forced: Whether it may be replaced.
 
     Raises:
-        TgdslError: If the density is none, the file is there already, or the robot has no link that can carry taxels.
+        TgdslError: If the density is none, the file is there already or cannot be written, or the robot has no link that can
+            carry taxels.
     """
     try:
         per_area = units.parse(density, "density")
@@ -53,11 +54,11 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         raise TgdslError(f"--density: {error}") from error
     if per_area <= 0:
         raise TgdslError(f"--density: {density} is out of range, expected more than 0")
-    if out.exists() and not is_forced:
+    if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
+    writable(out)
     proposal = propose(robot, per_area, with_groups)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(out, layout_text(proposal, robot.file.name).encode())
+    write_whole(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),

@@ -16,6 +16,7 @@ from tgdsl.compiler.variants import OwnObjects
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout, Link
+from tgdsl.progress import Progress, silent
 from tgdsl.regions import RegionPart
 from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
@@ -71,19 +72,24 @@ class Resolved:
             raise LowerError(error.what, hint=error.hint) from error
 
 
-def resolve(loaded: Loaded) -> Resolved:
+def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     """Place a document's sensors on its robot.
+
+    Args:
+        loaded: The document.
+        progress: Is told what is done.
 
     Raises:
         SpecError: All mistakes found so far, those of reading included.
         RobotError: If a model file cannot be read.
     """
+    progress("reading robot and scene")
     robot, scene = _models(loaded)
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, FeltBody] = {}
     own = OwnObjects()
-    if robot is not None and loaded.layout is not None:
+    if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
         _check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
@@ -96,12 +102,13 @@ def resolve(loaded: Loaded) -> Resolved:
     loaded.raise_problems()
     assert robot is not None and scene is not None and loaded.layout is not None
     needed = {name for names in links.values() for name in names} if links else {patch.link.name for patch in patches}
-    layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed])
+    layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
     listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
-    others = [body for body in scene.bodies if body not in robot.bodies[1:] and body not in listed_bodies]
+    welded = {scene.compiled.body(i).name for felt in objects.values() for i in felt.bodies}
+    others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {patch.link.name: patch for patch in patches})
 
@@ -125,6 +132,17 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
         what = f'there is no file "{loaded.spec.scene.model}"'
         loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
     return robot, scene
+
+
+def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
+    """Return whether a layout is for another robot, which is then one mistake: none of its links is on this one."""
+    keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
+    if len(keys) < 2 or any(_matched(robot, key) for key in keys):
+        return False
+    what = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
+    hint = f"the layout has {listed(keys, 4)}; the robot has {listed([b for b in robot.bodies if b != 'world'], 4)}"
+    loaded.problems.append(loaded.problem(("robot", "layout"), what, hint))
+    return True
 
 
 def _names(robot: Model) -> list[list[str]]:
@@ -223,9 +241,10 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
 
 
-def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> Layout:
+def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch], progress: Progress) -> Layout:
     parts: list[Samples] = []
-    for patch in patches:
+    for i, patch in enumerate(patches):
+        progress(f"placing taxels on {patch.link.name} ({i + 1} of {len(patches)} links)")
         try:
             parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder))
         except SampleError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from tgdsl.module import TactileModule
-from tgdsl.runtime.dots import Dots, dots_of
+from tgdsl.runtime.dots import Dots, dots_of, touched
 from tgdsl.runtime.source import Simulator
 from tgdsl.runtime.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
+from tgdsl.schema.files import whole, with_folder
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -24,7 +26,14 @@ ARROW = 0.09
 
 
 def overview(
-    touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor], path: Path, *, env: int = 0, title: str = ""
+    touch: TactileModule,
+    sim: Simulator,
+    readings: Mapping[str, Tensor],
+    path: Path,
+    *,
+    env: int = 0,
+    title: str = "",
+    view: str | None = None,
 ) -> Path:
     """Draw every reading of one environment, and write the picture.
 
@@ -38,24 +47,34 @@ def overview(
         path: PNG file to write; its folder is made if need be.
         env: Which environment.
         title: What to write above it all.
+        view: From where, as in `view.picture`.
 
     Returns:
         The path.
 
     Raises:
-        ViewError: If there is no such environment, or nothing to draw.
+        ViewError: If there is no such environment or view, or nothing to draw.
+        FileError: If the file cannot be written.
     """
-    figure = drawing(touch, sim, readings, env=env, title=title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    figure = drawing(touch, sim, readings, env=env, title=title, view=view)
+    with whole(with_folder(path)) as file:
+        figure.savefig(file, format="png")
     return path
 
 
-def drawing(touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor], *, env: int = 0, title: str = "") -> Figure:
-    """Return what `overview` writes; its axes are the panels, in the order of the module's outputs."""
-    outputs = [output for output in touch.outputs if output.name in readings]
+def drawing(
+    touch: TactileModule,
+    sim: Simulator,
+    readings: Mapping[str, Tensor],
+    *,
+    env: int = 0,
+    title: str = "",
+    view: str | None = None,
+) -> Figure:
+    """Return what `overview` writes; its axes are the panels, one for each reading of taxels or bodies."""
+    outputs = [output for output in touch.outputs if output.name in readings and output.rows in ("taxel", "body")]
     if not outputs:
-        raise ViewError("there is nothing to draw: the readings given hold none of this module's")
+        raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = [dots_of(touch, sim, output, readings[output.name], env) for output in outputs]
@@ -64,7 +83,8 @@ def drawing(touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor]
     width, height = (FINE * round(0.94 * size * DPI) for size in (PANEL[0], 0.82 * PANEL[1]))
     has_taxels = any(output.rows == "taxel" for output in outputs)
     lead = outputs.index(chosen_output(touch, readings)) if has_taxels else 0
-    scene = scene_of(touch, sim, dots[lead], env, width, height)
+    dots[lead] = replace(dots[lead], would_read=touched(touch, sim, outputs[lead], readings, env))
+    scene = scene_of(touch, sim, dots[lead], env, width, height, view)
     figure = Figure(figsize=(columns * PANEL[0], rows * PANEL[1] + 0.5), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
@@ -82,7 +102,7 @@ def drawing(touch: TactileModule, sim: Simulator, readings: Mapping[str, Tensor]
         draw_dots(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
         _draw_arrows(axes, scene, own)
         axes.set_title(f"{output.name}  ·  {output.kind}", fontsize=11, color=INK, loc="left", pad=18, weight="bold")
-        axes.text(0, 1.02, f"{own.quantity}  {own.summary()}", transform=axes.transAxes, fontsize=9.5, color=FAINT)
+        axes.text(0, 1.02, own.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
     figure.text(0.012, 1 - 0.26 / figure.get_figheight(), title, size=15, weight="bold", color=INK, va="center")
     return figure
 

@@ -6,7 +6,7 @@ shows. Shapes: `point` points of the picture, `h` and `w` rows and columns of pi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -20,14 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
-from tgdsl.errors import did_you_mean
+from tgdsl.errors import FileError
 from tgdsl.layout import Layout
+from tgdsl.runtime.cameras import ViewError, angles_of, camera_of, pose_of
 from tgdsl.runtime.discs import discs, group_of, legend, radii, taxels_of
-from tgdsl.runtime.dots import Pose, Taxels
+from tgdsl.runtime.dots import Taxels
 from tgdsl.runtime.shot import (
-    Camera,
     Screen,
     Shot,
     Solid,
@@ -39,13 +38,11 @@ from tgdsl.runtime.shot import (
     shaded,
     smaller,
     solid_of,
-    unit,
 )
-from tgdsl.runtime.view import FAINT, INK, ViewError, draw_ruler
+from tgdsl.runtime.view import FAINT, INK, draw_ruler
+from tgdsl.schema.files import whole, with_folder, writable
 
 Array = np.ndarray
-VIEWS = {"front": (6.0, 16.0), "back": (186.0, 16.0), "left": (-70.0, 10.0), "right": (70.0, 10.0), "iso": (36.0, 32.0)}
-"""Where the camera is, from the taxels' mean normal: degrees round the hand to the picture's right, and degrees up."""
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
 HEIGHT = 750
 """Rows of the file if no size is asked for."""
@@ -74,7 +71,8 @@ def render(
         layouts: What to draw, by the title of its panel.
         out: PNG file to write; its folder is made if need be.
         keyframe: Name of the model's keyframe that gives the pose; default: the model's own initial state.
-        view: One of `VIEWS`. In `front` the taxels' mean normal points at the camera, or nearly so.
+        view: One of `cameras.VIEWS`, or azimuth and elevation in degrees. In `front` the taxels' mean normal points at the
+            camera, or nearly so.
         size: Columns and rows of the file; default: `HEIGHT` rows and as many columns as the hand needs.
 
     Returns:
@@ -83,12 +81,13 @@ def render(
     Raises:
         ViewError: If there is no such keyframe or view, if there is nothing to draw, or if the file cannot be written.
     """
-    figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, format="png", pil_kwargs={"optimize": True})
-    except OSError as error:
-        raise ViewError(f"cannot write {out}: {error.strerror or error}") from error
+        writable(out)
+        figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
+        with whole(with_folder(out)) as file:
+            figure.savefig(file, format="png", pil_kwargs={"optimize": True})
+    except FileError as error:
+        raise ViewError(f"cannot write {error}") from error
     return out
 
 
@@ -127,8 +126,7 @@ def drawing(
 
 
 def _check(layouts: Mapping[str, Layout], view: str, size: tuple[int, int] | None) -> None:
-    if view not in VIEWS:
-        raise ViewError(f'there is no view "{view}"; {did_you_mean(view, VIEWS, "views")}')
+    angles_of(view)
     if not any((layout.radius > 0).any() for layout in layouts.values()):
         raise ViewError("there is nothing to draw: no layout has a taxel")
     if size is not None and min(size) < FEWEST:
@@ -136,53 +134,6 @@ def _check(layouts: Mapping[str, Layout], view: str, size: tuple[int, int] | Non
 
 
 # The hand -------------------------------------------------------------------------------------------------------------
-
-
-def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
-    """Return where a keyframe puts the bodies; without one, where the model's own initial state does.
-
-    Raises:
-        ViewError: If the model has no such keyframe.
-    """
-    state = mujoco.MjData(model)
-    if keyframe is not None:
-        names = [model.key(i).name for i in range(model.nkey)]
-        if keyframe not in names:
-            raise ViewError(f'the scene has no keyframe "{keyframe}"; {did_you_mean(keyframe, names, "keyframes")}')
-        mujoco.mj_resetDataKeyframe(model, state, names.index(keyframe))
-    mujoco.mj_kinematics(model, state)
-    return Pose(state.xpos.copy(), state.xquat.copy())
-
-
-def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, top: int) -> Camera:
-    """Return the camera of a view: it is fixed to the hand's first body, so that a hand that closes is seen from the same side.
-
-    Args:
-        view: One of `VIEWS`.
-        model: The robot.
-        layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
-        pose: Where the bodies are.
-        top: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
-            those that do not point at the camera.
-    """
-    initial = pose_of(model, None)
-    taxels = [taxels_of(model, initial, layout) for layout in layouts]
-    weight = np.concatenate([each.size**2 for each in taxels])
-    centre = weight @ np.concatenate([each.pos for each in taxels]) / weight.sum()
-    normal = unit(weight @ np.concatenate([each.normal for each in taxels]), np.zeros(3))
-    axes = Rotation.from_quat(initial.quat[top], scalar_first=True).as_matrix().T
-    axes = np.concatenate([axes, -axes])
-    across = axes[np.abs(axes @ normal) < 0.7]
-    up = across[np.argmax(across @ (centre - initial.pos[top] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
-    toward = unit(normal - (normal @ up) * up, axes[np.argmin(np.abs(axes @ up))])
-    around, rise = np.radians(VIEWS[view])
-    level = np.cos(around) * toward + np.sin(around) * np.cross(up, toward)
-    toward = np.cos(rise) * level + np.sin(rise) * up
-    right = np.cross(up, level)
-    frame = np.stack([right, np.cross(toward, right), toward])
-    turn = Rotation.from_quat(pose.quat[top], scalar_first=True).as_matrix() @ axes[:3]
-    right, above, toward = frame @ turn.T
-    return Camera(right, above, toward, pose.pos[top])
 
 
 def _box(points: Float[Array, "point 2"]) -> Float[Array, "2 2"]:

@@ -15,8 +15,8 @@ from typing import NoReturn
 import numpy as np
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.errors import StateError, TgdslError
-from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
 from tgdsl.runtime.xhand1.errors import StaleReadingError

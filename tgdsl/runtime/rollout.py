@@ -5,8 +5,7 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` 
 
 from __future__ import annotations
 
-import os
-import tempfile
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,8 +19,13 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module import TactileModule
+from tgdsl.runtime.controls import control_tensor
+from tgdsl.runtime.room import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
+from tgdsl.schema.files import whole
 
+PLACES = ("link", "body", "pos", "normal", "area")
+"""What is kept of each taxel, as `taxels.taxel_table` calls it."""
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
@@ -44,7 +48,8 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
         control_step: Duration of a control step [s].
 
     Raises:
-        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive.
+        SimulationError: If the scene has no such keyframe, none is given, or the duration is not positive, or takes more steps
+            than there is memory for.
     """
     if not keyframes or not 0 < seconds < np.inf:
         raise SimulationError(f"{len(keyframes)} keyframes held for {seconds:g} s: expected at least one, and more than 0 s")
@@ -52,7 +57,7 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     for name in keyframes:
         if name not in known:
             raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}')
-    steps = max(round(seconds / control_step), 1)
+    steps = _num_steps(model, seconds, control_step, 2 * len(keyframes) - 1)
     targets = [model.key_ctrl[model.key(name).id] for name in keyframes]
     parts = [np.tile(targets[0], (steps, 1))]
     for start, end in pairwise(targets):
@@ -76,18 +81,25 @@ def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) ->
         control_step: Duration of a control step [s].
 
     Raises:
-        SimulationError: If the duration is not positive.
+        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
     """
     if not 0 < seconds < np.inf:
         raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
-    return np.zeros((max(round(seconds / control_step), 1), model.nu))
+    return np.zeros((_num_steps(model, seconds, control_step), model.nu))
+
+
+def _num_steps(model: mujoco.MjModel, seconds: float, control_step: float, times: int = 1) -> int:
+    """Return how many control steps a duration has, at least one; controls of so many, `times` over, fit into memory."""
+    steps = max(round(seconds / control_step), 1)
+    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * model.nu)
+    return steps
 
 
 def recorded_controls(path: Path) -> Controls:
     """Return the array `ctrl` of an `.npz` file, (step, actuator) or (step, env, actuator).
 
     Raises:
-        SimulationError: If the file cannot be read or holds no such array.
+        SimulationError: If the file cannot be read or holds no such array, or a number in it is not finite.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -99,13 +111,25 @@ def recorded_controls(path: Path) -> Controls:
             f"{path}: `ctrl` is {controls.dtype} of shape {controls.shape}, "
             "expected floats (step, actuator) or (step, env, actuator)"
         )
+    if len(bad := np.argwhere(~np.isfinite(controls))):
+        place = ", ".join(map(str, bad[0]))
+        more = f", and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise SimulationError(f"{path}: `ctrl[{place}]` is {controls[tuple(bad[0])]}{more}: expected finite numbers")
     return controls.astype(np.float64)
 
 
 def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterator[Step]:
-    """Step a scene through controls and yield the readings after each control step."""
+    """Step a scene through controls and yield the readings after each control step.
+
+    Raises:
+        SimulationError: If the controls do not fit the scene, or a step fails: then it says which one, from 0.
+    """
+    control_tensor(controls[0], sim.num_envs, sim.model.nu)
     for index, control in enumerate(controls):
-        sim.step(control)
+        try:
+            sim.step(control)
+        except SimulationError as error:
+            raise SimulationError(f"control step {index} of {len(controls)}: {error}") from error
         yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
 
 
@@ -113,12 +137,20 @@ class Recorder:
     """Keeps the readings of a rollout and writes them as one `.npz` file.
 
     The file holds `time` (step,) [s], `ctrl` (step, …, actuator), each reading by its name (step, env, taxel, channel) as
-    float32, and its channels' names and units under `<name>:channels` and `<name>:units`.
+    float32, and its channels' names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under
+    `<name>:link`, `<name>:body`, `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings
+    of bodies there is `<name>:body` alone.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
-        """Make room for a rollout."""
-        self._outputs = touch.outputs
+        """Make room for a rollout.
+
+        Raises:
+            SimulationError: If this computer has too little memory.
+        """
+        self._outputs, self._taxels = touch.outputs, touch.taxels
+        size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
+        refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)
         self._readings = {
             output.name: np.empty((num_steps, num_envs, *output.shape), dtype=np.float32) for output in self._outputs
         }
@@ -136,12 +168,9 @@ class Recorder:
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)
             arrays[f"{output.name}:units"] = np.array(output.units)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+            if output.rows == "body":
+                arrays[f"{output.name}:body"] = np.array(output.bodies)
+            elif output.rows == "taxel":
+                arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
+        with whole(path) as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

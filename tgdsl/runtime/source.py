@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 import mujoco
@@ -10,10 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.env_ids import EnvIds
 from tgdsl.state import SceneState
-
-EnvIds = Tensor | np.ndarray | Sequence[int]
-"""Environments: indices, or a boolean mask over all of them."""
 
 
 class Source(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +16,14 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import did_you_mean
 from tgdsl.module import Output, TactileModule
-from tgdsl.runtime.dots import Dots, Pose, dots_of
+from tgdsl.runtime.cameras import ViewError as ViewError
+from tgdsl.runtime.cameras import best_camera, camera_of
+from tgdsl.runtime.dots import Dots, Pose, dots_of, touched
 from tgdsl.runtime.shot import (
     Screen,
     Shot,
-    camera_for,
     is_seen,
     rasterise,
     robot_bodies,
@@ -32,20 +34,18 @@ from tgdsl.runtime.shot import (
     unit,
 )
 from tgdsl.runtime.source import Simulator
+from tgdsl.schema.files import whole, with_folder
 
 Array = np.ndarray
 SIZE, DPI = (16.0, 9.0), 100
 VIEW = (0.0125, 0.06, 0.55, 0.82)  # the 3-D view in the figure: left, bottom, width, height
 FINE = 2  # pixels of the 3-D view per pixel of the file, along each axis
 MAX_MAPS = 12
+_TITLE = {1: 11, 2: 11, 3: 9, 4: 7.8}  # size of the maps' titles, by how many stand side by side
 INK, FAINT, REST = "#2b2f36", "#7b828c", "#d3d6da"
 _LIT, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
 _HEAT = LinearSegmentedColormap.from_list("touch", matplotlib.colormaps["YlOrRd"](np.linspace(0.2, 0.93, 256)))
 _HEAT = _HEAT.with_extremes(under=REST, bad=(0, 0, 0, 0))
-
-
-class ViewError(TgdslError):
-    """A picture that cannot be drawn of what was given."""
 
 
 def picture(
@@ -57,6 +57,7 @@ def picture(
     env: int = 0,
     reading: str | None = None,
     title: str = "",
+    view: str | None = None,
 ) -> Path:
     """Draw one reading of one environment: the robot with its taxels, and a heat map per link.
 
@@ -68,32 +69,37 @@ def picture(
         env: Which environment.
         reading: Which reading of taxels; default: a kinematic taxel's, if there is any, or else the first.
         title: What to write above it all; default: the reading's name.
+        view: From where: one of `cameras.VIEWS`, or azimuth and elevation in degrees, "30,20"; default: see
+            `cameras.best_camera`.
 
     Returns:
         The path.
 
     Raises:
-        ViewError: If there is no such reading or environment.
+        ViewError: If there is no such reading, environment or view.
+        FileError: If the file cannot be written.
     """
     output = chosen_output(touch, readings, reading)
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = dots_of(touch, sim, output, readings[output.name], env)
+    dots = replace(dots, would_read=touched(touch, sim, output, readings, env))
     table = touch.taxels[output.sensor]
     norm = Normalize(0.0, float(dots.value.max()) or 1.0)
     figure = Figure(figsize=SIZE, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     width, height = (FINE * round(part * size * DPI) for part, size in zip(VIEW[2:], SIZE, strict=True))
-    draw_dots(figure.add_axes(VIEW), scene_of(touch, sim, dots, env, width, height), dots, norm)
+    draw_dots(figure.add_axes(VIEW), scene_of(touch, sim, dots, env, width, height, view), dots, norm)
     _draw_maps(figure, dots, table, norm)
     resolution = touch.plan.origin.resolution
     figure.text(0.016, 0.955, title or output.name, size=19, weight="bold", color=INK, va="center")
     parts = [output.name] if title else []
     parts += [output.kind, f"resolution {resolution}"] if resolution else [output.kind]
-    parts += [f"{dots.is_read.sum()} of {len(table)} taxels touched", f"{dots.quantity} {dots.summary()}", f"environment {env}"]
+    count = f"{dots.is_touched.sum()} of {len(table)} taxels touched"
+    parts += [count + ("" if dots.would_read is None else " before noise"), dots.headline, f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, format="png")
+    with whole(with_folder(path)) as file:
+        figure.savefig(file, format="png")
     return path
 
 
@@ -124,7 +130,9 @@ class Backdrop(NamedTuple):
     screen: Screen
 
 
-def scene_of(touch: TactileModule, sim: Simulator, dots: Dots, env: int, width: int, height: int) -> Backdrop:
+def scene_of(
+    touch: TactileModule, sim: Simulator, dots: Dots, env: int, width: int, height: int, view: str | None = None
+) -> Backdrop:
     """Draw robot and felt objects, seen from where some taxels are in view.
 
     Args:
@@ -134,6 +142,7 @@ def scene_of(touch: TactileModule, sim: Simulator, dots: Dots, env: int, width: 
         env: Which environment.
         width: Columns, before `FINE` of them become one pixel.
         height: Rows, likewise.
+        view: From where; default: see `cameras.best_camera`.
     """
     model, pose = sim.model, Pose(*sim.body_poses(env))
     carriers = {model.body(link.body).id for link in touch.plan.links}
@@ -141,7 +150,8 @@ def scene_of(touch: TactileModule, sim: Simulator, dots: Dots, env: int, width: 
     felt = {model.body(target.body).id for target in touch.plan.objects}
     hand, objects = (solid_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
-    camera = camera_for(dots, pose.pos[min(framed)])
+    layout, top = touch.plan.layout(), min(framed)
+    camera = best_camera(dots, hand, model, layout, pose, top) if view is None else camera_of(view, model, [layout], pose, top)
     box = _window(camera.project(hand.corners[frame] if frame.any() else dots.pos[:, None]), camera.project(objects.corners))
     screen = screen_for(camera, box, width, height)
     shot = rasterise(screen.project(hand.corners), width, height)
@@ -210,7 +220,7 @@ def _draw_maps(figure: Figure, dots: Dots, table: Array, norm: Normalize) -> Non
         axes = figure.add_subplot(grid[i], anchor="N")
         chosen = np.flatnonzero(table["link"] == link)
         _draw_map(axes, dots.value[chosen], table[chosen], norm)
-        axes.set_title(f"{names[link]}\n{dots.summary(chosen)}", fontsize=9 if columns > 2 else 11, color=INK, linespacing=1.35)
+        axes.set_title(f"{names[link]}\n{dots.summary(chosen)}", fontsize=_TITLE[min(columns, 4)], color=INK, linespacing=1.35)
     if len(links) > MAX_MAPS:
         rest = f"and {len(links) - MAX_MAPS} more links, touched less or not at all"
         figure.text(0.985, 0.912, rest, size=10.5, color=FAINT, ha="right", va="center")

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 import tgdsl
+from tgdsl.errors import FileError
 
 _PACKAGE = Path(tgdsl.__file__).parent
 
@@ -48,16 +52,80 @@ def layout_file(model: Path) -> Path | None:
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
 
 
-def write_whole(target: Path, content: bytes) -> None:
-    """Write a file so that it appears whole or not at all; one that is there is replaced."""
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+def writable(target: Path) -> Path:
+    """See that a file can be written, before the work that leads to it; nothing is made, its folder neither.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    there = next(part for part in target.absolute().parents if part.exists())
+    if not there.is_dir():
+        raise FileError(f"{target}: {there} is a file, expected a folder")
+    with _named(target):
+        _refuse_folder(target)
+        with tempfile.TemporaryFile(dir=there):
+            return target
+
+
+def with_folder(target: Path) -> Path:
+    """Make the folder of a file that is written next; return the file.
+
+    Raises:
+        FileError: If it cannot be made.
+    """
+    with _named(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    return target
+
+
+@contextmanager
+def whole(target: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing that appears whole, when it is closed, or not at all; one that is there is replaced.
+
+    Raises:
+        FileError: If it cannot be written; the error names the file.
+    """
+    temporary = None
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        with _named(target):
+            _refuse_folder(target)
+            handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+            with os.fdopen(handle, "wb") as file:
+                yield file
+            umask = os.umask(0)
+            os.umask(umask)
+            os.chmod(temporary, 0o666 & ~umask)
+            os.replace(temporary, target)
+            temporary = None
+    finally:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+
+
+def write_whole(target: Path, content: bytes) -> None:
+    """Write a file so that it appears whole or not at all; one that is there is replaced.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    with whole(target) as file:
+        file.write(content)
+
+
+@contextmanager
+def _named(target: Path) -> Iterator[None]:
+    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile."""
+    try:
+        yield
+    except FileError:
         raise
+    except OSError as error:
+        raise FileError(f"{target}: {error.strerror or error}") from error
+
+
+def _refuse_folder(target: Path) -> None:
+    if target.is_dir():
+        raise FileError(f"{target}: this is a folder, expected a file's name")

@@ -10,7 +10,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from tgdsl.errors import Problem, SpecError, did_you_mean
+from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
+from tgdsl.proprioception import QUANTITIES
 from tgdsl.schema import files, yaml
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.faults import read_as
@@ -87,7 +88,7 @@ class Loaded:
 
 def load(
     document: str | PathLike[str] | Mapping[str, Any],
-    overrides: Mapping[str, str] | None = None,
+    overrides: Mapping[str, Any] | None = None,
     kinds: tuple[Kind, ...] = KINDS,
     needs_sensors: bool = True,
 ) -> Loaded:
@@ -95,7 +96,7 @@ def load(
 
     Args:
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
-        overrides: Values to set first, YAML text by dotted path, such as `{"resolution": "high"}`.
+        overrides: Values to set first by dotted path, as YAML text or plain, such as `{"resolution": "high"}`.
         kinds: The sensor kinds that the document may use.
         needs_sensors: Whether it is a mistake to have none.
 
@@ -104,13 +105,16 @@ def load(
 
     Raises:
         SpecError: If so much is wrong that no further stage can look at it.
+        TgdslError: If the document is neither a file's name nor a mapping.
     """
+    if not isinstance(document, (str, PathLike, Mapping)):
+        raise TgdslError(f"a document is a YAML file's name or a mapping, found {type(document).__name__}")
     if isinstance(document, Mapping):
         source, folder = yaml.from_mapping(document, "<mapping>"), FilePath.cwd()
     else:
         source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
-    for dotted, text in (overrides or {}).items():
-        source.set(dotted, text)
+    for dotted, value in (overrides or {}).items():
+        source.set(dotted, value)
     model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
@@ -224,13 +228,20 @@ def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
             if objects is not None and target not in objects:
                 hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
+            elif target in sensor.feels[:i]:
+                problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
         problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
+    for name in QUANTITIES.keys() & set(sensors):
+        what = f'"{name}" is the name of a reading that no sensor makes'
+        problems.append(source.problem(("sensors", name), what, "give the sensor another name", on_key=True))
     for group in names("observations") or []:
         terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
             target = term.get("of") if isinstance(term, dict) else None
-            if isinstance(target, str) and target.removesuffix("/clean") not in sensors:
+            if isinstance(target, str) and target.split("/")[0] not in sensors:
                 hint = did_you_mean(target, sensors, "sensors")
+                if target in QUANTITIES:
+                    hint = f"no sensor makes it: {{type: {target}}} observes it"
                 problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
     if loaded.layout is not None:
         resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})

@@ -9,7 +9,8 @@ from pydantic import Field, StrictInt, Tag, model_validator
 from tgdsl.fields import TEXT_OR_OTHER, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, Text
 from tgdsl.regions import Region
 
-Count = Annotated[StrictInt, Field(ge=1, le=1_000_000)]
+MAX_COUNT = 1_000_000
+Count = Annotated[StrictInt, Field(ge=1, le=MAX_COUNT)]
 
 
 class _Sampled(SpecModel):
@@ -40,6 +41,8 @@ class Grid(_Sampled):
 
     @model_validator(mode="after")
     def _enough_cells(self) -> Grid:
+        if self.rows * self.columns > MAX_COUNT:
+            raise ValueError(f"{self.rows} × {self.columns} cells are too many, expected at most {MAX_COUNT} in all")
         if self.count is not None and self.count > self.rows * self.columns:
             raise ValueError(f"count {self.count} is more than the {self.rows} × {self.columns} cells of the grid")
         return self

@@ -29,7 +29,8 @@ def select(
     Args:
         selection: What to include and exclude.
         candidates: The names that each candidate answers to.
-        groups: Named selections that may stand in place of names, also within one another.
+        groups: Named selections that may stand in place of names, also within one another. In its own definition a group's name
+            means the link that is called so.
         report: Called for each pattern of the selection itself that matches nothing; an `exclude` may match nothing.
         group: The selection's own name, if it is a group: that it contains itself is reported too.
 
@@ -42,7 +43,7 @@ def select(
             report(pattern, f'group "{pattern}" holds no link', "")
         elif pattern not in groups and not _matched(pattern, candidates):
             report(pattern, f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
-    if group is not None and (circle := _circle(group, group, groups, ())):
+    if group is not None and (circle := _circle(group, group, candidates, groups, ())):
         report(circle[0], f'group "{group}" contains itself', " → ".join([group, *circle]))
     return sorted(_chosen(selection, candidates, groups, () if group is None else (group,)))
 
@@ -51,8 +52,11 @@ def _chosen(
     selection: Selection, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], inside: tuple[str, ...]
 ) -> set[int]:
     def of(patterns: Sequence[str]) -> set[int]:
-        found = [_group(p, candidates, groups, inside) if p in groups else _matched(p, candidates) for p in patterns]
-        return set().union(*found)
+        def one(pattern: str) -> set[int]:
+            is_link = pattern not in groups or (pattern,) == inside[-1:]
+            return _matched(pattern, candidates) if is_link else _group(pattern, candidates, groups, inside)
+
+        return set().union(*map(one, patterns))
 
     return of(selection.include) - of(selection.exclude)
 
@@ -68,11 +72,16 @@ def _matched(pattern: str, candidates: Sequence[Sequence[str]]) -> set[int]:
     return {i for i, names in enumerate(candidates) if matching(pattern, names)}
 
 
-def _circle(name: str, end: str, groups: Mapping[str, Selection], seen: tuple[str, ...]) -> tuple[str, ...]:
+def _circle(
+    name: str, end: str, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], seen: tuple[str, ...]
+) -> tuple[str, ...]:
     """Return the groups that lead from one to another through includes and excludes, the last one too; or nothing."""
     for pattern in (*groups[name].include, *groups[name].exclude):
+        if pattern == name and _matched(pattern, candidates):
+            continue  # the link that is called so
         if pattern == end:
             return (pattern,)
-        if pattern in groups and pattern not in seen and (rest := _circle(pattern, end, groups, (*seen, name, pattern))):
+        is_new = pattern in groups and pattern not in seen
+        if is_new and (rest := _circle(pattern, end, candidates, groups, (*seen, name, pattern))):
             return (pattern, *rest)
     return ()

@@ -69,10 +69,12 @@ class Source:
                 return None
         return value
 
-    def set(self, dotted: str, text: str) -> None:
-        """Override one value, as the command line's `--set key.key=value` does; the value is YAML."""
-        path: Path = tuple(dotted.split("."))
-        parsed = parse(text, f"--set {dotted}={text}")
+    def set(self, dotted: str, value: Any) -> None:
+        """Override one value, as the command line's `--set key.key=value` does; a text is YAML, all else a plain value."""
+        path: Path = tuple(str(dotted).split("."))
+        name = f"--set {dotted}={value}"
+        parsed = parse(value, name) if isinstance(value, str) else from_mapping({path[-1]: value}, name)
+        parsed.value = parsed.value if isinstance(value, str) else parsed.value[path[-1]]
         self.problems += parsed.problems
         if parsed.problems:
             return

@@ -12,10 +12,10 @@ side of the body, by depth, and such that the moment of the taxel forces is that
 
 So Σ_j f_j + missed = f_net always: no load is lost or made up, static shear included. As every f_j is a sum of contact forces
 with weights ≥ 0, it leaves no cone that they share, such as the friction cone of a flat face. A contact that slides off the
-sensor, or around an edge of its body, hands its force to `missed` continuously. So is missed what lies beyond `slots`, further
-than a footprint from every active taxel, or on the back of the body. Inactive taxels carry nothing. `missed` and `residual`
-have one row per body. The residual is a pure couple, since the shared forces sum to those they came from: it is the same about
-any point.
+sensor, or around an edge of its body, hands its force to `missed` continuously. So is missed what lies further than a footprint
+from every active taxel, or on the back of the body. What contacts beyond `slots` carry acts at the centre of the others, see
+`geometry.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per body. The residual is a pure
+couple, since the shared forces sum to those they came from: it is the same about any point.
 
 Source: a solver's contacts are rigid points; this is the distribution of a resultant on a Winkler foundation, whose pressure is
 proportional to depth (Johnson, *Contact Mechanics*, §4.3), with its moment corrected.
@@ -61,7 +61,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
     """Newton steps towards the contacts' moment; 0: shares by depth and distance alone [1]."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that are shared out; what is beyond them is missed [1]."""
+    """Contacts per pair of body and object that are shared out; what others carry acts at the centre of these [1]."""
 
     def radii(self, layout: Layout) -> np.ndarray:
         """Return r_f of each body [m]."""

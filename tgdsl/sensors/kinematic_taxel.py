@@ -23,8 +23,9 @@ Balanced, the normal forces of a body's taxels sum to the solver's W, in the pro
 that of the law up to a limit: the cone of `friction_cone`, or else all together the solver's own, so that a contact without
 friction has none. A taxel's patch is no larger than its probe, so friction twists it with no more than l_j R_j, R_j its radius
 [m]. Nothing grows as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. What pulls has no share of W. ε is the normal force up
-to which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. Of contacts
-beyond `slots` nothing is known. Static friction is not of this law: `force_taxel` shares out forces.
+to which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. What
+contacts beyond `slots` carry acts at the centre of the others, and counts. Static friction is not of this law: `force_taxel`
+shares out forces.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 
@@ -79,7 +80,7 @@ class KinematicTaxelSpec(ContactProbeSpec):
     balance: Literal["none", "solver"] = "none"
     """`solver` has a body's taxels press with the solver's normal force, and bounds their friction; `none` as in the paper."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that `balance` counts [1]."""
+    """Contacts per pair of body and object whose normals `balance` takes [1]."""
 
     @model_validator(mode="after")
     def _is_used(self) -> KinematicTaxelSpec:

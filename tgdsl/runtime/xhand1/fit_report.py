@@ -16,6 +16,7 @@ from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.fit import FingerFit, FitError
 from tgdsl.runtime.xhand1.loads import Frames
 from tgdsl.runtime.xhand1.payloads import FINGERS
+from tgdsl.schema.files import whole
 
 AXIS_COLOURS = ("#c8553d", "#588157", "#3d5a80")
 _PANEL = (3.6, 5.4)
@@ -82,7 +83,8 @@ def picture(fits: Mapping[str, FingerFit], path: Path, title: str) -> Path:
         title: What to write above it all.
     """
     figure = drawing(fits, title)
-    figure.savefig(path, format="png")
+    with whole(path) as file:
+        figure.savefig(file, format="png")
     return path
 
 

@@ -1,0 +1,78 @@
+"""Environments as users name them: by index, or by a mask over all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, TgdslError, listed
+
+EnvIds = Tensor | np.ndarray | Sequence[int]
+"""Environments: indices, or a boolean mask over all of them."""
+
+
+def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:
+    """Return environments as indices, in the order in which they are named.
+
+    Args:
+        env_ids: Indices, or a boolean mask over environments; None: all.
+        num_envs: Number of environments.
+        error: What is raised.
+
+    Raises:
+        TgdslError: Of the type `error`, if there are no such environments.
+    """
+    if env_ids is None:
+        return np.arange(num_envs)
+    found = np.asarray(torch.as_tensor(env_ids).cpu())
+    if found.dtype == bool and found.shape == (num_envs,):
+        return np.flatnonzero(found)
+    is_index = found.dtype.kind in "iu" and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
+    if found.size and not is_index:
+        what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
+        raise error(f"env_ids: found {listed([str(value) for value in found.ravel()])}, expected {what}")
+    return found.reshape(-1).astype(np.int64)
+
+
+def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
+    """Return whether environments are named by a mask; a tensor's numbers are not looked at."""
+    found = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
+    return found.dtype == torch.bool and found.shape == (num_envs,)
+
+
+def env_mask(
+    env_ids: EnvIds | None,
+    num_envs: int,
+    device: torch.device,
+    error: type[TgdslError] = SimulationError,
+    waits: bool = True,
+) -> Bool[Tensor, " env"]:
+    """Return environments as a mask on a device. A mask that is there already is taken as it is, and nothing waits for the GPU.
+
+    Args:
+        env_ids: Indices, or a boolean mask over environments; None: all.
+        num_envs: Number of environments.
+        device: Where the mask is wanted.
+        error: What is raised.
+        waits: Whether to wait for a GPU to look at indices that lie there; if not, its kernel asserts that they exist.
+
+    Raises:
+        TgdslError: Of the type `error`, if there are no such environments.
+    """
+    if env_ids is None:
+        return torch.ones(num_envs, dtype=torch.bool, device=device)
+    if isinstance(env_ids, Tensor):
+        if env_ids.dtype == torch.bool and env_ids.shape == (num_envs,):
+            return env_ids.to(device)
+        is_index = env_ids.dtype in (torch.int64, torch.int32) and env_ids.ndim == 1
+        if not waits and is_index and env_ids.device.type != "cpu":
+            mask = torch.zeros(num_envs, dtype=torch.bool, device=env_ids.device)
+            mask[env_ids.long()] = True
+            return mask.to(device)
+    found = np.zeros(num_envs, dtype=bool)
+    found[env_indices(env_ids, num_envs, error)] = True
+    return torch.from_numpy(found).to(device)

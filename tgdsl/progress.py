@@ -1,0 +1,44 @@
+"""Notes on long work: whoever starts it hands in a function that is told what is being done."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from types import TracebackType
+from typing import TextIO
+
+Progress = Callable[[str], None]
+"""Called with what is done next, such as "object mug: distance grid"."""
+
+
+def silent(what: str) -> None:
+    """Say nothing."""
+
+
+class StatusLine:
+    """One line of a terminal that says what is being done and is wiped at the end; elsewhere nothing is printed."""
+
+    def __init__(self, stream: TextIO | None = None):
+        """Write to a stream; default: standard error."""
+        self._stream = stream or sys.stderr
+        self._is_shown = self._stream.isatty()
+
+    def __call__(self, what: str) -> None:
+        """Show what is being done, in place of what was done before."""
+        if self._is_shown:
+            width = shutil.get_terminal_size().columns - 1
+            self._stream.write(f"\r\x1b[K{what[:width]}")
+            self._stream.flush()
+
+    def wipe(self) -> None:
+        """Remove the line, so that something else can be printed."""
+        if self._is_shown:
+            self._stream.write("\r\x1b[K")
+            self._stream.flush()
+
+    def __enter__(self) -> StatusLine:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.wipe()
