@@ -121,6 +121,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "row": layout.body_id * counts.max() + rank,
         "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
         "place": footprint.place(layout.pos, layout.normal, is_active),
+        "padded": np.concatenate([layout.pos.T, -2.0 * layout.normal.T])[:, taxel],
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
     }
@@ -146,7 +147,6 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
     shared = footprint.shared_forces(
         bodies,
-        probes.pos,
         felt.depth,
         contacts.pos,
         contacts.force,
