@@ -340,7 +340,10 @@ def test_under_inference_mode(tmp_path, simulator):
 
 
 def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypatch):
-    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated."""
+    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated.
+
+    Nor can it later have a captured reading evaluate anything: from then on everything is evaluated at once.
+    """
     sim, twin = (warp(module(tmp_path), 3, keyframe="home") for _ in range(2))
     for one in (sim, twin):
         one.step()
@@ -356,3 +359,7 @@ def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypat
     twin.state()
     for name, value in found.items():
         assert torch.equal(twin.arrays[name], value), name
+    for one in (sim, twin):
+        one.reset(mask)
+    assert not torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
+    assert torch.equal(twin.state().body_pos, sim.state().body_pos) and torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])

@@ -97,7 +97,7 @@ class Worlds:
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
             self._is_reset = torch.zeros_like(self._is_stale)
             self.faults = Faults(self.arrays, on_fault)
-        self._has_stale, self._lane = True, lane
+        self._has_stale, self._is_in_graphs, self._lane = True, False, lane
         self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self.evaluate_stale)
 
     def step(self, num_steps: int) -> None:
@@ -130,8 +130,10 @@ class Worlds:
         Args:
             is_evaluated: Whether those that were started anew have been evaluated; which these are, only the device knows.
         """
-        self._has_stale = self.faults.on_fault == "reset" and not is_evaluated
-        self._evaluate_if_captured()
+        if not self._lane.is_capturing:
+            self._has_stale = False
+        if self.faults.on_fault == "reset" and not is_evaluated:
+            self._note_stale()
 
     def reset(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
         """Start some environments anew, with values. Their poses and contacts are evaluated when they are next asked for."""
@@ -155,20 +157,29 @@ class Worlds:
     def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
         """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
         self._is_stale |= mask
-        self._has_stale = True
-        self._evaluate_if_captured()
+        self._note_stale()
 
     def refresh(self) -> None:
         """Evaluate poses, velocities and contacts of the environments that are elsewhere than at the last evaluation."""
+        self._is_in_graphs |= self._lane.is_capturing
         if not self._has_stale:
             return
         if self._is_stale.is_cuda or self._is_stale.any():
             self._refresh()
-        self._has_stale = False
+        self._has_stale = self._lane.is_capturing
 
-    def _evaluate_if_captured(self) -> None:
-        """Evaluate at once in a graph that is being captured: what the host notes now, it does not when this is replayed."""
+    def _note_stale(self) -> None:
+        """Note, on the host, that environments are to be evaluated.
+
+        A graph of a user's own is replayed without the host. What is captured there is therefore evaluated in it; and once
+        there is one, so is everything else at once, as the graph may read it.
+        """
         if self._lane.is_capturing:
+            self._is_in_graphs = True
+            self._refresh()
+            return
+        self._has_stale = True
+        if self._is_in_graphs:
             self.refresh()
 
     def evaluate_stale(self) -> None:
