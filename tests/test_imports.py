@@ -21,13 +21,14 @@ FLOORS = {
         "memory",
         "felt_objects",
         "taxels",
+        "observing",
         "example",
         "state",
         "scene",
         "artifact",
         "explain",
     },
-    2: {"sensors", "observations", "layout", "plan"},
+    2: {"sensors", "observations", "proprioception", "layout", "plan"},
     1: {"geometry", "units", "fields", "fusion", "graphed", "regions", "selection", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}

@@ -11,6 +11,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialized
 
+from tgdsl.buffers import check_dtype
 from tgdsl.errors import ArtifactError
 from tgdsl.module import TactileModule
 from tgdsl.plan import Plan
@@ -43,13 +44,14 @@ def load(
     Args:
         path: The artefact.
         kinds: Sensor kinds of your own, if it was compiled with any.
-        dtype: Dtype of the readings, float32 or float64.
+        dtype: Dtype of the readings, float32 or float64, as for `compile`.
         device: Where the module lives.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, or is of another version.
-        TgdslError: If it uses a kind that is not given.
+        TgdslError: If it uses a kind that is not given, or the dtype is neither float32 nor float64.
     """
+    check_dtype(dtype)
     return TactileModule(load_plan(path), (*KINDS, *kinds), dtype).to(device)
 
 

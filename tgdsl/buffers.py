@@ -8,12 +8,33 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tgdsl.errors import TgdslError
+
+DTYPES = (torch.float32, torch.float64)
+"""What a module can be of. A narrower float knows places on a hand to a tenth of a millimetre, too coarse for a depth."""
+
+
+def check_dtype(dtype: torch.dtype) -> None:
+    """Refuse a dtype that no module can be of.
+
+    Raises:
+        TgdslError: If it is not one of `DTYPES`.
+    """
+    if dtype not in DTYPES:
+        hint = "readings can be cast afterwards, a module computes depths that a narrower float cannot hold"
+        raise TgdslError(f"a module cannot be of {dtype}, expected torch.float32 or torch.float64; {hint}")
+
 
 class Constants(nn.Module):
     """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
-        """Make a buffer of each array, floats in `dtype`."""
+        """Make a buffer of each array, floats in `dtype`.
+
+        Raises:
+            TgdslError: If no module can be of that dtype.
+        """
+        check_dtype(dtype)
         super().__init__()
         self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
         self._counts = {name: tuple(array[0].tolist()) for name, array in arrays.items() if name.endswith("/num")}

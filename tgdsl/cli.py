@@ -156,9 +156,10 @@ class Run:
         bar.close()
         recorder.write(self.out / "readings.npz", controls)
         print(f"readings: {self.out / 'readings.npz'}")
-        if any(output.rows == "taxel" for output in touch.outputs):
+        sensed = [output.rows for output in touch.outputs if output.rows in ("taxel", "body")]
+        if "taxel" in sensed:
             print(f"picture:  {picture(touch, sim, readings, self.out / 'picture.png')}")
-        if len(touch.outputs) > 1 or all(output.rows == "body" for output in touch.outputs):
+        if len(sensed) > 1 or "taxel" not in sensed:
             print(f"overview: {overview(touch, sim, readings, self.out / 'overview.png', title=self.document.stem)}")
 
 

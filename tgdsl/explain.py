@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tgdsl.memory import Memory
 from tgdsl.module import TactileModule
 from tgdsl.plan import PlannedObject, PlannedPoints, PlannedSensor
+from tgdsl.proprioception import QUANTITIES
 from tgdsl.sensors.noise.lower import quantity
 
 
@@ -268,7 +269,8 @@ def _fields(touch: TactileModule) -> list[str]:
 def _observations(touch: TactileModule) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
-        what = f"{term.type} of {term.reading} ({term.num_features})" if term.reading else term.type
+        of = f" of {term.reading}" if term.reading not in (None, *QUANTITIES) else ""
+        what = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
         groups.setdefault(term.group, []).append(what)
     if not groups:
         return []
@@ -280,8 +282,14 @@ def _inputs(touch: TactileModule) -> list[str]:
     lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
     if inputs.pairs:
         lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
+    for name, parts in inputs.contacts_of.items():
+        lines.append(f"  contacts with {name} are those on {', '.join(f'{part.kind} {part.name}' for part in parts)}")
     if inputs.slots:
         lines.append(f"  slots   {inputs.slots} contacts of each pair")
+    if inputs.joints:
+        lines.append(f"  joints  {', '.join(inputs.joints)}")
+    if inputs.actuators:
+        lines.append(f"  actuators  {', '.join(inputs.actuators)}")
     return [*lines, ""]
 
 

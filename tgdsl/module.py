@@ -18,8 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from tgdsl import observations
-from tgdsl.buffers import Constants
+from tgdsl.buffers import Constants, check_dtype
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
 from tgdsl.fusion import of_its_own
@@ -28,6 +27,7 @@ from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
 from tgdsl.history import last_step, pushed, reduced
 from tgdsl.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.observing import ObservationTerm, observation_terms, observe
 from tgdsl.plan import Inputs, Plan
 from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
@@ -35,6 +35,7 @@ from tgdsl.selection import EnvIds, env_mask
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
 from tgdsl.taxels import image_indices, taxel_table
 
@@ -44,7 +45,8 @@ class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
-    "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    "taxel"), or the bodies that carry it ("body"), which `bodies` lists. A reading that no sensor makes has its own name for
+    sensor and kind; its rows are those of `inputs.joints` ("joint") or `inputs.actuators` ("actuator").
     """
 
     name: str
@@ -75,10 +77,10 @@ class TactileModule(nn.Module):
         Args:
             plan: What to compute.
             kinds: The kinds that the plan's sensors are of.
-            dtype: Dtype of constants, state and readings.
+            dtype: Dtype of constants, state and readings, float32 or float64.
 
         Raises:
-            TgdslError: If the plan uses a kind that is not given.
+            TgdslError: If the plan uses a kind that is not given, or the dtype is another one.
         """
         super().__init__()
         self.plan = plan
@@ -103,6 +105,7 @@ class TactileModule(nn.Module):
         self._graphed: dict[str, Graphed] = {}
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
 
     @property
     def inputs(self) -> Inputs:
@@ -112,7 +115,7 @@ class TactileModule(nn.Module):
     @property
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading."""
-        return tuple(
+        sensed = tuple(
             Output(
                 reading.name,
                 sensor.sensor,
@@ -126,6 +129,15 @@ class TactileModule(nn.Module):
             for sensor in self.plan.sensors
             for reading in sensor.readings
         )
+        return sensed + tuple(
+            Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
+            for r in self.plan.proprioception
+        )
+
+    @property
+    def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
+        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        return observation_terms(self.plan)
 
     @property
     def taxels(self) -> dict[str, Any]:
@@ -173,7 +185,6 @@ class TactileModule(nn.Module):
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
                 such environments, or some are to be left out before anything was handed out.
-            TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
         """
         tensors, num_envs = self._tensors(state)
         step = "advance"
@@ -219,11 +230,12 @@ class TactileModule(nn.Module):
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
         """Return the fields of a state that are wanted, and the number of environments."""
-        if self.dtype == torch.float16:
-            raise TgdslError("this module is of torch.float16, whose range is too small: touch.to(torch.float32), or bfloat16")
         tensors = state.checked(self.inputs, self.device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
             held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
@@ -256,7 +268,7 @@ class TactileModule(nn.Module):
         if self._graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
             call = self._graphed[name]
         found = call(tensors, memory)
-        return {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
+        return {name: found[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
@@ -321,28 +333,17 @@ class TactileModule(nn.Module):
                 updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
                 found[reading.name] = reduced(updated[path], sensor.history.reduce)
             readings |= found
+        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
 
         Raises:
-            ObservationError: If an observation is one that only the real hand has.
+            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
         """
-        num_envs = next(iter(readings.values())).shape[0]
-        nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
-        groups: dict[str, list[Tensor]] = {}
-        for term in self.plan.observations:
-            features = nothing
-            if term.type in observations.HAND_ONLY:
-                raise observations.hand_only_error(term.group, term.index, term.type)
-            if term.reading is not None:
-                constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-                reading = readings[term.reading]
-                steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-                features = torch.cat([observations.observe(term.type, step, term.channels, constants) for step in steps], dim=1)
-            groups.setdefault(term.group, []).append(features)
-        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+        return observe(self.plan, self.constants, readings)
 
     def images(
         self, name: str, readings: Mapping[str, Tensor]
@@ -515,7 +516,12 @@ class TactileModule(nn.Module):
                 warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
-        """Move or cast all tensors; a captured graph has read the old ones."""
+        """Move or cast all tensors; a captured graph has read the old ones.
+
+        Raises:
+            TgdslError: If they are to be neither float32 nor float64.
+        """
+        check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
         super()._apply(fn, recurse)
         for graphed in self._graphed.values():
             graphed.forget()

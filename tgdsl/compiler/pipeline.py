@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import torch
 
+from tgdsl.buffers import check_dtype
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.robot import xml_files
@@ -99,7 +100,8 @@ def compile(
         resolution: Instead of the document's own.
         overrides: YAML text by dotted path, such as `{"sensors.touch.normal_stiffness": "400"}`.
         kinds: Sensor kinds of your own, beside those of tgdsl.
-        dtype: Dtype of the readings, float32 or float64.
+        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64. Narrower floats are refused, as
+            their rounding of places is as large as the depths; cast the readings instead, `readings["s"].to(torch.bfloat16)`.
         device: Where the module lives.
 
     Returns:
@@ -108,7 +110,9 @@ def compile(
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        TgdslError: If the dtype is neither float32 nor float64.
     """
+    check_dtype(dtype)
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
     plan = compile_plan(document, chosen, kinds)
     return TactileModule(plan, (*KINDS, *kinds), dtype).to(device)

@@ -18,6 +18,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
 from tgdsl.runtime.batch_reading import BatchReader
 from tgdsl.runtime.faults import DIVERGED, EnvFaults, OnFault
+from tgdsl.runtime.joint_fields import JointPlaces, KeptJoints
 from tgdsl.runtime.lookup import env_indices, keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
@@ -35,8 +36,8 @@ class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch`, read by one module.
 
     Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
-    start of the last substep, and so is the state. After `reset`, `set_state` and `forward` they are of where the environments
-    are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory.
+    start of the last substep, and so is the state, its joints included. After `reset`, `set_state` and `forward` they are of
+    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory, and of now.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
@@ -88,6 +89,7 @@ class BatchSimulation(Simulation):
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
+        self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
@@ -171,9 +173,15 @@ class BatchSimulation(Simulation):
     def _evaluate(self, ids: Int[Array, " n"]) -> None:
         if len(ids):
             self._run(lambda: self.batch.forward(ids))
+            self._kept.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
+        if self._kept.is_wanted:
+            if num_steps > 1:
+                self._run(lambda: self.batch.step(nstep=num_steps - 1))
+            self._kept.keep()
+            num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.settle()
@@ -186,7 +194,7 @@ class BatchSimulation(Simulation):
         self._faults.warn_once()
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = dict(self._reader.read())
+        values: dict[str, Any] = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
         tensors: dict[str, Any] = {name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}

@@ -120,7 +120,7 @@ class WarpSimulation(Simulation):
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
             self._objects.tell(self._worlds)
-        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.contacts)
+        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
         self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
         self._substep = Replay(self._lane, lambda: self._worlds.step(1))
         self._step_and_read = Replay(self._lane, self._physics_and_touch)
@@ -276,6 +276,7 @@ class WarpSimulation(Simulation):
         self._worlds.stepped(is_evaluated)
         if self._lane.is_capturing:
             return
+        self._touch.slot_watch.warn()
         to_raise, totals = self._worlds.faults.shown()
         if to_raise:
             self.check()

@@ -17,6 +17,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.plan import Inputs
 from tgdsl.runtime.faults import BAD_VALUES
+from tgdsl.runtime.joint_fields import FORCES, JointPlaces
 from tgdsl.runtime.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
@@ -37,6 +38,7 @@ class Worlds:
         data: MuJoCo Warp's data.
         arrays: Live tensors of `data`, (env, …): what is integrated, what a state is read from, `geom_xpos` and `geom_xmat`.
         parameters: Live tensors of those fields of `model` that environments have of their own, (env, …).
+        kept: Those of `qpos`, `qvel` and `ctrl` that the module wants, at the instant of poses and contacts.
         contacts: The contacts that the module wants.
         faults: What has gone wrong.
     """
@@ -89,9 +91,12 @@ class Worlds:
             # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
-            names = (*INTEGRATED, *_DERIVED, *_WATCHED)
+            joints = JointPlaces.of(inputs, model)
+            names = (*INTEGRATED, *_DERIVED, *_WATCHED, *FORCES.values())
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
+            self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
+            self._forces = tuple(array for name, array in joints.fields.items() if name in FORCES)
             self.contacts = PairContacts(inputs, model, num_envs, lane.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
@@ -111,6 +116,9 @@ class Worlds:
         try:
             for i in reversed(range(num_steps)):
                 self.model.opt.disableflags = idle if i else whole
+                if not i:
+                    for name, kept in self.kept.items():
+                        kept.copy_(self.arrays[name])
                 self._mjw.step(self.model, self.data)
                 self.faults.look()
         finally:
@@ -187,14 +195,16 @@ class Worlds:
 
         It is work for a `Replay`.
         """
-        arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
-        kept = {name: array.clone() for name, array in arrays.items()}
+        arrays = {name: self.arrays[name] for name in (*_DERIVED, *self._forces, "history")} | self.contacts.arrays
+        earlier = {name: array.clone() for name, array in arrays.items()}
         self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)
-        for name, before in kept.items():
+        for name, before in earlier.items():
             array = arrays[name]
             if array.numel():
                 array.copy_(torch.where(_like(self._is_stale, array), array, before))
+        for name, kept in self.kept.items():
+            kept.copy_(torch.where(_like(self._is_stale, kept), self.arrays[name], kept))
         self._is_stale.zero_()
 
     def forget_graphs(self) -> None:
