@@ -186,13 +186,14 @@ def test_on_warp_the_chosen_are_set_and_nothing_of_the_others_changes(tmp_path, 
         one.warp_model.opt.tolerance.fill_(model.opt.tolerance) if one is not cpu else None
         for _ in range(4):
             one.step(np.array([0.2, -0.3]))
+        one.ctrl[...] = 0.7  # of now: the forces are still those of the last step
     before, ids = everything(sim), [1, 3]
     values = {name: value.astype(np.float32).astype(np.float64) for name, value in drawn(model, 2).items()}
     chosen, given = as_given(warp, values, ids, 5)[form]
     sim.reset(chosen, **given)
     cpu.reset(ids, **values)
     after = everything(sim)
-    assert {"geom_xpos", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
+    assert {"geom_xpos", "qfrc_actuator", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
     for name, found in after.items():
         np.testing.assert_array_equal(found[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
     state, other = sim.state(), cpu.state()

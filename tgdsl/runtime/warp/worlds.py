@@ -24,7 +24,7 @@ from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
 from tgdsl.runtime.warp.reading import SOURCES
 
-_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat")
+_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat", *FORCES.values())
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
 """Contacts per environment that there is room for, unless said otherwise."""
@@ -92,11 +92,10 @@ class Worlds:
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
             joints = JointPlaces.of(inputs, model)
-            names = (*INTEGRATED, *_DERIVED, *_WATCHED, *FORCES.values())
+            names = (*INTEGRATED, *_DERIVED, *_WATCHED)
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
             self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
-            self._forces = tuple(array for name, array in joints.fields.items() if name in FORCES)
             self.contacts = PairContacts(inputs, model, num_envs, lane.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
@@ -195,7 +194,7 @@ class Worlds:
 
         It is work for a `Replay`.
         """
-        arrays = {name: self.arrays[name] for name in (*_DERIVED, *self._forces, "history")} | self.contacts.arrays
+        arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
         earlier = {name: array.clone() for name, array in arrays.items()}
         self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)
