@@ -232,6 +232,17 @@ def test_masks_of_environments():
             env_mask([3], 3, cpu, error)
 
 
+def test_indices_on_a_device_are_not_looked_at():
+    """On the device `meta` tensors have no numbers: whoever looked at one would fail."""
+    meta = torch.device("meta")
+    for dtype in (torch.int32, torch.int64):
+        mask = env_mask(torch.tensor([5], dtype=dtype, device=meta), 3, meta, waits=False)
+        assert (mask.shape, mask.dtype, mask.device) == ((3,), torch.bool, meta)
+    given = torch.ones(3, dtype=torch.bool, device=meta)
+    assert env_mask(given, 3, meta) is given
+    assert env_mask(None, 3, meta).device == meta
+
+
 def test_a_file_error_is_the_systems_too(document, tmp_path):
     with pytest.raises(OSError, match=r"this is a folder") as caught:
         tgdsl.save(tgdsl.compile(document), tmp_path)
