@@ -59,6 +59,7 @@ CASES = {
     "a compiled model": lambda: tgdsl.instrument(mujoco.MjModel.from_xml_string(SCENE), touch.inputs),
     "no document": lambda: tgdsl.compile(None),
     "an override of the wrong type": lambda: tgdsl.compile(document(), overrides={"sensors.touch.normal_stiffness": [1]}),
+    "overrides that are no mapping": lambda: tgdsl.compile(document(), overrides=["resolution=o"]),
     "a folder": lambda: tgdsl.save(touch, "folder"),
     "a folder that is not there": lambda: tgdsl.save(touch, "none/x.safetensors"),
     "no module": lambda: tgdsl.save("touch", "x.safetensors"),
@@ -96,6 +97,10 @@ EXPECTED = {
     "an override of the wrong type": (
         "SpecError",
         "--set sensors.touch.normal_stiffness=[1]: sensors.touch.normal_stiffness: ",
+    ),
+    "overrides that are no mapping": (
+        "TgdslError",
+        "overrides are a mapping from dotted paths to values, found list",
     ),
     "a folder": ("FileError", "folder: this is a folder, expected a file's name"),
     "a folder that is not there": ("FileError", "none/x.safetensors: No such file or directory"),
