@@ -31,12 +31,24 @@ robot:
 objects: {cube: {body: cube}}
 sensors: {touch: {kind: contact_depth, links: pad, feels: [cube]}}
 """
+STAGE = """#usda 1.0
+(
+    defaultPrim = "cube"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Cube "cube" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI"])
+{
+    double size = 0.04
+}
+"""
 
 
 @pytest.fixture
 def base(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    (tmp_path / "cube.usda").write_text(STAGE)
     return tmp_path
 
 
@@ -107,6 +119,7 @@ def test_output_to_a_full_disk(base, arguments):
         (("run", "pad.yaml", "--seconds", "0.1"), "out/readings.npz"),
         (("schema",), "tgdsl.schema.json"),
         (("layout", "new", "xhand1"), "layout.yaml"),
+        (("import", "cube.usda"), "cube.xml"),
     ],
 )
 def test_a_file_that_grows_too_large_is_named_and_not_left(base, arguments, file):

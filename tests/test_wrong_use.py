@@ -59,6 +59,7 @@ CASES = {
     "a compiled model": lambda: tgdsl.instrument(mujoco.MjModel.from_xml_string(SCENE), touch.inputs),
     "no document": lambda: tgdsl.compile(None),
     "an override of the wrong type": lambda: tgdsl.compile(document(), overrides={"sensors.touch.normal_stiffness": [1]}),
+    "overrides that are no mapping": lambda: tgdsl.compile(document(), overrides=["resolution=o"]),
     "a folder": lambda: tgdsl.save(touch, "folder"),
     "a folder that is not there": lambda: tgdsl.save(touch, "none/x.safetensors"),
     "no module": lambda: tgdsl.save("touch", "x.safetensors"),
@@ -96,6 +97,10 @@ EXPECTED = {
     "an override of the wrong type": (
         "SpecError",
         "--set sensors.touch.normal_stiffness=[1]: sensors.touch.normal_stiffness: ",
+    ),
+    "overrides that are no mapping": (
+        "TgdslError",
+        "overrides are a mapping from dotted paths to values, found list",
     ),
     "a folder": ("FileError", "folder: this is a folder, expected a file's name"),
     "a folder that is not there": ("FileError", "none/x.safetensors: No such file or directory"),
@@ -230,6 +235,17 @@ def test_masks_of_environments():
     for error in (SimulationError, StateError):
         with pytest.raises(error, match=r"^env_ids: found 3, expected indices from 0 to 2, or a mask of 3$"):
             env_mask([3], 3, cpu, error)
+
+
+def test_indices_on_a_device_are_not_looked_at():
+    """On the device `meta` tensors have no numbers: whoever looked at one would fail."""
+    meta = torch.device("meta")
+    for dtype in (torch.int32, torch.int64):
+        mask = env_mask(torch.tensor([5], dtype=dtype, device=meta), 3, meta, waits=False)
+        assert (mask.shape, mask.dtype, mask.device) == ((3,), torch.bool, meta)
+    given = torch.ones(3, dtype=torch.bool, device=meta)
+    assert env_mask(given, 3, meta) is given
+    assert env_mask(None, 3, meta).device == meta
 
 
 def test_a_file_error_is_the_systems_too(document, tmp_path):

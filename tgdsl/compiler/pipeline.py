@@ -123,9 +123,12 @@ def compile(
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
-        TgdslError: If the dtype is neither float32 nor float64, there is no such device, or a kind is none.
+        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
+            no mapping.
     """
     dtype, device = dtype_of(dtype), device_of(device)
+    if not isinstance(overrides, Mapping | None):
+        raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
     plan = compile_plan(document, chosen, kinds, progress)
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)

@@ -38,6 +38,7 @@ from tgdsl.compiler.usd_stage import Matrix, Prim, Stage, opened, unique_names
 from tgdsl.compiler.usd_tree import Link, Tree, spanning_tree
 from tgdsl.compiler.usd_xml import MeshAssets, add_geom, add_key, add_loop, add_motion, add_site, numbers, posed
 from tgdsl.errors import RobotError
+from tgdsl.schema.files import naming
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 """Endings of USD files."""
@@ -270,10 +271,13 @@ def write_mjcf(text: str, out: Path) -> None:
     Args:
         text: What `usd_to_mjcf` returns.
         out: The MJCF file. It is replaced if it is there, and so are meshes of the same names; other files are left alone.
+
+    Raises:
+        FileError: If it cannot be written.
     """
     root, out = ET.fromstring(text), Path(out)
     folder = out.with_name(f"{out.stem}_assets")
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
+    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
         files: list[str] = []
         for mesh in root.iterfind("asset/mesh[@vertex]"):
             file = _file_name(mesh.get("name", ""), files)

@@ -64,7 +64,7 @@ def writable(target: Path) -> Path:
     there = next(part for part in target.absolute().parents if part.exists())
     if not there.is_dir():
         raise FileError(f"{target}: {there} is a file, expected a folder")
-    with _named(target):
+    with naming(target):
         _refuse_folder(target)
         with tempfile.TemporaryFile(dir=there):
             return target
@@ -76,7 +76,7 @@ def with_folder(target: Path) -> Path:
     Raises:
         FileError: If it cannot be made.
     """
-    with _named(target):
+    with naming(target):
         target.parent.mkdir(parents=True, exist_ok=True)
     return target
 
@@ -90,7 +90,7 @@ def whole(target: Path) -> Iterator[IO[bytes]]:
     """
     temporary = None
     try:
-        with _named(target):
+        with naming(target):
             _refuse_folder(target)
             handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
             with os.fdopen(handle, "wb") as file:
@@ -116,8 +116,12 @@ def write_whole(target: Path, content: bytes) -> None:
 
 
 @contextmanager
-def _named(target: Path) -> Iterator[None]:
-    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile."""
+def naming(target: Path) -> Iterator[None]:
+    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile.
+
+    Raises:
+        FileError: Instead of any OSError.
+    """
     try:
         yield
     except FileError:

@@ -25,7 +25,7 @@ from tgdsl.runtime.xhand1.errors import HandClosedError, HandError
 from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.log import CHUNK, FORMAT, IDENTITY_BYTES, RECORD, STATE, Fault, LogError
 from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.schema.files import whole
+from tgdsl.schema.files import naming, whole
 
 _COMPRESSION = 1
 
@@ -94,6 +94,7 @@ class LogWriter:
 
         Raises:
             LogError: If the log is closed, or the reading or failure is not newer than the last one.
+            FileError: If it cannot be kept.
         """
         if self._spool is None:
             raise LogError(f"{self._path}: this log is closed")
@@ -108,7 +109,8 @@ class LogWriter:
             event.sequence > last.sequence and event.requested_at >= last.requested_at and event.received_at >= last.received_at
         ):
             raise LogError(f"{self._path}: reading {event.sequence} is not newer than reading {last.sequence}")
-        self._spool.write(_record(event).tobytes())
+        with naming(self._path):
+            self._spool.write(_record(event).tobytes())
         self._newest = event
         self.num_readings += 1
 
