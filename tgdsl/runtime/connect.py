@@ -23,7 +23,7 @@ from tgdsl.runtime.batch import BatchSimulation, simulate
 from tgdsl.runtime.source import EnvIds
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
-from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S, XHand1
+from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.link import LinkTiming
@@ -294,10 +294,8 @@ def _hand(
     control = _Controls(touch, motion, "the hand")
     warn_of_noise(touch.plan)
     with ExitStack() as opened:
-        patience = max(READ_TIMEOUT_S, 2 * (timing or LinkTiming()).reply_timeout_s)
-        age = max(MAX_AGE_S, patience)
-        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing, max_age_s=age))
-        source = XHand1Source(hand, control_step=control_step, calibration=calibration, read_timeout_s=patience)
+        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing))
+        source = XHand1Source(hand, control_step=control_step, calibration=calibration)
         opened.pop_all()
     return _hand_connection(source, observer, control)
 
