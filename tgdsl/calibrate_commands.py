@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from tgdsl.errors import TgdslError
-from tgdsl.hand_commands import CalibrationFile, refuse_to_replace, write_whole
+from tgdsl.hand_commands import CalibrationFile, refuse_to_replace
+from tgdsl.schema.files import write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -96,7 +97,7 @@ class Calibrate:
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
         for file in (self.out, self.plot):
             file.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(self.out, "".join(notes) + result.text())
+        write_whole(self.out, ("".join(notes) + result.text()).encode())
         print(f"calibration: {self.out}")
         print(f"picture:     {picture(fits, self.plot, f'{self.log.name}: fingertip forces')}")
 

@@ -7,9 +7,7 @@ no current: its reply is the only reading of touch that is known.
 from __future__ import annotations
 
 import math
-import os
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from tgdsl.errors import TgdslError
+from tgdsl.schema.files import write_whole
 
 if TYPE_CHECKING:
     from tgdsl.runtime.xhand1.calibration import Calibration
@@ -121,7 +120,7 @@ class TareHand:
             what = f"the fingertips were not still over {self.frames} readings: {', '.join(spreads)} counts"
             raise TgdslError(f"{what}, expected at most {self.max_spread:g}; leave the hand untouched, or see --max-spread")
         self.out.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(self.out, base.with_tare(tare).text())
+        write_whole(self.out, base.with_tare(tare).text().encode())
         for name, mean, spread in zip(FINGERS, tare.mean, tare.spread, strict=True):
             print(f"{name:<7} tare {mean[0]:7.2f} {mean[1]:7.2f} {mean[2]:7.2f}   spread {max(spread):g} counts")
         print(f"calibration: {self.out}")
@@ -244,19 +243,6 @@ def refuse_to_replace(out: Path, is_forced: bool) -> None:
     """
     if out.exists() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or another name")
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Write a file of text; it appears whole or not at all."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def _tare(hand: XHand1, num_frames: int) -> Tare:

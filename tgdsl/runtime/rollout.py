@@ -5,8 +5,6 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` 
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,6 +19,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module import TactileModule
 from tgdsl.runtime.source import Simulator
+from tgdsl.schema.files import whole_file
 
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
@@ -136,12 +135,5 @@ class Recorder:
         for output in self._outputs:
             arrays[f"{output.name}:channels"] = np.array(output.channels)
             arrays[f"{output.name}:units"] = np.array(output.units)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with whole_file(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

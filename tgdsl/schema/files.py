@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import tgdsl
@@ -48,16 +50,26 @@ def layout_file(model: Path) -> Path | None:
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
 
 
-def write_whole(target: Path, content: bytes) -> None:
-    """Write a file so that it appears whole or not at all; one that is there is replaced."""
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+@contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """Yield an empty file beside a target, of the same suffix and with a new file's permissions, which then takes its place.
+
+    If anything is raised meanwhile it is removed, and the target stays as it was.
+
+    Raises:
+        OSError: If there can be no such file.
+    """
+    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # less what the process's umask takes away
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+        yield temporary
         os.replace(temporary, target)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+def write_whole(target: Path, content: bytes) -> None:
+    """Write a file so that it appears whole or not at all; one that is there is replaced."""
+    with whole_file(target) as temporary:
+        temporary.write_bytes(content)

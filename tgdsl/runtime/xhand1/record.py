@@ -25,6 +25,7 @@ from tgdsl.runtime.xhand1.errors import HandClosedError, HandError
 from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.log import CHUNK, FORMAT, IDENTITY_BYTES, RECORD, STATE, Fault, LogError
 from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.schema.files import whole_file
 
 _COMPRESSION = 1
 
@@ -125,17 +126,10 @@ class LogWriter:
             self.num_readings = spool.seek(0, os.SEEK_END) // RECORD.itemsize  # Ctrl-C may have struck within `add`
             if not self.num_readings:
                 raise LogError(f"{self._path}: not one reading came, so nothing was written")
-            handle, temporary = tempfile.mkstemp(dir=self._path.parent, prefix=f".{self._path.name}.")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    self._write(file, spool)
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.chmod(temporary, 0o644)
-                os.replace(temporary, self._path)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
+            with whole_file(self._path) as temporary, temporary.open("wb") as file:
+                self._write(file, spool)
+                file.flush()
+                os.fsync(file.fileno())
 
     def __enter__(self) -> LogWriter:
         return self
