@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from xhand1_hands import PATIENT, WrittenBytes, read_again
+from xhand1_hands import PATIENT, WrittenBytes, read_again, wait_until
 from xhand1_models import JOINTS, document, hand_xml
 
 import tgdsl
@@ -23,8 +23,9 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand
 from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
 from tgdsl.runtime.xhand1.emulator import Emulator
-from tgdsl.runtime.xhand1.errors import HandDisconnectedError, HandTimeoutError, MotionError, StaleReadingError
+from tgdsl.runtime.xhand1.errors import HandDisconnectedError, HandTimeoutError, MotionError, StaleReadingError, WatchdogError
 from tgdsl.runtime.xhand1.faulty_line import Faults
+from tgdsl.runtime.xhand1.link import LinkTiming
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.payloads import FORCE_MAX, PASSIVE, encode_command
 from tgdsl.runtime.xhand1.protocol import Frame, encode_frame
@@ -73,6 +74,16 @@ def recorded(env: Connection, controls) -> torch.Tensor:
 def steps(env: Connection, num_steps: int) -> None:
     for _ in range(num_steps):
         env.step()
+
+
+def stepped(env: Connection, control) -> bool:
+    """Step, and return whether the watchdog let it: on a machine that stood still it does not, and the hand goes on from there."""
+    try:
+        env.step(control)
+    except WatchdogError:
+        env.resume()
+        return False
+    return True
 
 
 def half_counts(axes: str) -> torch.Tensor:
@@ -201,7 +212,8 @@ def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touc
 
 
 def test_after_a_failed_step_nothing_old_is_observed(touch):
-    with Emulator() as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}") as env:
+    timing = LinkTiming(reply_timeout_s=2.0, silence_s=1.0)
+    with Emulator() as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=timing) as env:
         env.observe()
         emulator.set_faults(Faults(silence=1.0))
         with pytest.raises(HandTimeoutError):
@@ -226,9 +238,7 @@ def test_a_hand_goes_where_the_actuators_say(tmp_path):
         Emulator(EmulatedHand(time_constant_s=0.001)) as emulator,
         tgdsl.connect(touch, f"xhand1:{emulator.device}", motion=instant(touch), timing=PATIENT) as env,
     ):
-        for _ in range(10):
-            env.step(SQUEEZE)
-        assert emulator.hand.position == pytest.approx(SQUEEZE[::-1], abs=1e-3)
+        assert wait_until(lambda: stepped(env, SQUEEZE) and abs(emulator.hand.position - SQUEEZE[::-1]).max() < 1e-3)
         env.reset()
         env.step()
         assert emulator.hand.is_passive
@@ -236,19 +246,17 @@ def test_a_hand_goes_where_the_actuators_say(tmp_path):
             env.step(np.array([1.5] + [0.1] * 11))
         with pytest.raises(MotionError, match=r"made passive: .* call resume\(\) to go on"):
             env.step(SQUEEZE)
+        assert isinstance(env.source, XHand1Source)
+        hand = env.source.hand
         env.resume()
-        env.step(SQUEEZE)
-        assert isinstance(env.source.hand, XHand1) and env.source.hand.stopped is None
+        assert wait_until(lambda: stepped(env, SQUEEZE) and hand.stopped is None)
 
 
 def test_the_emulator_runs_in_real_time(touch):
     """It presses, says so, and lets go when it is reset."""
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=instant(touch)) as env:
         unloaded = env.observe()["policy"]
-        deadline = time.monotonic() + 20
-        while env.observe()["policy"].abs().max() < 10 and time.monotonic() < deadline:
-            env.step(SQUEEZE)
-        assert env.observe()["policy"].abs().max() > 10
+        assert wait_until(lambda: stepped(env, SQUEEZE) and env.observe()["policy"].abs().max() > 10)
         env.reset()
         assert (env.observe()["policy"] == unloaded).all()
 
@@ -260,9 +268,8 @@ def test_a_passive_body_holds_where_it_is(touch):
             env.step(control)
         env.source.hand.relax()
         env.source._target = None
-        deadline = time.monotonic() + 5
-        while not env.source.emulator.hand.is_passive and time.monotonic() < deadline:
-            time.sleep(0.005)
+        hand = env.source.emulator.hand
+        assert wait_until(lambda: hand.is_passive)
         for _ in range(30):
             env.step()
         held = env.source.sample().joint_pos
@@ -296,11 +303,60 @@ def test_a_simulation_that_ends_is_an_error_and_no_old_reading(touch, monkeypatc
             raise SimulationError("environment 0 diverged")
 
         monkeypatch.setattr(env.source.body, "step", diverge)
-        deadline = time.monotonic() + 10
-        while env.source.body.failure is None and time.monotonic() < deadline:
-            time.sleep(0.005)
+        body = env.source.body
+        assert wait_until(lambda: body.failure is not None)
         with pytest.raises(SimulationError, match="the emulated hand's simulation ended: environment 0 diverged"):
             env.step()
+
+
+def test_a_reset_does_not_hide_that_the_simulation_ended(touch, monkeypatch):
+    with tgdsl.connect(touch, "emulator", calibration=NEWTON) as env:
+        assert isinstance(env.source, EmulatedSource)
+        body = env.source.body
+
+        def diverge():
+            raise SimulationError("environment 0 diverged")
+
+        monkeypatch.setattr(body, "step", diverge)
+        assert wait_until(lambda: body.failure is not None)
+        with pytest.raises(SimulationError, match="the emulated hand's simulation ended: environment 0 diverged"):
+            env.reset()
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, lockstep):
+    """A mistake in what the fingertips feel ends its thread: the step that waits for a reading says so, and so does close."""
+    timing = LinkTiming(reply_timeout_s=1.0, silence_s=0.5)
+    env = tgdsl.connect(touch, "emulator", calibration=NEWTON, timing=timing, lockstep=lockstep)
+    assert isinstance(env.source, EmulatedSource)
+    env.step()
+
+    def broken(time_s):
+        raise ValueError("a mistake of ours")
+
+    monkeypatch.setattr(env.source.body, "felt", broken)
+    with pytest.raises(HandError, match=r"the emulator's thread ended: ValueError\('a mistake of ours'\)") as caught:
+        steps(env, 1000)
+    assert isinstance(caught.value.__cause__, ValueError)
+    with pytest.raises(HandError, match="the emulator's thread ended"):
+        env.reset()
+    with pytest.raises(HandError, match="the emulator's thread ended"):
+        env.close()
+
+
+def test_in_lockstep_a_policy_may_think_for_as_long_as_it_likes(touch):
+    """The watchdog's time passes on the wall, where nothing runs: what is observed does not know of it."""
+    model, runs = tgdsl.simulate(touch, 1).model, []
+    for watchdog_s, pause in ((1.0, 0.0), (0.025, 0.06)):
+        motion = MotionLimits.of_robot(model, speed=1e9, current_limit=300, kp=100, watchdog_s=watchdog_s)
+        with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=motion, lockstep=True) as env:
+            found = []
+            for control in [*ramp(10), None]:
+                env.step(control)
+                time.sleep(pause)
+                found.append(env.observe()["policy"])
+        runs.append(torch.cat(found))
+    assert (runs[0] == runs[1]).all() and runs[0].any()
 
 
 def test_the_emulator_feels_what_is_observed_and_nothing_else(tmp_path):

@@ -19,6 +19,7 @@ from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.emulator import Emulator
 from tgdsl.runtime.xhand1.errors import HandDisconnectedError, HandError, HandTimeoutError, StaleReadingError
 from tgdsl.runtime.xhand1.faulty_line import Faults
+from tgdsl.runtime.xhand1.link import LinkTiming
 from tgdsl.runtime.xhand1.log import Fault, LogError
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.payloads import saturated
@@ -55,7 +56,7 @@ def run_live(path) -> list[HandSample | Fault]:
     live: list[HandSample | Fault] = []
     with (
         Emulator(EmulatedHand(forces=swelling, time_constant_s=0.1)) as emulator,
-        XHand1.open(emulator.device, motion=LIMITS) as hand,
+        XHand1.open(emulator.device, motion=LIMITS, timing=LinkTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
         LogWriter(path, calibration=NEWTON) as log,
     ):
         source = XHand1Source(hand, control_step=0.02, calibration=NEWTON, velocity_time_constant=0.05)

@@ -2,12 +2,10 @@
 
 import math
 import runpy
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from xhand1_hands import Stamps, Wait
 
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_body import TipForces
@@ -142,22 +140,43 @@ def test_a_minute_at_the_highest_rate_loses_nothing(capsys):
         print(f"\n{found.text()}")
 
 
-@pytest.mark.slow
-def test_a_minute_with_one_fault_of_each_kind_in_twenty():
-    stamps = Stamps()
-    with Emulator(EmulatedHand(forces=stamps), seed=7) as emulator, XHand1.open(emulator.device) as hand:
-        emulator.set_faults(Faults.each(0.05))
-        found, errors, waits = [], [], []
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            with Wait() as wait:
-                try:
-                    found.append(stamps.check(hand.read()))
-                except HandError as error:
-                    errors.append(type(error))
-            waits.append(wait.seconds)
-    assert HandError not in errors
-    assert np.all(np.diff(found) >= 1)
-    assert len(found) > 100
-    assert np.quantile(waits, 0.99) < 0.1
-    print(f"\n{len(found)} readings, {len(errors)} named errors, longest wait {1e3 * max(waits):.1f} ms")
+def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
+    """A field of forces with a mistake: the port goes away, and whoever calls is told what happened, at once and again."""
+
+    def broken(time_s, position):
+        raise ValueError("a mistake of ours")
+
+    emulator = Emulator(EmulatedHand(forces=broken))
+    message = r"the emulator's thread ended: ValueError\('a mistake of ours'\)"
+    with pytest.raises(HandError):
+        XHand1.open(emulator.device)
+    for call in (emulator.check, emulator.unplug, lambda: emulator.set_faults(Faults()), emulator.close):
+        with pytest.raises(HandError, match=message) as caught:
+            call()
+        assert isinstance(caught.value.__cause__, ValueError)
+    assert not Path(emulator.device).exists()
+    emulator.close()
+
+
+def test_a_call_under_way_is_told_too(monkeypatch):
+    """The thread ends between a call's arrival and its turn."""
+    emulator = Emulator()
+
+    def broken(now):
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(emulator._wire, "due", broken)
+    for call in (lambda: emulator.set_faults(Faults()), emulator.close):
+        with pytest.raises(HandError, match="the emulator's thread ended: RuntimeError"):
+            call()
+
+
+def test_what_a_call_raises_is_raised_to_its_caller_and_the_hand_goes_on(monkeypatch):
+    with Emulator() as emulator:
+        emulator.unplug()
+        with monkeypatch.context() as patched:
+            patched.setattr("os.symlink", lambda *paths: 1 / 0)
+            with pytest.raises(ZeroDivisionError):
+                emulator.replug()
+        emulator.set_faults(Faults())
+        emulator.check()

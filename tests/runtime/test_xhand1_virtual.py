@@ -113,6 +113,18 @@ def test_all_faults_at_once(monkeypatch):
     assert len(readings) > 400 and errors
 
 
+@pytest.mark.slow
+def test_minutes_with_one_fault_of_each_kind_in_twenty(monkeypatch):
+    stamps = Stamps()
+    with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=7) as (hand, port, time):
+        hand.read()
+        port.set_faults(Faults.each(0.05))
+        start = time.now
+        while time.now < start + 120:
+            readings, _ = read_for(hand, time, stamps, 500)
+            assert len(readings) > 300
+
+
 def test_a_silent_device_is_named_at_once_and_again(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, EmulatedHand(forces=stamps)) as (hand, port, time):

@@ -1,12 +1,13 @@
 """An emulated hand whose fingertips say when they were read, so that an old reading cannot pass for a new one.
 
 These tests run in real time, beside others on a machine that may be busy or stand still: they wait for what shall happen rather
-than for a time in which it should have, and a limit in time is for what is usual (a quantile, or the best of some rounds), as no
-single one can be told from the machine's own pauses.
+than for a time in which it should have, and do again what such a pause has spoilt. What must happen in time is tested in virtual
+time (`virtual_hands`).
 """
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -65,22 +66,11 @@ class WrittenBytes:
         return port
 
 
-class Wait:
-    """Measures how long a block takes.
-
-    Attributes:
-        seconds: Time that passed [s].
-    """
-
-    def __enter__(self) -> "Wait":
-        self._start = time.monotonic()
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.seconds = time.monotonic() - self._start
+GENEROUS_S = 120.0
+"""How long to wait for what must happen [s]."""
 
 
-def wait_until(is_so: Callable[[], bool], seconds: float = 20.0) -> bool:
+def wait_until(is_so: Callable[[], bool], seconds: float = GENEROUS_S) -> bool:
     """Wait until something is so, and return whether it is in the end."""
     deadline = time.monotonic() + seconds
     while not is_so():
@@ -90,12 +80,37 @@ def wait_until(is_so: Callable[[], bool], seconds: float = 20.0) -> bool:
     return True
 
 
-def read_again(hand: XHand1, seconds: float = 20.0) -> Reading:
+def open_again(device: str, **options: Any) -> XHand1:
+    """Open a hand, again and again where faults or a busy machine keep it from answering."""
+    deadline = time.monotonic() + GENEROUS_S
+    while True:
+        try:
+            return XHand1.open(device, **options)
+        except HandError:
+            if time.monotonic() > deadline:
+                raise
+
+
+def read_again(hand: XHand1) -> Reading:
     """Return the first reading that comes after failures."""
-    deadline = time.monotonic() + seconds
+    deadline = time.monotonic() + GENEROUS_S
     while True:
         try:
             return hand.read()
         except HandError:
             if time.monotonic() > deadline:
                 raise
+
+
+def drive_until(hand: XHand1, target: np.ndarray, is_so: Callable[[], bool]) -> None:
+    """Command until something is so; what was stopped, as the machine stood still, is begun anew."""
+
+    def commanded() -> bool:
+        try:
+            hand.command(target)
+        except HandError:
+            hand.resume()
+            return False
+        return is_so()
+
+    assert wait_until(commanded)

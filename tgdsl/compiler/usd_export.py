@@ -13,8 +13,6 @@ Textures stay behind.
 
 from __future__ import annotations
 
-import os
-import tempfile
 import warnings
 from itertools import combinations
 from pathlib import Path
@@ -29,6 +27,7 @@ from tgdsl.compiler.usd_export_geoms import add_geoms, add_sites
 from tgdsl.compiler.usd_export_joints import BALL, FREE, add_drives, add_joint, joint_of
 from tgdsl.compiler.usd_notes import OPTION, flags, notable, plain
 from tgdsl.errors import RobotError, listed
+from tgdsl.schema.files import whole_file
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
 ENDINGS = (".usda", ".usdc", ".usd")
@@ -207,18 +206,9 @@ def _left_out(draft: Draft) -> list[str]:
 
 def _write(draft: Draft, out: Path) -> None:
     """Write the stage to a file that is whole whenever it is there."""
-    temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(dir=out.parent, prefix=f".{out.stem}.", suffix=out.suffix)
-        os.close(handle)
-        if not draft.stage.GetRootLayer().Export(temporary):
-            raise OSError(0, "USD did not say why")
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, out)
+        with whole_file(out) as temporary:
+            if not draft.stage.GetRootLayer().Export(str(temporary)):
+                raise OSError(0, "USD did not say why")
     except OSError as error:
         raise RobotError(f"{out}: cannot be written: {error.strerror}") from error
-    finally:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)

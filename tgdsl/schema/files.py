@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -82,27 +83,35 @@ def with_folder(target: Path) -> Path:
 
 
 @contextmanager
+def whole_file(target: Path) -> Iterator[Path]:
+    """Yield an empty file beside a target, of the same suffix and with a new file's permissions, which then takes its place.
+
+    If anything is raised meanwhile it is removed, and the target stays as it was.
+
+    Raises:
+        FileError: If it cannot be written; the error names the target.
+    """
+    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    with naming(target):
+        _refuse_folder(target)
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # less what the process's umask takes away
+        try:
+            yield temporary
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
 def whole(target: Path) -> Iterator[IO[bytes]]:
     """Open a file for writing that appears whole, when it is closed, or not at all; one that is there is replaced.
 
     Raises:
         FileError: If it cannot be written; the error names the file.
     """
-    temporary = None
-    try:
-        with naming(target):
-            _refuse_folder(target)
-            handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-            with os.fdopen(handle, "wb") as file:
-                yield file
-            umask = os.umask(0)
-            os.umask(umask)
-            os.chmod(temporary, 0o666 & ~umask)
-            os.replace(temporary, target)
-            temporary = None
-    finally:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
+    with whole_file(target) as temporary, temporary.open("wb") as file:
+        yield file
 
 
 def write_whole(target: Path, content: bytes) -> None:

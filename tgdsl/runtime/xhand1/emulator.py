@@ -148,11 +148,17 @@ class Emulator:
 
     def _plug(self) -> None:
         if self._ends is None:
-            self._ends = os.openpty()
-            for end in self._ends:
-                tty.setraw(end)
-            os.set_blocking(self._ends[0], False)
-            os.symlink(os.ttyname(self._ends[1]), self.device)
+            ends = os.openpty()
+            try:
+                for end in ends:
+                    tty.setraw(end)
+                os.set_blocking(ends[0], False)
+                os.symlink(os.ttyname(ends[1]), self.device)
+            except BaseException:
+                for end in ends:
+                    os.close(end)
+                raise
+            self._ends = ends
 
     def _unplug(self) -> None:
         if self._ends is not None:
