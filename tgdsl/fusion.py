@@ -40,6 +40,10 @@ def of_its_own(method: Callable[..., Any]) -> Callable[..., Any]:
 
 def takes_kernel(*tensors: Tensor) -> bool:
     """Return whether a Triton kernel can take these: all float32 on a GPU, and nobody asks for derivatives, which it lacks."""
-    wants_derivatives = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
     are_fit = all(tensor.is_cuda and tensor.dtype == torch.float32 for tensor in tensors)
-    return HAS_TRITON and are_fit and not wants_derivatives
+    return HAS_TRITON and are_fit and not wants_derivatives(*tensors)
+
+
+def wants_derivatives(*tensors: Tensor) -> bool:
+    """Return whether somebody asks for derivatives with respect to any of these."""
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)

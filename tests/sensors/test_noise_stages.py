@@ -485,3 +485,24 @@ def test_crosstalk_keeps_channels_apart():
     signal[2, 1] = 1
     found = Noise(BLUR, line(6), CHANNELS).read(signal)[0].numpy()
     assert (found[:, [0, 2]] == 0).all() and (found[:, 1] > 0).all()
+
+
+@pytest.mark.parametrize("name", ["foo_x", "y", "ball_y_z"])
+def test_a_distance_is_named_by_its_object_whatever_that_ends_in(tmp_path, name):
+    """An amplitude for `distance_foo_x` is no component's of `distance_foo`: module and definition read the same."""
+    model = tmp_path / "pads.xml"
+    model.write_text(PADS)
+    points = [{"pos": [0, 0, 20 * MM], "normal": [0, 0, 1], "radius": "50 mm"}]
+    noise = {"bias": {f"distance_{name}": 0.25}, "white_noise": {f"distance_{name}": 1e-3}}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(model), "layout": {"resolutions": {"r": {"a": {"method": "points", "points": points}}}}},
+        "objects": {name: {"body": "item"}},
+        "sensors": {"s": {"kind": "surface_distance", "links": ["a"], "feels": [name], "noise": noise, "readout": "both"}},
+    }
+    touch = tgdsl.compile(document, dtype=torch.float64).seed(5)
+    (definition,) = definitions_of(touch, 5, [noise], 1)
+    readings = touch(dataclasses.replace(touch.example_state(1), dt=DT))
+    read, clean = readings["s"][0].numpy(), readings["s/clean"][0].numpy()
+    np.testing.assert_allclose(read, definition.read(clean, DT), rtol=0, atol=1e-12)
+    assert np.abs(read - clean - 0.25).max() < 0.02

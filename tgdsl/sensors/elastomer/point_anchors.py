@@ -14,6 +14,7 @@ Shapes: planes (env, link, point) of one object; in the state all objects one af
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.points import Meeting, MetPoints, are_for_kernel, met_points, tile_size
 from tgdsl.geometry.reference import ReferencePoints
+from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import Law, capped
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
@@ -136,30 +138,55 @@ def _summed(pull: Pull, markers: Markers) -> Vec:
     num_taxels = markers.pos[0].shape[0]
     zero = markers.pos[0].new_zeros((pull.pos[0].shape[0], num_taxels))
     total = (zero, zero, zero)
+    rows = active_points(pull.pos, pull.strength) if are_compacted(pull.pos, pull.strength) else None
     for link, (first, last) in enumerate(pull.taxels):
         pos, normal = (planes.vec(part[first:last] for part in vector) for vector in (markers.pos, markers.normal))
-        z, strength = (planes.vec(part[:, link] for part in vector) for vector in (pull.pos, pull.strength))
-        found = _summed_on_link(z, strength, pos, normal, markers.falloff)
+        if rows is None:
+            z, strength = (planes.vec(part[:, link] for part in vector) for vector in (pull.pos, pull.strength))
+            found = _summed_on_link(z, strength, pos, normal, markers.falloff)
+        else:
+            points, env = next(rows)
+            found = _summed_on_link(planes.vec(points[:3]), planes.vec(points[3:]), pos, normal, markers.falloff)
+            found = planes.vec(zero[:, first:last].index_add(0, env, part) for part in found)
         around = (first, num_taxels - last)
         total = planes.add(total, planes.vec(torch.nn.functional.pad(part, around) for part in found))
     return total
 
 
 def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
-    """Return the sum for one link's markers, of planes (env, point)."""
-    num_envs, num = pos[0].shape
-    # A compiler fuses kernel and sum into one loop, whatever the length.
-    step = num if torch.compiler.is_compiling() else BLOCK
-    x, normal = (planes.vec(part[:, None] for part in vector) for vector in (marker, normal))
-    zero = pos[0].new_zeros((num_envs, marker[0].shape[0]))
-    total = (zero, zero, zero)
-    for start in range(0, num, step):
-        z, own = (planes.vec(part[:, None, start : start + step] for part in vector) for vector in (pos, strength))
-        way = planes.sub(x, z)
-        along = planes.dot(way, normal)
-        fall = torch.exp(-falloff * (planes.dot(way, way) - along * along))
-        total = planes.add(total, planes.vec((fall * part).sum(dim=-1) for part in own))
-    return total
+    """Return the sum for one link's markers, of planes (env, point) or (row, slot)."""
+    if torch.compiler.is_compiling():  # a compiler fuses kernel and sum into one loop, whatever the length
+        return _summed_at_once(pos, strength, marker, normal, falloff)
+    blocks = zip(*(part.split(BLOCK, dim=1) for part in (*pos, *strength)), strict=True)
+    sums = [_summed_at_once(planes.vec(b[:3]), planes.vec(b[3:]), marker, normal, falloff) for b in blocks]
+    return planes.vec(torch.stack(parts).sum(dim=0) for parts in zip(*sums, strict=True))
+
+
+def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
+    """Return the sum for one link's markers, of one block of points.
+
+    The in-plane offset is found along two tangents of each marker, scaled so that its square is the exponent of 2.
+    """
+    scale = torch.sqrt(falloff / math.log(2.0))
+    z, own = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
+    offset_u, offset_v = (
+        stored(planes.dot(tangent, marker))[:, None] - planes.dot(planes.vec(stored(part)[:, None] for part in tangent), z)
+        for tangent in (planes.scale(scale, tangent) for tangent in _tangents(normal))
+    )
+    fall = torch.exp2(-offset_u * offset_u - offset_v * offset_v)
+    return planes.vec((fall * part).sum(dim=-1) for part in own)
+
+
+def _tangents(normal: Vec) -> tuple[Vec, Vec]:
+    """Return two unit vectors across unit normals and each other.
+
+    Without a branch that loses digits: Duff et al., "Building an orthonormal basis, revisited", 2017.
+    """
+    x, y, z = normal
+    sign = torch.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
 
 
 def reference_drag(

@@ -1,7 +1,8 @@
 """The definition of the noise: the equations of `stages`, for one environment, in plain float64 NumPy.
 
-The batched form shares nothing with it but constants: hashes are of unsigned words, normal numbers are by cosine and sine, the
-delay interpolates in a list of all times and signals since the reset, and crosstalk is a sum over pairs of taxels.
+The batched form shares nothing with it but constants and the names of quantities: hashes are of unsigned words, normal numbers
+are by cosine and sine, the delay interpolates in a list of all times and signals since the reset, and crosstalk is a sum over
+pairs of taxels.
 
 Shapes: `row` taxels (or bodies) of the reading, `channel` its channels, `word` random words.
 """
@@ -16,6 +17,7 @@ from jaxtyping import Float, UInt64
 
 from tgdsl.layout import Layout
 from tgdsl.sensors.noise import random
+from tgdsl.sensors.noise.lower import quantity
 from tgdsl.sensors.noise.spec import ALL, ZERO, Knobs, Range
 from tgdsl.sensors.noise.stages import PARAMETERS
 
@@ -195,5 +197,4 @@ def _range(knobs: Knobs, name: str, channel: str) -> Range:
             found = knobs.read_delay if name == "delay" else getattr(knobs, name)
     if isinstance(found, tuple):
         return found
-    quantity = channel[:-2] if channel.endswith(("_x", "_y", "_z")) else channel
-    return found.get(quantity, found.get(ALL, ZERO))
+    return found.get(quantity(channel), found.get(ALL, ZERO))
