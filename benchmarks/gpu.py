@@ -74,14 +74,14 @@ class Bench:
         if options.eager:
             return cls(case, plan, touch.advance, touch.device)
         turn.compile(touch)
-        assert touch._compiled is not None, "this machine cannot compile"
-        return cls(case, plan, touch._compiled, touch.device)
+        assert touch._compiled, "this machine cannot compile"
+        return cls(case, plan, touch._compiled["advance"], touch.device)
 
     def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""
         touch = TactileModule(self.plan).to(self.device)
-        touch._compiled = self.core
-        touch._graphed = Graphed(self.core) if graph and self.device.type == "cuda" else None
+        touch._compiled = {"advance": self.core}
+        touch._graphed = {"advance": Graphed(self.core)} if graph and self.device.type == "cuda" else {}
         return touch
 
 

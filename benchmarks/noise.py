@@ -108,8 +108,7 @@ class Cost:
                 with torch.no_grad():
                     touch(state)  # compiles it, and makes what it remembers
                     calls[name] = captured(lambda touch=touch, state=state: touch(state), self.device)
-                held = [*touch.memory.buffers(), *touch.histories.buffers()]
-                size = sum(buffer.numel() * buffer.element_size() for buffer in held if buffer.ndim)
+                size = sum(buffer.numel() * buffer.element_size() for buffer in touch.memory.buffers() if buffer.ndim)
                 sizes[name] = size / self.num_envs / NUM_TAXELS[scene]
         times = median_ms(calls, self.repeats, self.device)
         return {name: (times[name], sizes[name]) for name in calls}

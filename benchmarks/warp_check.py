@@ -19,6 +19,8 @@ Errors are over the largest magnitude of that channel in the batch; slots of con
   mean magnitude. Means over environments must agree to 2 % and 0.1 mm: a steady grip depends little on how it came about, but
   contacts that stick do remember it, and where two runs differ by a rounding some of them stick elsewhere.
 - `graph`: readings of `step_and_read` are those of the same module, eager, on the state that it left, as `modules`.
+- `masked`: a CUDA graph of a reading of all environments, a reset of some, a second reading of these alone and a look at what
+  the next call would read, replayed on new states and masks: what the eager module reads in the same order, as `modules`.
 - `reset`: environments of a mask are bit for bit at the start, the others where they were.
 - `overflow`: a pool that is too small is reported by name, and no more after a reset to a state with few contacts.
 """
@@ -122,8 +124,8 @@ def demand(is_met: bool, what: str) -> None:
         raise Failure(what)
 
 
-def judge(touch: TactileModule, error: dict[str, np.ndarray]) -> None:
-    """Demand of 99.9 % of each reading but remainders that they agree.
+def judge(touch: TactileModule, error: dict[str, np.ndarray], calls: Sequence[str] = ("",)) -> None:
+    """Demand of 99.9 % of each reading but remainders that they agree, in each of some calls.
 
     Raises:
         Failure: If they do not.
@@ -132,8 +134,9 @@ def judge(touch: TactileModule, error: dict[str, np.ndarray]) -> None:
         if output.name.endswith(REMAINDERS):
             continue
         tolerance = 3e-5 if output.kind == "elastomer" else 1e-5
-        share = np.mean(error[output.name] > tolerance)
-        demand(bool(share <= 1e-3), f"{output.name}: {share:.2%} differ by more than {tolerance:g}")
+        for call in calls:
+            share = np.mean(error[f"{call}{output.name}"] > tolerance)
+            demand(bool(share <= 1e-3), f"{call}{output.name}: {share:.2%} differ by more than {tolerance:g}")
 
 
 def check_modules(options: argparse.Namespace) -> None:
@@ -246,6 +249,53 @@ def check_graph(options: argparse.Namespace) -> None:
     judge(touch, errors(found, expected))
 
 
+def check_masked(options: argparse.Namespace) -> None:
+    """Read all, then some anew, in one graph: captured after three calls, and replayed."""
+    touch, other = module(options, options.device), module(options, options.device)
+    if not options.eager:
+        touch.compile()
+    sim = simulation(touch, options, substeps=SUBSTEPS)
+    state = copied(sim.state())
+    mask = torch.zeros(options.num_envs, dtype=torch.bool, device=options.device)
+
+    def calls(read: TactileModule) -> dict[str, Tensor]:
+        found = {f"all {name}": value for name, value in read(state).items()}
+        read.reset(mask)
+        found |= {f"some {name}": value for name, value in read(state, mask).items()}
+        return found | {f"next {name}": value for name, value in read.peek(state).items()}
+
+    found: Kept = {}
+    expected: Kept = {}
+    graph, made = None, {}
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for i, control in enumerate(grips(sim.model, np.linspace(0.3, 1.2, options.num_envs), options.instants * EVERY)):
+            sim.step(control)
+            copied(sim.state(), state)
+            mask.copy_(torch.rand(options.num_envs, generator=generator) < 0.2)
+            if graph is None and i == 3 and options.device != "cpu":
+                graph, made = torch.cuda.CUDAGraph(), {}
+                with torch.cuda.graph(graph):
+                    made = calls(touch)
+            if graph is None:
+                made = calls(touch)
+            else:
+                graph.replay()
+            keep(numbers(made), found)
+            keep(numbers(calls(other)), expected)
+    judge(touch, errors(found, expected), ("all ", "some ", "next "))
+
+
+def copied(state: SceneState, into: SceneState | None = None) -> SceneState:
+    """Return a state in tensors of its own, or write it into those of another one."""
+    if into is None:
+        into = state.to(torch.float32, copy=True)
+    for name in vars(state):
+        if isinstance(value := getattr(state, name), Tensor):
+            getattr(into, name).copy_(value)
+    return into
+
+
 def check_reset(options: argparse.Namespace) -> None:
     """Start every other environment anew, five times, so that what is captured is replayed."""
     touch = module(options, options.device)
@@ -289,6 +339,7 @@ CHECKS: dict[str, Callable[[argparse.Namespace], None]] = {
     "states": check_states,
     "runs": check_runs,
     "graph": check_graph,
+    "masked": check_masked,
     "reset": check_reset,
     "overflow": check_overflow,
 }

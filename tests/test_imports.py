@@ -21,6 +21,8 @@ FLOORS = {
         "memory",
         "felt_objects",
         "taxels",
+        "observing",
+        "slot_watch",
         "env_ids",
         "example",
         "state",
@@ -28,7 +30,7 @@ FLOORS = {
         "artifact",
         "explain",
     },
-    2: {"sensors", "observations", "layout", "plan"},
+    2: {"sensors", "observations", "proprioception", "layout", "plan"},
     1: {"geometry", "devices", "progress", "tables", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}

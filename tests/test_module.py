@@ -1,5 +1,6 @@
 import copy
 import pickle
+import warnings
 from typing import Literal
 
 import numpy as np
@@ -150,7 +151,7 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
 def test_float64_constants_are_the_plans_to_the_bit(document):
     touch = tgdsl.compile(document)
     exact = tgdsl.compile(document, dtype=torch.float64)
-    for moved in (touch.double(), tgdsl.compile(document).to(torch.float64), tgdsl.compile(document).half().double()):
+    for moved in (touch.double(), tgdsl.compile(document).to(torch.float64), tgdsl.compile(document).double().float().double()):
         for (name, a), (_, b) in zip(moved.constants.named_buffers(), exact.constants.named_buffers(), strict=True):
             assert torch.equal(a, b), name
         assert moved.dtype == torch.float64
@@ -280,13 +281,34 @@ def test_as_many_modules_as_one_likes_are_compiled(document, monkeypatch):
         assert len(found) == count and all(torch.equal(found[name], expected[name]) for name in expected)
 
 
-def test_half_precision_is_refused(touch):
-    state = touch.example_state(2)
-    with pytest.raises(
-        TgdslError, match=r"this module is of torch\.float16, whose range is too small: touch\.to\(torch\.float32\)"
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.bfloat16, torch.bool, torch.complex64])
+def test_only_float32_and_float64_are_a_modules(document, touch, tmp_path, dtype):
+    """A bfloat16 knows 4 cm to 0.1 mm, so depths erred by half of full scale; an integer read zeros."""
+    path = tmp_path / "touch.safetensors"
+    tgdsl.save(touch, path)
+    refused = pytest.raises(TgdslError, match=rf"^a module cannot be of {dtype}, expected torch\.float32 or torch\.float64; ")
+    for make in (
+        lambda: tgdsl.compile(document, dtype=dtype),
+        lambda: tgdsl.load(path, dtype=dtype),
+        lambda: TactileModule(touch.plan, dtype=dtype),
     ):
-        touch.half()(state)
-    assert touch.to(torch.bfloat16)(state)["touch"].dtype == torch.bfloat16
+        with refused:
+            make()
+    if dtype not in (torch.int64, torch.bool):  # torch itself casts modules to floating point or complex dtypes alone
+        for cast in (lambda: touch.to(dtype), lambda: touch.type(dtype), lambda: torch.nn.Sequential(touch).to(dtype)):
+            with warnings.catch_warnings(), refused:
+                warnings.filterwarnings("ignore", "Complex modules")
+                cast()
+        assert {b.dtype for b in touch.buffers() if b.is_floating_point()} == {touch.dtype}
+
+
+def test_a_module_is_cast_between_its_dtypes(touch):
+    state = touch.example_state(3)
+    single = touch(state)["touch"]
+    touch.free()
+    double = touch.double()(state)["touch"]
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5 * float(double.abs().max()))
 
 
 def test_tables_have_no_tiles(document, tmp_path, monkeypatch):

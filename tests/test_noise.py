@@ -425,11 +425,11 @@ def test_explain_tells_the_stages_and_their_values(build):
     ]
     assert "rate: 60 Hz" in text and "history: stack of 4 calls" in text
     num = 17 * 6 * 4
-    fixed = 4 * num + 4 + 8 * num + 1  # lag, last, walk and held sample; phase; the history twice; is_new
+    fixed = 4 * num + 4 + 4 * num  # lag, last, walk and held sample; phase; the history
     what = "noise lag, noise last, noise ring, noise walk, sample phase, sample measured, history"
     per_taxel = f"{fixed / 17:.3g} per taxel, and for each call of the last 0.03 s {num} bytes, 24 per taxel"
     assert f"remembers {what} ({fixed} bytes per environment), {per_taxel}" in text
-    assert f"remembers    {fixed + 16:>10} bytes, and {num} for each call of the delays" in text
+    assert f"remembers    {fixed + 24:>10} bytes, and {num} for each call of the delays" in text
 
 
 @pytest.mark.parametrize("history", [{}, {"history": 3}, {"history": {"length": 5, "reduce": "mean"}}, {"history": {"length": 5, "reduce": "last"}}])  # fmt: skip

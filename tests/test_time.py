@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.errors import StateError
+from tgdsl.errors import SpecError, StateError
 from tgdsl.reading import _phase
 from tgdsl.state import SceneState
 
@@ -209,16 +209,50 @@ def test_history_is_a_window_over_the_last_calls(build, length, rate):
         np.testing.assert_allclose(readings["median"].numpy(), np.median(window, axis=1), atol=1e-15)
 
 
-def test_a_stack_is_a_view_of_the_ring(build):
-    """No copy is made, at any place of the ring."""
-    touch = build(s={"history": 5})
-    for depth in ramp(12, 4):
-        stack = touch(pressed(touch, depth))["s"]
-        ring = touch.histories["s"].get_buffer("ring")
-        first = ring.data_ptr()
-        assert first <= stack.data_ptr() < first + ring.numel() * ring.element_size()
-        assert stack.untyped_storage().data_ptr() == ring.untyped_storage().data_ptr()
-        assert stack.shape == (4, 5, 2, 1) and torch.equal(stack[:, -1, 0, 0], stack[:, -1].flatten(1)[:, 0])
+def test_a_stack_is_a_copy_that_later_calls_leave_alone(build):
+    touch, depths = build(s={"history": 5}), ramp(12, 4)
+    kept = [touch(pressed(touch, depth))["s"] for depth in depths]
+    for call, stack in enumerate(kept):
+        window = depths[np.maximum(np.arange(call - 4, call + 1), 0)].T
+        np.testing.assert_allclose(stack[..., 0, 0].numpy(), window, atol=1e-15)
+
+
+def test_a_stack_may_be_a_view_of_the_memory(build):
+    """Each call writes over it, in the same place, and it reads what a copy reads."""
+    touch, plain, depths = build(s={"history": {"length": 5, "view": True}}), build(s={"history": 5}), ramp(12, 4)
+    views = []
+    for depth in depths:
+        views.append(touch(pressed(touch, depth))["s"])
+        copy = plain(pressed(plain, depth))["s"]
+        assert all(torch.equal(view, copy) for view in views)
+    window = touch.memory.get_buffer("history/s")
+    assert {view.untyped_storage().data_ptr() for view in views} == {window.untyped_storage().data_ptr()}
+
+
+def test_only_a_stack_can_be_a_view(build):
+    with pytest.raises(SpecError, match=r"`view` is used by `reduce: stack` alone, expected it to be left out"):
+        build(s={"history": {"length": 5, "reduce": "mean", "view": True}})
+
+
+@pytest.mark.parametrize("reduce", ["stack", "mean", "median"])
+def test_a_history_keeps_the_gradient_of_its_last_call(build, reduce):
+    """Against finite differences: what was read before is constant, so a mean of three has a third of the slope."""
+    touch, depths = build(s={"history": {"length": 3, "reduce": reduce}}), torch.tensor([[1e-3], [3e-3], [2e-3]])
+    touch(pressed(touch, depths[0]))
+    touch(pressed(touch, depths[1]))
+    state = pressed(touch, depths[2])
+    assert state.body_pos is not None
+    state.body_pos.requires_grad_()
+    read = touch.peek(state)["s"][..., 0, 0].sum()
+    (slope,) = torch.autograd.grad(read, state.body_pos)
+    step, place = 1e-6, (0, touch.inputs.bodies.index("item"), 2)
+    values = []
+    for sign in (1, -1):
+        moved = state.body_pos.detach().clone()
+        moved[place] += sign * step
+        values.append(touch.peek(SceneState(body_pos=moved, body_quat=state.body_quat))["s"][..., 0, 0].sum().item())
+    assert slope[place].item() == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-6)
+    assert slope[place].item() == pytest.approx({"stack": -1, "mean": -1 / 3, "median": -1}[reduce], rel=1e-6)
 
 
 def test_a_stack_is_channel_major_per_call(build):
@@ -276,7 +310,9 @@ def test_history_fixes_the_batch(build):
     assert touch.has_state
     touch(pressed(touch, [1e-3, 2e-3]))
     assert touch.num_envs == 2
-    with pytest.raises(StateError, match=r"^this module holds the state of 2 environments, the scene has 3$"):
+    with pytest.raises(
+        StateError, match=r"^this module holds the state of 2 environments, the scene has 3; `free\(\)` lets go of it$"
+    ):
         touch(pressed(touch, [1e-3] * 3))
 
 
@@ -365,6 +401,6 @@ def test_the_clock_counts_calls_and_episodes(build):
         if call == 4:
             touch.reset(torch.tensor([True, False, False]))
     clock = touch.memory.clock
-    assert clock.get_buffer("step").item() == 7
+    assert clock.get_buffer("step").tolist() == [7, 7, 7]
     assert clock.get_buffer("episode").tolist() == [2, 0, 1]
     assert clock.get_buffer("age").tolist() == [2, 7, 4]

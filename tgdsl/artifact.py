@@ -50,7 +50,7 @@ def load(
     Args:
         path: The artefact.
         kinds: Sensor kinds of your own, if it was compiled with any.
-        dtype: Dtype of the readings, float32 or float64; its name will do.
+        dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
         device: Where the module lives.
 
     Raises:

@@ -8,12 +8,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tgdsl.devices import check_dtype
+
 
 class Constants(nn.Module):
     """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
-        """Make a buffer of each array, floats in `dtype`."""
+        """Make a buffer of each array, floats in `dtype`.
+
+        Raises:
+            TgdslError: If no module can be of that dtype.
+        """
+        check_dtype(dtype)
         super().__init__()
         self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
         self._counts = {name: tuple(array[0].tolist()) for name, array in arrays.items() if name.endswith("/num")}

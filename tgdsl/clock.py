@@ -22,11 +22,11 @@ _INT64 = 2**63
 
 
 class Clock(nn.Module):
-    """Counts calls and episodes. It holds nothing until `start`, nor if no sensor asks for it.
+    """Counts calls and episodes, of each environment alone. It holds nothing until `start`, nor if no sensor asks for it.
 
-    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes), `step` (calls so
-    far), `episode` (resets of each environment, (env,)), `age` (calls since the last one, (env,)); and `ages` (call,), how long
-    before the last call each one was [s], itself first.
+    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
+    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
+    (env, call), how long before the last call each one was [s], itself first.
 
     Attributes:
         home: Has device and dtype of counts that are loaded before the start.
@@ -36,6 +36,7 @@ class Clock(nn.Module):
         """Note which sensors want to know."""
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.is_timed]
+        self._has_history = any(sensor.windows for sensor in sensors)
         self._drawing = list(dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams))
         self._seed, self._first_env = 0, None
         self.home = torch.empty(0)
@@ -43,7 +44,7 @@ class Clock(nn.Module):
     @property
     def is_wanted(self) -> bool:
         """Whether any sensor wants to know."""
-        return len(self._sensors) > 0
+        return len(self._sensors) > 0 or self._has_history
 
     @property
     def num_envs(self) -> int | None:
@@ -58,17 +59,25 @@ class Clock(nn.Module):
             calls: How many calls before the present one some ring remembers.
             like: Has the module's device and dtype.
         """
-        first = _rank() * num_envs if self._first_env is None else self._first_env
-        for name, value in {"seed": self._seed, "first_env": first, "step": 0}.items():
-            self.register_buffer(name, torch.tensor(value, dtype=torch.int64, device=like.device))
-        for name in ("episode", "age"):
-            self.register_buffer(name, torch.zeros(num_envs, dtype=torch.int64, device=like.device))
+        whole = {"device": like.device, "dtype": torch.int64}
+        for name in ("seed", "first_env"):
+            self.register_buffer(name, torch.zeros((), **whole))
+        for name in ("step", "episode", "age"):
+            self.register_buffer(name, torch.zeros(num_envs, **whole))
         if calls:
-            self.register_buffer("ages", torch.zeros(calls, dtype=like.dtype, device=like.device))
+            self.register_buffer("ages", torch.zeros(num_envs, calls, dtype=like.dtype, device=like.device))
         # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
         periods = torch.tensor([sensor.period for sensor in self._sensors], dtype=like.dtype, device=like.device)
         self.register_buffer("periods", periods, persistent=False)
-        self._set_keys()
+        if self._drawing:
+            keys = torch.zeros(len(self._drawing), 2, dtype=torch.int32, device=like.device)
+            self.register_buffer("keys", keys, persistent=False)
+        self._count_anew()
+
+    def free(self) -> None:
+        """Hold nothing again; the seed is kept."""
+        for name in [name for name, _ in self.named_buffers(recurse=False)]:
+            delattr(self, name)
 
     def seed_with(self, seed: int, first_env: int | None) -> None:
         """Choose other random numbers, from the next call on; environments are counted from `first_env`.
@@ -83,10 +92,7 @@ class Clock(nn.Module):
         # It is kept as an int64: whoever loads a state dict draws the same numbers.
         self._seed, self._first_env = (int(seed) + _INT64) % (2 * _INT64) - _INT64, first_env
         if self.num_envs is not None:
-            ages = self._buffers.get("ages")
-            like = self._buffers["age"] if ages is None else ages
-            assert like is not None
-            self.start(self.num_envs, 0 if ages is None else len(ages), like)
+            self._count_anew()
 
     def reset(self, chosen: Tensor) -> None:
         """Begin a new episode in the environments of a mask."""
@@ -108,12 +114,12 @@ class Clock(nn.Module):
         """
         if not self.is_wanted:
             return {}
-        step, age = memory["clock/step"], memory["clock/age"][:, None]
+        step, age = memory["clock/step"][:, None], memory["clock/age"][:, None]
         ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
         drawn: dict[str, Mapping[int, Stream]] = {}
         if self._drawing:
             env = torch.arange(len(age), device=age.device) + memory["clock/first_env"]
-            found = streams(memory["clock/keys"], env, step, memory["clock/episode"])
+            found = streams(memory["clock/keys"], env, step[:, 0], memory["clock/episode"])
             drawn = dict(zip(self._drawing, found, strict=True))
         nows = {}
         for i, sensor in enumerate(self._sensors):
@@ -130,24 +136,36 @@ class Clock(nn.Module):
         counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
         if "clock/ages" in clock and dt is not None:
             ages = clock["clock/ages"]
-            counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:1]), ages[:-1] + dt])
+            counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1] + dt], dim=1)
         return counts
 
-    def _set_keys(self) -> None:
-        seed, device = int(self._buffers["seed"]), self._buffers["seed"].device  # type: ignore[arg-type, union-attr]
-        if self._drawing:
-            keys = [sensor_key(seed, sensor) for sensor in self._drawing]
-            self.register_buffer("keys", torch.tensor(keys, dtype=torch.int32, device=device), persistent=False)
+    def _count_anew(self) -> None:
+        """Write the seed and what follows from it, and start all counts from 0, in place: captured graphs go on with them."""
+        assert self.num_envs is not None
+        first = _rank() * self.num_envs if self._first_env is None else self._first_env
+        with torch.no_grad():
+            self.get_buffer("seed").fill_(self._seed)
+            self.get_buffer("first_env").fill_(first)
+            for name in ("step", "episode", "age"):
+                self.get_buffer(name).zero_()
+        self._set_keys()
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Make room for the counts that are loaded, and go on with their seed."""
+    def _set_keys(self) -> None:
+        if self._drawing:
+            keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._drawing]
+            self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Make room for the counts that are loaded, and go on with their seed; do nothing if `Memory` has found errors."""
+        if args[-1]:
+            return
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
             ages = state_dict.get(f"{prefix}ages")
-            self.start(len(age), len(ages) if isinstance(ages, Tensor) else 0, self.home)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+            self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
+        super()._load_from_state_dict(state_dict, prefix, *args)
         if self.num_envs is not None:
-            self._seed, self._first_env = int(self._buffers["seed"]), int(self._buffers["first_env"])  # type: ignore[arg-type]
+            self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
             self._set_keys()
 
 

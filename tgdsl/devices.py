@@ -6,6 +6,20 @@ import torch
 
 from tgdsl.errors import TgdslError
 
+DTYPES = (torch.float32, torch.float64)
+"""What a module can be of. A narrower float knows places on a hand to a tenth of a millimetre, too coarse for a depth."""
+
+
+def check_dtype(dtype: torch.dtype) -> None:
+    """Refuse a dtype that no module can be of.
+
+    Raises:
+        TgdslError: If it is not one of `DTYPES`.
+    """
+    if dtype not in DTYPES:
+        hint = "readings can be cast afterwards, a module computes depths that a narrower float cannot hold"
+        raise TgdslError(f"a module cannot be of {dtype}, expected torch.float32 or torch.float64; {hint}")
+
 
 def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
     """Return a dtype by its name.
@@ -14,11 +28,12 @@ def dtype_of(dtype: torch.dtype | str) -> torch.dtype:
         dtype: A dtype, or its name, "float32" or "torch.float32".
 
     Raises:
-        TgdslError: If there is none of that name.
+        TgdslError: If there is none of that name, or no module can be of it.
     """
     found = getattr(torch, dtype.removeprefix("torch."), None) if isinstance(dtype, str) else dtype
     if not isinstance(found, torch.dtype):
         raise TgdslError(f"dtype is {dtype!r}, expected torch.float32 or torch.float64")
+    check_dtype(found)
     return found
 
 

@@ -38,6 +38,12 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     return found.reshape(-1).astype(np.int64)
 
 
+def is_env_mask(env_ids: EnvIds, num_envs: int) -> bool:
+    """Return whether environments are named by a mask; a tensor's numbers are not looked at."""
+    found = env_ids if isinstance(env_ids, Tensor) else torch.as_tensor(env_ids)
+    return found.dtype == torch.bool and found.shape == (num_envs,)
+
+
 def env_mask(
     env_ids: EnvIds | None,
     num_envs: int,

@@ -14,6 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tgdsl.memory import Memory
 from tgdsl.module import TactileModule
 from tgdsl.plan import PlannedObject, PlannedPoints, PlannedSensor
+from tgdsl.proprioception import QUANTITIES
 from tgdsl.sensors.noise.lower import quantity
 
 
@@ -135,7 +136,7 @@ def _remembers(touch: TactileModule, sensor: PlannedSensor) -> str:
     """Return what a sensor carries from one call to the next, and its size; the clock, which all share, is not in it."""
     fixed, ring = _sizes(touch, sensor)
     own = [name if "/" not in name else " ".join(name.split("/")[:2]) for name in sensor.state]
-    if _rings(sensor):
+    if sensor.windows:
         own.append("history")
     if not own:
         return "remembers the clock alone" if sensor.is_timed else "no state"
@@ -152,16 +153,9 @@ def _sizes(touch: TactileModule, sensor: PlannedSensor) -> tuple[int, int]:
     size = torch.finfo(touch.dtype).bits // 8
     fixed = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if not memory.past)
     ring = size * sum(math.prod(memory.shape) for memory in sensor.state.values() if memory.past)
-    return fixed + sum(count * size + 1 for count in _rings(sensor)), ring
-
-
-def _rings(sensor: PlannedSensor) -> list[int]:
-    """Return how many numbers the history of each reading holds, see `history.History`."""
-    history = sensor.history
-    if history is None or history.reduce == "last":
-        return []
-    own = [reading for reading in sensor.readings if reading.name in (sensor.name, f"{sensor.name}/clean")]
-    return [2 * history.length * reading.num_rows * len(reading.channels) for reading in own]
+    steps = 0 if sensor.history is None else sensor.history.length
+    windows = sum(steps * reading.num_rows * len(reading.channels) for reading in sensor.windows)
+    return fixed + size * windows, ring
 
 
 _OF_READING = "unit of the reading"
@@ -275,7 +269,8 @@ def _fields(touch: TactileModule) -> list[str]:
 def _observations(touch: TactileModule) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
-        what = f"{term.type} of {term.reading} ({term.num_features})" if term.reading else term.type
+        of = f" of {term.reading}" if term.reading not in (None, *QUANTITIES) else ""
+        what = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
         groups.setdefault(term.group, []).append(what)
     if not groups:
         return []
@@ -287,13 +282,19 @@ def _inputs(touch: TactileModule) -> list[str]:
     lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
     if inputs.pairs:
         lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
+    for name, parts in inputs.contacts_of.items():
+        lines.append(f"  contacts with {name} are those on {', '.join(f'{part.kind} {part.name}' for part in parts)}")
     if inputs.slots:
         lines.append(f"  slots   {inputs.slots} contacts of each pair")
+    if inputs.joints:
+        lines.append(f"  joints  {', '.join(inputs.joints)}")
+    if inputs.actuators:
+        lines.append(f"  actuators  {', '.join(inputs.actuators)}")
     return [*lines, ""]
 
 
-_CLOCK_BYTES = 16
-"""What the clock holds of each environment: two int64, see `clock.Clock`."""
+_CLOCK_BYTES = 24
+"""What the clock holds of each environment beside the ages of calls: three int64, see `clock.Clock`."""
 
 
 def _costs(touch: TactileModule) -> list[str]:

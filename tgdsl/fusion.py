@@ -39,6 +39,7 @@ def of_its_own(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def takes_kernel(*tensors: Tensor) -> bool:
-    """Return whether a Triton kernel can take these: float32 on a GPU, and nobody asks for derivatives, which it lacks."""
+    """Return whether a Triton kernel can take these: all float32 on a GPU, and nobody asks for derivatives, which it lacks."""
     wants_derivatives = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return HAS_TRITON and tensors[0].is_cuda and tensors[0].dtype == torch.float32 and not wants_derivatives
+    are_fit = all(tensor.is_cuda and tensor.dtype == torch.float32 for tensor in tensors)
+    return HAS_TRITON and are_fit and not wants_derivatives

@@ -1,12 +1,13 @@
-"""What a module carries from one call to the next: buffers of each sensor, and its clock.
+"""What a module carries from one call to the next: buffers of each sensor, windows over last readings, and its clock.
 
-Shapes: `env` environments, `call` calls that a ring remembers.
+Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, `row` taxels or bodies, `channel`
+numbers per row.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,19 +18,27 @@ from tgdsl.errors import StateError
 from tgdsl.fusion import stored
 from tgdsl.plan import PlannedMemory, PlannedSensor
 
+WINDOW, KEPT = "history/", "kept/"
+"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, channel, row), the last one."""
+
 
 class Memory(nn.Module):
-    """Buffers `sensor:name`, (env, …) or (env, call, …); none before the first call, nor if no sensor carries anything.
+    """Buffers `sensor:name`, (env, …) or (env, call, …), and `history/<reading>`; none before the first call.
 
     Attributes:
-        home: Has the device of state that is loaded before the first call.
+        home: Has device and dtype of state that is loaded before the first call.
     """
 
     def __init__(self, sensors: Sequence[PlannedSensor]):
         """Note what sensors carry."""
         super().__init__()
-        self._planned = {f"{s.name}:{name}": (s, name, part) for s in sensors for name, part in s.state.items()}
-        self._rings = {path: found for path, found in self._planned.items() if found[2].past > 0}
+        self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
+        for s in sensors:
+            for reading in s.windows:
+                assert s.history is not None
+                shape = (s.history.length, len(reading.channels), reading.num_rows)
+                self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
+        self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
 
@@ -41,7 +50,8 @@ class Memory(nn.Module):
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call."""
-        return next((len(buffer) for buffer in self._buffers.values() if buffer is not None), self.clock.num_envs)
+        held = (buffer for name, buffer in self.named_buffers(recurse=False) if not name.startswith(KEPT))
+        return next((len(buffer) for buffer in held), self.clock.num_envs)
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
@@ -55,51 +65,122 @@ class Memory(nn.Module):
         Raises:
             StateError: If dt is so short that a ring is too short.
         """
-        if not self.is_wanted:
-            return {}
-        if self.num_envs is None:
+        if self.is_wanted and self.num_envs is None:
             with torch.inference_mode(False):
-                for path, (_, _, planned) in self._planned.items():
+                for path, planned in self._planned.items():
                     shape = (num_envs, *_calls(planned, dt), *planned.shape)
                     self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
                 if self.clock.is_wanted:
-                    calls = max((_calls(part, dt)[0] for _, _, part in self._rings.values()), default=0)
+                    calls = max((_calls(part, dt)[0] for _, part in self._rings.values()), default=0)
                     self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
-        held: dict[str, Tensor] = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
-        for path, (sensor, _, planned) in self._rings.items():
+        held = dict(self.named_buffers(recurse=False))
+        for path, (sensor, planned) in self._rings.items():
             if _calls(planned, dt)[0] > held[path].shape[1]:
-                what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor.sensor}" does not hold'
+                what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
                 raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
         return held | self.clock.tensors()
 
+    @property
+    def num_kept(self) -> int | None:
+        """Number of environments whose last readings are kept; None if none are."""
+        return next((len(buffer) for name, buffer in self.named_buffers(recurse=False) if name.startswith(KEPT)), None)
+
+    def keep(self, readings: Mapping[str, Tensor]) -> None:
+        """From now on keep what is handed out, for the environments that a masked call leaves out.
+
+        Args:
+            readings: What was handed out last, (env, row, channel).
+        """
+        with torch.inference_mode(False), torch.no_grad():
+            for name, reading in readings.items():
+                copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
+                self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+
+    def forget_kept(self) -> None:
+        """Keep readings no longer."""
+        for name in [name for name, _ in self.named_buffers(recurse=False) if name.startswith(KEPT)]:
+            delattr(self, name)
+
+    def free(self) -> None:
+        """Hold nothing again, as before the first call."""
+        for name in [name for name, _ in self.named_buffers(recurse=False)]:
+            delattr(self, name)
+        self.clock.free()
+
     def reset(self, chosen: Tensor) -> None:
-        """Begin a new episode in the environments of a mask; what noise remembers starts anew by its age."""
-        for path, (_, name, planned) in self._planned.items():
-            if path in self._buffers and "/" not in name:
-                buffer = self._buffers[path]
-                assert buffer is not None
+        """Begin a new episode in the environments of a mask; what noise and history remember starts anew by its age."""
+        for path, planned in self._planned.items():
+            if "/" not in path.partition(":")[2] and not path.startswith(WINDOW):
+                buffer = self.get_buffer(path)
                 buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
         self.clock.reset(chosen)
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        """Make room for the state that is loaded: before the first call there is none."""
-        for path in self._planned:
-            value = state_dict.get(prefix + path)
-            if isinstance(value, Tensor):
-                self.register_buffer(path, torch.zeros_like(value, device=self.home.device))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state."""
+        found = {path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)}
+        has_clock = f"{prefix}clock.age" in state_dict
+        if found or has_clock:
+            error_msgs.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
+        if error_msgs:
+            return  # nothing is loaded, nor by the clock
+        for path, value in found.items():
+            room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
+            self.register_buffer(path, room)
+        self.forget_kept()  # what is replaced has handed them out
+        own = local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        super()._load_from_state_dict(state_dict, prefix, *own)
+
+    def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
+        """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
+        wrong = [f'"{prefix}{path}" is missing beside other state' for path in self._planned if path not in found]
+        if self.clock.is_wanted and age is None:
+            wrong.append(f'"{prefix}clock.age" is missing beside other state')
+        counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
+        if len(counts) > 1:
+            wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
+        for path, value in found.items():
+            expected = self._planned[path].shape
+            if tuple(value.shape[value.ndim - len(expected) :]) != tuple(expected):
+                wrong.append(
+                    f'"{prefix}{path}" has shape {tuple(value.shape)}, expected (env, …, {", ".join(map(str, expected))})'
+                )
+        return wrong
 
 
-def store(memory: dict[str, Tensor], updated: dict[str, Tensor]) -> None:
+def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
     """Put new state in the place of the old one; of a ring, this call's entry."""
     with torch.no_grad():
         for name, value in updated.items():
             if value.ndim < memory[name].ndim:
-                place = stored(memory["clock/step"] % memory[name].shape[1])[None]
-                memory[name].index_copy_(1, place, value.detach()[:, None])
+                env, place = _entry_of(memory, name)
+                memory[name].index_put_((env, place), value.detach())
         for name, value in updated.items():
             if value.ndim == memory[name].ndim:
                 memory[name].copy_(value.detach())
+
+
+def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
+    """Return new state of the environments of a mask, and the old one of all others."""
+    chosen = {}
+    for name, value in updated.items():
+        old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]
+        chosen[name] = torch.where(mask.view(-1, *[1] * (value.ndim - 1)), value, old)
+    return chosen
+
+
+def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
+    """Return the places of this call's entries in a ring: environment, and which of its calls."""
+    place = stored(memory["clock/step"] % memory[name].shape[1])
+    return torch.arange(len(place), device=place.device), place
 
 
 def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:

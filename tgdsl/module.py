@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from tgdsl import observations
 from tgdsl.buffers import Constants
+from tgdsl.devices import check_dtype
 from tgdsl.env_ids import EnvIds, env_mask
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
@@ -27,14 +27,16 @@ from tgdsl.fusion import of_its_own
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.graphed import Graphed
-from tgdsl.history import History, last_step
-from tgdsl.memory import Memory, store
+from tgdsl.history import last_step, pushed, reduced
+from tgdsl.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.observing import ObservationTerm, observation_terms, observe
 from tgdsl.plan import Inputs, Plan
 from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
 from tgdsl.tables import Outputs, TaxelTable, TaxelTables
 from tgdsl.taxels import image_indices, taxel_table
@@ -45,7 +47,8 @@ class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
-    "taxel"), or the bodies that carry it ("body"), which `bodies` lists.
+    "taxel"), or the bodies that carry it ("body"), which `bodies` lists. A reading that no sensor makes has its own name for
+    sensor and kind; its rows are those of `inputs.joints` ("joint") or `inputs.actuators` ("actuator").
     """
 
     name: str
@@ -63,8 +66,11 @@ class TactileModule(nn.Module):
 
     Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel,
     channel) where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state
-    (see `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it; one without
-    state takes any. Noise is drawn from the seed 0, or from that given to `seed`.
+    (see `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it until `free`; one
+    without state takes any. Noise is drawn from the seed 0, or from that given to `seed`.
+
+    Each call advances what sensors remember: delays, filters, histories, random numbers. `peek` reads without doing so, and
+    `touch(state, mask)` reads and advances some environments alone.
     """
 
     def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):
@@ -73,10 +79,10 @@ class TactileModule(nn.Module):
         Args:
             plan: What to compute.
             kinds: The kinds that the plan's sensors are of.
-            dtype: Dtype of constants, state and readings.
+            dtype: Dtype of constants, state and readings, float32 or float64.
 
         Raises:
-            TgdslError: If the plan uses a kind that is not given.
+            TgdslError: If the plan uses a kind that is not given, or the dtype is another one.
         """
         super().__init__()
         self.plan = plan
@@ -96,18 +102,12 @@ class TactileModule(nn.Module):
             for name in sensor.state
             if "/" not in name
         ]
-        self.histories = nn.ModuleDict(
-            {
-                reading.name: History(sensor.history)
-                for sensor in plan.sensors
-                for reading in sensor.readings
-                if sensor.history is not None and reading.name in (sensor.name, f"{sensor.name}/clean")
-            }
-        )
-        self._compiled: Callable[..., Any] | None = None
-        self._graphed: Graphed | None = None
+        self._last: dict[str, Tensor] = {}
+        self._compiled: dict[str, Callable[..., Any]] = {}
+        self._graphed: dict[str, Graphed] = {}
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
 
     def __repr__(self) -> str:
         layout, origin = self.plan.layout(), self.plan.origin
@@ -122,7 +122,7 @@ class TactileModule(nn.Module):
     @property
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading; a tuple that prints as a table."""
-        return Outputs(
+        sensed = tuple(
             Output(
                 reading.name,
                 sensor.sensor,
@@ -136,6 +136,16 @@ class TactileModule(nn.Module):
             for sensor in self.plan.sensors
             for reading in sensor.readings
         )
+        joints = tuple(
+            Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
+            for r in self.plan.proprioception
+        )
+        return Outputs(sensed + joints)
+
+    @property
+    def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
+        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        return observation_terms(self.plan)
 
     @property
     def taxels(self) -> dict[str, TaxelTable]:
@@ -155,52 +165,142 @@ class TactileModule(nn.Module):
     @property
     def has_state(self) -> bool:
         """Whether any sensor carries something from one call to the next."""
-        return self.memory.is_wanted or len(self.histories) > 0
+        return self.memory.is_wanted
 
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call, or if there is no state."""
-        found = self.memory.num_envs
-        return next((len(buffer) for buffer in self.histories.buffers()), found) if len(self.histories) else found
+        return self.memory.num_envs
 
-    def forward(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
-        """Read all sensors.
+    def forward(
+        self, state: SceneState, mask: Tensor | None = None, env_ids: EnvIds | None = None
+    ) -> dict[str, Float[Tensor, "env *step row channel"]]:
+        """Read all sensors, and advance what they remember.
+
+        With `mask` or `env_ids` it reads and advances those environments alone, as after a reset in the middle of a control
+        step: delay, noise and history of the others stay where they are, and their rows are as they were handed out before. A
+        mask on the module's device can be captured in a CUDA graph.
+
+        Args:
+            state: The scene, at one instant.
+            mask: Which environments to read, boolean (env,); default: all.
+            env_ids: The same by indices.
+
+        Returns:
+            Readings of all environments by name, as `outputs` lists them, in the module's dtype. They are tensors of their own,
+            but for a module that replays a CUDA graph (see `compile`), and histories that are declared as views.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
+                such environments, or some are to be left out before anything was handed out.
+        """
+        tensors, num_envs = self._tensors(state)
+        step = "advance"
+        if mask is not None or env_ids is not None:
+            step, tensors["mask"] = "advance_some", self._chosen(mask, env_ids, num_envs)
+        elif self.memory.num_kept not in (None, num_envs):  # only a module without state may change its batch
+            self.memory.forget_kept()
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        readings = self._run(step, tensors, memory)
+        self.hand_out(readings)
+        return self._with_views(readings)
+
+    def hand_out(self, readings: Mapping[str, Tensor]) -> None:
+        """Note what a call has handed out; for who replays a captured graph of calls in their place."""
+        self._last = {} if self.memory.num_kept else {name: reading.detach() for name, reading in readings.items()}
+
+    def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
+        """Return what a call would read, and advance nothing: the next call draws the same random numbers.
 
         Args:
             state: The scene, at one instant.
 
-        Returns:
-            Readings by name, as `outputs` lists them, in the module's dtype.
-
         Raises:
-            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
-            TgdslError: If the module is of float16, which cannot hold what lies between a state and its readings.
+            StateError: As a call does.
+            TgdslError: As a call does.
         """
+        tensors, num_envs = self._tensors(state)
+        is_first = self.has_state and self.num_envs is None
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        try:
+            return self._run("look", tensors, memory)
+        finally:
+            if is_first:
+                self.free()
+
+    def free(self) -> None:
+        """Let go of all that sensors remember, and of the number of environments; the seed is kept.
+
+        The next call may have any number of environments, and begins an episode in each.
+        """
+        self.memory.free()
+        self._last = {}
+
+    def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
+        """Return the fields of a state that are wanted, and the number of environments."""
         if not isinstance(state, SceneState):
             what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
             raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(self.inputs.fields)}")
-        dtype, device = self.dtype, self.device
-        if dtype == torch.float16:
-            raise TgdslError("this module is of torch.float16, whose range is too small: touch.to(torch.float32), or bfloat16")
-        tensors = state.checked(self.inputs, device)
+        tensors = state.checked(self.inputs, self.device)
         if state.dt is not None and "dt" in self.inputs.fields:
             tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
-            raise StateError(f"this module holds the state of {held} environments, the scene has {num_envs}")
-        memory = self.memory.tensors(num_envs, state.dt, dtype, device)
-        call = self._compiled or self.advance
-        if self._graphed is not None and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
-            call = self._graphed
+            held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
+            raise StateError(f"{held_by}; `free()` lets go of it")
+        return tensors, num_envs
+
+    def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
+        """Return which environments are read, and see to it that there is something to read of the others."""
+        if mask is not None and env_ids is not None:
+            raise StateError("found both `mask` and `env_ids`, expected one of them")
+        if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
+            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+            raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
+        if self.memory.num_kept is None:
+            if not self._last:
+                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+            stacks = {reading.name for sensor in self.plan.sensors for reading in sensor.windows if reading.steps}
+            self.memory.keep({name: reading for name, reading in self._last.items() if name not in stacks})
+        kept = self.memory.num_kept
+        if kept not in (None, num_envs):
+            raise StateError(f"readings of {kept} environments were handed out before, the scene has {num_envs}")
+        return env_mask(mask if mask is not None else env_ids, num_envs, self.device, StateError, waits=False)
+
+    def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
+        call = self._compiled.get(name) or getattr(self, name)
+        if self._graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
+            call = self._graphed[name]
         found = call(tensors, memory)
-        readings = {reading.name: found[reading.name] for sensor in self.plan.sensors for reading in sensor.readings}
-        return readings | {name: history.push(readings[name]) for name, history in self.histories.items()}  # type: ignore[operator]
+        return {name: found[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
         readings, updated = self._read(tensors, memory)
-        store(memory, updated)
+        store(memory, updated | _kept(readings, memory))
         return readings
+
+    def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Do what `advance` does for the environments of `tensors["mask"]`; of the others return what was handed out before."""
+        mask = tensors["mask"]
+        readings, updated = self.core(tensors, memory)
+        updated = chosen_only(memory, updated, mask)
+        for name, reading in readings.items():
+            if f"{KEPT}{name}" in memory:
+                made = torch.where(mask[:, None, None], reading.transpose(1, 2), memory[f"{KEPT}{name}"])
+                readings[name] = made.transpose(1, 2)
+            elif f"{WINDOW}{name}" in memory:
+                readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+        store(memory, updated | _kept(readings, memory))
+        return readings
+
+    def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings of `core`, and leave the state as it is."""
+        return self.core(tensors, memory)[0]
 
     def core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Compute readings and the new state: a pure function of its arguments, traceable in one graph.
@@ -234,30 +334,24 @@ class TactileModule(nn.Module):
                     joined[sensor.joined] = self._joined_signal(sensor.joined, felt, probes)
                 signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
             found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name), signal)
-            readings |= found
             updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
+            for reading in sensor.windows:
+                assert sensor.history is not None
+                path = f"{WINDOW}{reading.name}"
+                updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
+                found[reading.name] = reduced(updated[path], sensor.history.reduce)
+            readings |= found
+        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
         return readings, updated
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
 
         Raises:
-            ObservationError: If an observation is one that only the real hand has.
+            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
         """
-        num_envs = next(iter(readings.values())).shape[0]
-        nothing = torch.empty((num_envs, 0), dtype=self.dtype, device=self.device)
-        groups: dict[str, list[Tensor]] = {}
-        for term in self.plan.observations:
-            features = nothing
-            if term.type in observations.HAND_ONLY:
-                raise observations.hand_only_error(term.group, term.index, term.type)
-            if term.reading is not None:
-                constants = self.constants.under(f"observations/{term.group}/{term.index}", term.constants)
-                reading = readings[term.reading]
-                steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-                features = torch.cat([observations.observe(term.type, step, term.channels, constants) for step in steps], dim=1)
-            groups.setdefault(term.group, []).append(features)
-        return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
+        return observe(self.plan, self.constants, readings)
 
     def images(
         self, name: str, readings: Mapping[str, Tensor]
@@ -301,10 +395,7 @@ class TactileModule(nn.Module):
         if self.num_envs is None:
             return  # nothing is held yet, and the first call begins an episode
         with torch.no_grad():
-            chosen = env_mask(env_ids, self.num_envs, self.device, StateError, waits=False)
-            self.memory.reset(chosen)
-            for history in self.histories.values():
-                history.reset(chosen)  # type: ignore[operator]
+            self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))
 
     def seed(self, seed: int, first_env: int | None = None) -> TactileModule:
         """Choose the random numbers of noise; steps and episodes are counted from 0 again.
@@ -327,7 +418,7 @@ class TactileModule(nn.Module):
         return self
 
     def compile(self, graph: bool = False, **options: Any) -> TactileModule:
-        """Compile `advance` with `torch.compile` into fused kernels, in place; the first call then takes longer.
+        """Have calls and `peek` compiled by `torch.compile` into fused kernels, in place; their first one then takes longer.
 
         Args:
             graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph: the host
@@ -349,8 +440,9 @@ class TactileModule(nn.Module):
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
         if not {"mode", "options", "backend"} & options.keys():
             defaults["options"] = self.inductor_options()
-        self._compiled = torch.compile(of_its_own(self.advance), **{**defaults, **options})
-        self._graphed = Graphed(self._compiled) if graph else None
+        steps = {step.__name__: step for step in (self.advance, self.advance_some, self.look)}
+        self._compiled = {name: torch.compile(of_its_own(step), **{**defaults, **options}) for name, step in steps.items()}
+        self._graphed = {name: Graphed(step) for name, step in self._compiled.items()} if graph else {}
         return self
 
     def inductor_options(self) -> dict[str, bool]:
@@ -407,6 +499,11 @@ class TactileModule(nn.Module):
         constants = [self.constants.under(sensor.folder, sensor.constants) for sensor in sensors]
         return joined_signal(self._kinds[names[0]], sensors, felt, probes, constants)
 
+    def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Put the memory itself in the place of stacks that are declared as views."""
+        views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
+        return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
+
     def _dt_tensor(self, dt: float) -> Tensor:
         """Return dt as a tensor that is written only when it changes.
 
@@ -431,18 +528,27 @@ class TactileModule(nn.Module):
                 warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
-        """Move or cast all tensors; a captured graph has read the old ones."""
+        """Move or cast all tensors; a captured graph has read the old ones.
+
+        Raises:
+            TgdslError: If they are to be neither float32 nor float64.
+        """
+        check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
         super()._apply(fn, recurse)
-        if self._graphed is not None:
-            self._graphed.forget()
+        for graphed in self._graphed.values():
+            graphed.forget()
         return self
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         """Have state that is loaded before the first call where the module is."""
         home = torch.empty(0, dtype=self.dtype, device=self.device)
-        for part in (self.memory, self.memory.clock, *self.histories.values()):
-            part.home = home  # type: ignore[assignment]
+        self.memory.home = self.memory.clock.home = home
         super()._load_from_state_dict(*args, **kwargs)
+
+
+def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return what is kept of readings that are handed out, if anything is."""
+    return {f"{KEPT}{name}": made.transpose(1, 2) for name, made in readings.items() if f"{KEPT}{name}" in memory}
 
 
 def _has_cpp_compiler() -> bool:

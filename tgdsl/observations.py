@@ -24,6 +24,7 @@ from torch import Tensor
 from tgdsl.errors import ObservationError
 from tgdsl.fields import Positive, SpecModel
 from tgdsl.layout import Layout
+from tgdsl.proprioception import JointSpec
 
 
 class NoneObservation(SpecModel):
@@ -37,7 +38,19 @@ class OfReading(SpecModel):
     """What all types have in common that observe a reading."""
 
     of: str
-    """The reading that is observed: a sensor's name, or `<sensor>/clean`."""
+    """The reading that is observed: a sensor's name, `<sensor>/clean`, or a report such as `<sensor>/missed`."""
+
+
+class ReadingObservation(OfReading):
+    """Any reading as it is: all its channels, or some of them."""
+
+    type: Literal["reading"]
+    """Any reading as it is."""
+    channels: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Names or shell wildcards of channels, such as `[distance_cube]` or `["nearest_*"]`; default: all of them.
+
+    They stand in the order of this list; what a wildcard matches in the order of the reading.
+    """
 
 
 class BoolObservation(OfReading):
@@ -137,8 +150,8 @@ class TaxelSaturatedObservation(SpecModel):
     """Whether each of the hand's own taxels is at the end of its range; from hardware alone."""
 
 
-ObservationSpec = Annotated[
-    NoneObservation
+ReadingSpec = (
+    ReadingObservation
     | BoolObservation
     | AggBoolObservation
     | DepthObservation
@@ -149,9 +162,10 @@ ObservationSpec = Annotated[
     | ProximityObservation
     | LinkBoolObservation
     | LinkForceObservation
-    | TaxelCountsObservation
-    | TaxelSaturatedObservation,
-    Field(discriminator="type"),
+)
+"""Observations of a sensor's reading."""
+ObservationSpec = Annotated[
+    NoneObservation | ReadingSpec | JointSpec | TaxelCountsObservation | TaxelSaturatedObservation, Field(discriminator="type")
 ]
 
 _FORCE, _TORQUE, _MARKER = (tuple(f"{name}_{axis}" for axis in "xyz") for name in ("force", "torque", "displacement"))
@@ -167,7 +181,7 @@ WANTED: dict[str, tuple[tuple[str, ...], str]] = {
     "link_bool": (("contact",), "body"),
     "link_force": (_FORCE, "body"),
 }
-"""Channels of a reading that each observation type takes, in order, and what the reading has rows of."""
+"""Channels of a reading that an observation type takes, in order, and what the reading has rows of; `reading` takes any."""
 
 HAND_ONLY = {"taxel_counts": 5 * 120 * 3, "taxel_saturated": 5 * 120}
 """Observation types of the real hand alone, and how many features each has."""
@@ -192,13 +206,13 @@ def hand_only_error(group: str, index: int, type_: str) -> ObservationError:
     return ObservationError(f'{what}, and no simulation; read one with tgdsl.connect(touch, "xhand1")')
 
 
-def num_features(type_: str, num_rows: int, num_links: int) -> int:
-    """Return how many features an observation type gives."""
+def num_features(type_: str, num_channels: int, num_rows: int, num_links: int) -> int:
+    """Return how many features an observation type gives of one call's reading."""
     if type_ == "agg_bool":
         return num_links
     if type_ == "agg_force":
         return 3 * num_links
-    return len(WANTED[type_][0]) * num_rows
+    return num_channels * num_rows
 
 
 def observe(
@@ -211,9 +225,9 @@ def observe(
 
     Args:
         type_: The observation type.
-        reading: The sensor's reading.
+        reading: The reading.
         channels: Indices of the wanted channels in the reading.
-        constants: The arrays of `lower`, as tensors.
+        constants: The arrays of `lower`, as tensors; `rows`, where only some rows are wanted, and which.
     """
     if type_ == "agg_bool":
         count = reading[:, :, channels[0]] @ constants["operator"]
@@ -221,7 +235,8 @@ def observe(
         return torch.where(count.isnan(), count, bit)
     if type_ == "agg_force":
         return reading[:, :, channels[0]] @ constants["operator"]
-    by_channel = reading.transpose(1, 2)
-    if channels != tuple(range(reading.shape[2])):
-        by_channel = by_channel[:, list(channels)]
-    return by_channel.flatten(1)
+    if "rows" in constants:
+        reading = reading.index_select(1, constants["rows"])
+    if channels == tuple(range(reading.shape[2])):
+        return reading.transpose(1, 2).flatten(1)
+    return torch.cat([reading[:, :, channel] for channel in channels], dim=1)

@@ -29,6 +29,7 @@ It knows no text, no robot file and no simulator. Its arrays are float64 or int6
 | `sensors/<name>/<constant>` | | what the kind's `lower` folded |
 | `sensors/<name>/noise/<knob>` | ([end,] channel, row) | values of its noise, see `sensors.noise.lower` |
 | `observations/<group>/<i>/<constant>` | | what the observation's `lower` folded |
+| `observations/<group>/<i>/rows` | (row,) | rows of a reading of joints or actuators that are observed, if not all |
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from tgdsl.errors import ArtifactError
 from tgdsl.layout import Layout, Link
 from tgdsl.tables import listing, spelled
 
-FORMAT = 9
+FORMAT = 10
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -64,6 +65,14 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class ContactPart:
+    """Geoms whose contacts are an object's: those of a body, those of a body and of all bodies below it, or a single one."""
+
+    kind: Literal["body", "subtree", "geom"]
+    name: str
+
+
+@dataclass(frozen=True)
 class Inputs:
     """What a module wants of a scene, and in which order.
 
@@ -75,6 +84,9 @@ class Inputs:
         slots: Contacts per pair of the slotted contact fields; 0 if none is read.
         objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
         num_variants: How many variants each of these objects has; 1 if only its size differs.
+        joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
+        actuators: Actuators of the field `last_action`.
+        contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
     """
 
     fields: tuple[str, ...]
@@ -84,6 +96,13 @@ class Inputs:
     slots: int
     objects: tuple[str, ...] = ()
     num_variants: tuple[int, ...] = ()
+    joints: tuple[str, ...] = ()
+    actuators: tuple[str, ...] = ()
+    contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
+
+    def parts_of(self, name: str) -> tuple[ContactPart, ...]:
+        """Return the geoms whose contacts are an object's; no geom is in two of its parts."""
+        return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
 
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -201,13 +220,13 @@ class PlannedQuery:
 
 @dataclass(frozen=True)
 class PlannedReading:
-    """One entry of a module's readings: its name, what it has rows of (taxels or bodies), name and unit of each channel.
+    """One entry of a module's readings: its name, what it has rows of, name and unit of each channel.
 
     `steps` calls are stacked in it, oldest first; 0: it is of one call and has no such dimension.
     """
 
     name: str
-    rows: Literal["taxel", "body"]
+    rows: Literal["taxel", "body", "joint", "actuator"]
     num_rows: int
     channels: tuple[str, ...]
     units: tuple[str, ...]
@@ -243,10 +262,11 @@ class PlannedNoise:
 
 @dataclass(frozen=True)
 class PlannedHistory:
-    """How many calls a reading holds or is made of, and how."""
+    """How many calls a reading holds or is made of, how, and whether a stack of them is handed out as a view of the memory."""
 
     length: int
     reduce: Literal["stack", "last", "median", "mean"]
+    view: bool = False
 
 
 @dataclass(frozen=True)
@@ -293,6 +313,16 @@ class PlannedSensor:
     def is_timed(self) -> bool:
         """Whether it wants to know when a reading is made: for chance, for what its noise remembers, or for its own rate."""
         return bool(self.noise and self.noise.streams) or any("/" in name for name in self.state)
+
+    @property
+    def own_readings(self) -> tuple[PlannedReading, ...]:
+        """Its readings without reports: the measured one, the clean one, or both."""
+        return tuple(reading for reading in self.readings if reading.name in (self.name, f"{self.name}/clean"))
+
+    @property
+    def windows(self) -> tuple[PlannedReading, ...]:
+        """Those of its readings whose last calls are remembered."""
+        return () if self.history is None or self.history.reduce == "last" else self.own_readings
 
 
 @dataclass(frozen=True)
@@ -360,6 +390,7 @@ class SceneObject:
         types: MuJoCo's types of the geoms that it has instead of the scene's own; none if only its size differs.
         variants: Which of these geoms each variant has, and how; None where it lacks one.
         is_sized: Whether the size of its geom is chosen per environment.
+        others: Bodies that are other objects: they keep their geoms where they are welded to its body.
     """
 
     name: str
@@ -367,6 +398,7 @@ class SceneObject:
     types: tuple[str, ...]
     variants: tuple[tuple[SceneGeom | None, ...], ...]
     is_sized: bool
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -410,6 +442,7 @@ class Plan:
         skin: The links' own surfaces, if points of objects are measured against them.
         queries: Geometry queries.
         sensors: Sensors, in the document's order.
+        proprioception: Readings of joints and actuators, which are fields of the state, handed out by the same names.
         observations: Observation terms, in the document's order.
         dropped: What the scene or the document has and the module does not need, and why.
         arrays: Constants by path.
@@ -424,6 +457,7 @@ class Plan:
     skin: PlannedSkin | None
     queries: tuple[PlannedQuery, ...]
     sensors: tuple[PlannedSensor, ...]
+    proprioception: tuple[PlannedReading, ...]
     observations: tuple[PlannedObservation, ...]
     dropped: tuple[tuple[str, str], ...]
     arrays: Mapping[str, np.ndarray]
@@ -438,8 +472,13 @@ class Plan:
         """Return the taxels of one sensor."""
         return self.layout().take(self.arrays[f"queries/{sensor.query}/taxels"][slice(*sensor.rows)])
 
+    def readings(self) -> dict[str, PlannedReading]:
+        """Return all readings by name, in the order in which they are handed out."""
+        own = {reading.name: reading for sensor in self.sensors for reading in sensor.readings}
+        return own | {reading.name: reading for reading in self.proprioception}
+
     def sensor_of(self, reading: str) -> PlannedSensor:
-        """Return the sensor that a reading is of."""
+        """Return the sensor that makes a reading."""
         return next(sensor for sensor in self.sensors if reading in [own.name for own in sensor.readings])
 
     def to_json(self) -> str:
@@ -497,6 +536,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def contact_sensor_names(pair: Pair) -> tuple[str, str]:
-    """Return the names of the contact sensors of a pair: its point slots, and its net force."""
-    return f"tgdsl/contact/{pair.link}/{pair.object}", f"tgdsl/netforce/{pair.link}/{pair.object}"
+def contact_sensor_names(pair: Pair, part: int = 0) -> tuple[str, str]:
+    """Return the names of the contact sensors of a pair and a part of its object: the point slots, and the net force."""
+    end = f"{pair.link}/{pair.object}" + (f"/{part}" if part else "")
+    return f"tgdsl/contact/{end}", f"tgdsl/netforce/{end}"

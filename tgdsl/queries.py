@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tgdsl.buffers import Constants
 from tgdsl.felt_objects import FeltObjects
+from tgdsl.geometry import planes
 from tgdsl.geometry.contacts import contacts
 from tgdsl.geometry.nearby import with_moments
 from tgdsl.geometry.points import with_points
@@ -100,17 +101,25 @@ class Queries:
                 felt = with_moments(felt, own, probes, sources)
             if answer.points is not None:
                 points = self._felt_objects.point_sources(f"{path}/points", answer.points, constants, tensors)
-                felt = with_points(felt, own, points)
+                felt = with_points(felt, _with_lost(own), points)
             answers.append((felt, probes))
         return answers
+
+
+def _with_lost(pairs: Pairs) -> Pairs:
+    """Return pairs that are nowhere, their offset not-a-number, where their gate is not-a-number."""
+    if pairs.gate is None:
+        return pairs
+    lost = pairs.gate.clamp(min=0.0)  # zero where it is a number
+    return pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))
 
 
 def _pairs(constants: Constants, tensors: Tensors) -> Pairs:
     """Return the relative poses and motions of all pairs, and which of them may be felt."""
     gate = None
     if "contact_found" in tensors:
-        found = tensors["contact_found"][:, constants["pairs/gate"]] > 0
-        gate = torch.where(found, 0.0, -torch.inf).to(constants.dtype)
+        found = tensors["contact_found"][:, constants["pairs/gate"]]
+        gate = torch.where(found > 0, 0.0, torch.where(found.isnan(), torch.nan, -torch.inf)).to(constants.dtype)
     return relate(
         tensors["body_pos"],
         tensors["body_quat"],

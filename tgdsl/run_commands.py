@@ -85,6 +85,7 @@ class Run:
             print(f"the scene has no keyframes rest and squeeze: its initial state is held for {self.seconds:g} s")
             return sim, held_controls(sim.model, self.seconds, sim.control_step)
         controls = scripted_controls(sim.model, keyframes, self.seconds, sim.control_step)
+        sim.close()
         return simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0]), controls
 
     def _steps(self, touch: TactileModule, sim: Simulator, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
@@ -112,10 +113,11 @@ class Run:
 
         drawn = []
         with StatusLine() as progress:
-            if any(output.rows == "taxel" for output in touch.outputs):
+            rows = [output.rows for output in touch.outputs if output.rows in ("taxel", "body")]
+            if "taxel" in rows:
                 progress("drawing the picture")
                 drawn.append(f"picture:  {picture(touch, sim, readings, files['picture'], view=self.view)}")
-            if len(touch.outputs) > 1 or all(output.rows == "body" for output in touch.outputs):
+            if len(rows) > 1 or "taxel" not in rows:
                 progress("drawing the overview")
                 path = overview(touch, sim, readings, files["overview"], title=self.document.stem, view=self.view)
                 drawn.append(f"overview: {path}")

@@ -97,8 +97,10 @@ class Choice:
 def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: Mapping[str, Choice]) -> mujoco.MjSpec:
     """Give objects the geoms of one variant each: the spec is changed in place and returned.
 
-    Whatever is chosen, the same geoms and meshes are there, so that MuJoCo lays its data out alike: those that a variant lacks
-    weigh nothing, are not seen, and collide only with what has a bit of `conaffinity` that nothing has.
+    Bodies that are welded to an object's body lose theirs. Whatever is chosen, the same geoms and meshes are there, so that
+    MuJoCo lays its data out alike: those that a variant lacks weigh nothing, are not seen, and collide only with what has a bit
+    of `conaffinity` that nothing has. A custom number of each geom's says whether it is lacking: its looks, which are the
+    template's, do not.
 
     Args:
         spec: The scene.
@@ -112,11 +114,17 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
             template = body.geoms[0]
             for i in range(len(target.types)):
                 _add_geom(spec, target, i, choice.variant, template)
-            for geom in body.geoms[: -len(target.types)]:
+            for geom in (*body.geoms[: -len(target.types)], *_welded_geoms(body, target.others)):
                 spec.delete(geom)
         if choice.size is not None:
             body.geoms[_sized_geom(target, choice.variant)].size = choice.size
     return spec
+
+
+def _welded_geoms(body: mujoco.MjsBody, others: Sequence[str]) -> list[mujoco.MjsGeom]:
+    """Return the geoms of the bodies below one that have no joint, and are not others."""
+    below = [child for child in body.bodies if not child.joints and child.name not in others]
+    return [geom for child in below for geom in (*child.geoms, *_welded_geoms(child, others))]
 
 
 def _sized_geom(target: SceneObject, variant: int) -> int:
@@ -131,7 +139,13 @@ def geom_name(target: SceneObject, i: int) -> str:
 
 def is_absent(model: mujoco.MjModel, geom: int) -> bool:
     """Return whether a geom is one that its object lacks in this model: see `with_choices`."""
-    return bool(model.geom(geom).name.startswith("tgdsl/") and model.geom_rgba[geom, 3] == 0)
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _absence(model.geom(geom).name))
+    return number >= 0 and bool(model.numeric_data[model.numeric_adr[number]])
+
+
+def _absence(name: str) -> str:
+    """Return the name of the custom number that says whether a geom is lacking."""
+    return f"{name}/is_absent"
 
 
 def _free_bit(spec: mujoco.MjSpec) -> int:
@@ -166,6 +180,7 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
         geom.meshname = meshes.get(variant, next(iter(meshes.values())))
     for name in INHERITED:
         setattr(geom, name, getattr(template, name))
+    spec.add_numeric(name=_absence(geom.name), data=[float(chosen is None)])
     if chosen is None:
         geom.contype, geom.conaffinity = _free_bit(spec), 0
         geom.mass, geom.density = 0.0, 0.0

@@ -1,7 +1,8 @@
 """The state of a scene: what a module reads of simulators and hardware.
 
 Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
-pair, `object` objects of its `inputs.objects`.
+pair, `object` objects of its `inputs.objects`, `joint` joints of its `inputs.joints`, `actuator` actuators of its
+`inputs.actuators`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,10 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "contact_netforce": ("pair", 3),
     "variant": ("object",),
     "object_size": ("object", 3),
+    "joint_pos": ("joint",),
+    "joint_vel": ("joint",),
+    "joint_effort": ("joint",),
+    "last_action": ("actuator",),
 }
 """Shape of each tensor of a `SceneState`, after the leading `env`."""
 
@@ -40,19 +45,28 @@ class SceneState:
     All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
     dtype and then cast, so that far from the origin nothing is lost.
 
+    A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
+    `contact_found` gates included. A slot is unused where force, torque and normal are all zero; where it is then does not
+    matter. A force whose normal is zero acts like any other, and what needs that normal is read as not-a-number.
+
     Attributes:
         body_pos: Position of each body's frame [m].
         body_quat: Orientation of each body, w, x, y, z.
         body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
         body_angvel: Angular velocity of the body [rad/s].
-        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive.
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive, as that
+            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`.
         contact_pos: Contact points [m].
         contact_force: Force on the link at each point [N].
         contact_torque: Torque on the link at each point [N·m].
         contact_normal: Unit normal out of the object at each point.
-        contact_netforce: The pair's whole force on the link [N].
+        contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
         variant: Which of its variants each object has, from 0; 0 for one that has none.
         object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
+        joint_pos: Position of each joint, of the same instant as the bodies' poses [rad; slides: m].
+        joint_vel: Velocity of each joint, of that instant [rad/s; slides: m/s].
+        joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
+        last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
         dt: Time since the last state [s].
     """
 
@@ -68,6 +82,10 @@ class SceneState:
     contact_netforce: Float[Tensor, "env pair 3"] | None = None
     variant: Int[Tensor, "env object"] | None = None
     object_size: Float[Tensor, "env object 3"] | None = None
+    joint_pos: Float[Tensor, "env joint"] | None = None
+    joint_vel: Float[Tensor, "env joint"] | None = None
+    joint_effort: Float[Tensor, "env joint"] | None = None
+    last_action: Float[Tensor, "env actuator"] | None = None
     dt: float | None = None
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
@@ -112,7 +130,14 @@ def _check_variants(variant: Tensor, inputs: Inputs) -> None:
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
     """Return the shape that a field has for a module, after the leading `env`."""
-    sizes = {"body": len(inputs.bodies), "pair": len(inputs.pairs), "slot": inputs.slots, "object": len(inputs.objects)}
+    sizes = {
+        "body": len(inputs.bodies),
+        "pair": len(inputs.pairs),
+        "slot": inputs.slots,
+        "object": len(inputs.objects),
+        "joint": len(inputs.joints),
+        "actuator": len(inputs.actuators),
+    }
     return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
 
 

@@ -34,14 +34,14 @@ class Stamps:
         self.times.append(time_s)
         return TipForces(np.tile([7.0, -3.0, 40.0], (5, 1)), taxel)
 
-    def check(self, reading: Reading) -> int:
+    def check(self, reading: Reading, now: float | None = None) -> int:
         """Assert that a reading is whole and was taken after it was asked for and before it came; return its stamp."""
         force = reading.state.taxel_force
         assert (force[:, :, 0] == np.arange(120) - 60).all()
         assert (reading.state.total_force == [7, -3, 40]).all()
         stamp = int.from_bytes(force[0, :4, 2].astype(np.uint8).tobytes(), "little")
         taken = self.times[stamp]
-        assert reading.requested_at <= taken <= reading.received_at <= time.monotonic()
+        assert reading.requested_at <= taken <= reading.received_at <= (time.monotonic() if now is None else now)
         return stamp
 
 

@@ -28,10 +28,14 @@ def pad(
     folder, taxels=TAXELS, mass=0.25, place="pos='0 0 .03'", mount="", friction=1.0, qvel="0 0 0 0 0 0",
     timestep=0.002, dtype=torch.float64, gravity="0 0 -9.81", **sensor: Any,
 ):  # fmt: skip
-    """Return a module with one sensor, `s`, whose taxels lie on top of a pad of 12 cm that carries a cube of 4 cm."""
+    """Return a module with one sensor, `s`, whose taxels lie on top of a pad of 12 cm that carries a cube of 4 cm.
+
+    They are force taxels, unless another kind is named.
+    """
     text = PAD.format(mass=mass, place=place, mount=mount, friction=friction, qvel=qvel, timestep=timestep, gravity=gravity)
     (folder / "scene.xml").write_text(text)
     points = [{"pos": [float(v) for v in pos], "normal": [0, 0, 1], "radius": 0.004} for pos in taxels]
+    kind = {} if "kind" in sensor else {"kind": "force_taxel", "footprint": FOOTPRINT}
     document = {
         "tgdsl": 1,
         "robot": {
@@ -39,7 +43,7 @@ def pad(
             "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
         },
         "objects": {"cube": {"body": "cube"}},
-        "sensors": {"s": {"kind": "force_taxel", "links": "pad", "feels": ["cube"], "footprint": FOOTPRINT, **sensor}},
+        "sensors": {"s": {"links": "pad", "feels": ["cube"], **kind, **sensor}},
     }
     return tgdsl.compile(document, dtype=dtype)
 

@@ -68,7 +68,7 @@ class Noise:
             length = max(math.ceil(self.lowered.past / dt - 1e-6), 1)
             self.memory["ring"] = torch.full((num_envs, length, len(channels), count), math.nan, dtype=dtype)
         self.env = torch.arange(num_envs) + first_env
-        self.ages = torch.zeros(length if "ring" in self.memory else 1, dtype=dtype)
+        self.ages = torch.zeros(num_envs, length if "ring" in self.memory else 1, dtype=dtype)
         self.step = 0
         self.age, self.episode = torch.zeros((2, num_envs), dtype=torch.int64)
 
@@ -78,10 +78,12 @@ class Noise:
 
     def now(self, dt: float = 0.0, is_sample: Tensor | None = None) -> stages.Now:
         """Return the circumstances of the next call."""
-        step, drawn = torch.tensor(self.step), {}
+        step, drawn = torch.full((self.num_envs,), self.step), {}
         if self.lowered.streams:
             (drawn,) = random.streams(torch.tensor([self.key], dtype=torch.int32), self.env, step, self.episode)
-        return stages.Now(torch.tensor(dt, dtype=self.dtype), step, self.age[:, None], self.ages + dt, is_sample, None, drawn)
+        return stages.Now(
+            torch.tensor(dt, dtype=self.dtype), step[:, None], self.age[:, None], self.ages + dt, is_sample, None, drawn
+        )
 
     def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""
@@ -96,7 +98,7 @@ class Noise:
             held = self.memory[key]
             place = held[:, self.step % held.shape[1]] if key == "ring" else held
             place.copy_(noted)
-        self.ages = torch.cat([torch.zeros_like(self.ages[:1]), self.ages[:-1] + dt])
+        self.ages = torch.cat([torch.zeros_like(self.ages[:, :1]), self.ages[:, :-1] + dt], dim=1)
         self.step += 1
         self.age += 1
         return signal.transpose(1, 2)

@@ -17,17 +17,26 @@ ELASTIC = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.48
 class TestElastomer(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, "friction": 0.6}
+    gates = ("geometric",)
+
+
+class TestElastomerWithoutAStandoff(KindConformance):
+    kind = ELASTOMER
+    parameters = {"friction": 0.6}
+    test_compiled_equals_eager = None  # its graph is that of the one above, and a gate's of other kinds
 
 
 class TestElastomerAsInThePaper(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
+    gates = ("geometric",)
     test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
 
 
 class TestHalfSpace(KindConformance):
     kind = ELASTOMER
     parameters = {"standoff": 0.003, **ELASTIC, "friction": 0.8, "marker_depth": 0.0005}
+    gates = ("geometric",)
 
 
 class BondedLayer(KindConformance):
@@ -143,6 +152,21 @@ def test_a_standoff_is_felt_above_the_taxels(tmp_path):
     np.testing.assert_allclose(u[0, 2], AREA / 6e-6 * 100 * 5e-4**1.2, rtol=1e-12)
 
 
+@pytest.mark.parametrize("gate", [None, "geometric"])
+def test_a_standoff_is_felt_before_the_simulator_has_a_contact(tmp_path, gate):
+    """A ball that comes down: the skin's bulge follows its depth from the first touch on, whatever the simulator finds."""
+    touch = module(tmp_path, PROBES[:1], BALL, kind="elastomer", gate=gate, standoff="1.5 mm", shear_strength=0)
+    assert touch.inputs.fields == ("body_pos", "body_quat")
+    for height in (2e-3, 1.5e-3, 1.4e-3, 7e-4, 1e-5, 0.0, -3e-4):
+        bulge = touch(state(touch, pos=[0, 0, 0.01 + height]))["s"][0, 0, 2]
+        np.testing.assert_allclose(bulge, AREA / 6e-6 * 100 * max(0.0, 1.5e-3 - height) ** 1.2, rtol=1e-9, atol=1e-12)
+
+
+def test_without_a_standoff_the_gate_stays_the_pairs(tmp_path):
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer", gate=None)
+    assert "contact_found" in touch.inputs.fields
+
+
 def test_lifting_ends_the_shear(tmp_path):
     touch = module(tmp_path, PROBES, BALL, kind="elastomer")
     for x, z in ((0.0, 0.0095), (2e-4, 0.0095), (2e-4, 0.0102)):
@@ -255,6 +279,7 @@ REFUSED = [
     ({"boundary": {}}, "`thickness` is missing, a clamped `boundary` needs it"),
     ({"boundary": {}, "thickness": 1e-3, "operator": "fft"}, "`operator: fft` cannot hold a clamped `boundary`"),
     ({"operator": "dense", "tolerance": 1e-3}, "`tolerance` is not used by `operator: dense`"),
+    ({"standoff": 1e-3, "gate": "contact_pair"}, "`gate: contact_pair` would hide what `standoff` feels"),
     ({"poissons_ratio": 0.51}, "0.51 is out of range, expected at most 0.5"),
     ({"compressibility": 1.5}, "1.5 is out of range, expected at most 1"),
     ({"tolerance": 1}, "1 is out of range, expected more than 0 and less than 1"),

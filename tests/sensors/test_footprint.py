@@ -25,15 +25,34 @@ def contacts(rng, num, half=0.012, height=0.0, shear=0.4):
     return point, force, np.zeros((num, 3))
 
 
-def shared(pos, point, force, torque, depth=None, steps=4, is_active=None, dtype=torch.float64, radius=RADIUS):
-    """Return the shares (contact, taxel) and the residual of one environment."""
+def up(pos):
+    """Normals of taxels on a flat pad."""
+    return np.tile([0.0, 0.0, 1.0], (len(pos), 1))
+
+
+def shared(
+    pos,
+    point,
+    force,
+    torque,
+    depth=None,
+    steps=4,
+    is_active=None,
+    dtype=torch.float64,
+    radius=RADIUS,
+    outward=None,
+    normal=None,
+):
+    """Return the shares (contact, taxel) and the residual of one environment; of contacts from above, if nothing is said."""
+    outward, normal = up(pos) if outward is None else outward, -up(point) if normal is None else normal
     depth = np.full(len(pos), 0.5) if depth is None else depth
     is_active = np.ones(len(pos), dtype=bool) if is_active is None else is_active
-    vectors = [tuple(torch.tensor(v.T[:, None], dtype=dtype)) for v in (point, force, torque)]
+    vectors = [tuple(torch.tensor(v.T[:, None], dtype=dtype)) for v in (point, force, torque, normal)]
     result = footprint(
         tuple(torch.tensor(pos.T, dtype=dtype)),
         torch.tensor(is_active),
         torch.tensor(depth[None], dtype=dtype),
+        tuple(torch.tensor(-2.0 * outward.T, dtype=dtype)),
         *vectors,
         torch.tensor(radius, dtype=dtype),
         torch.full((steps,), LEVENBERG, dtype=dtype),
@@ -59,8 +78,11 @@ def test_shares_are_those_of_the_loops(steps, half):
         torque = 1e-4 * rng.normal(size=(3, 3))
         force[2] = 0
         depth = rng.uniform(0, 1, 64)
-        share, residual = shared(pos, point, force, torque, depth, steps, is_active)
-        expected, left = reference(pos, is_active, depth, point, force, torque, RADIUS, (LEVENBERG,) * steps)
+        sides = rng.normal([0, 0, 1], 0.5, (64, 3)), rng.normal([0, 0, -1], 0.5, (3, 3))
+        outward, normal = (side / np.linalg.norm(side, axis=1)[:, None] for side in sides)
+        share, residual = shared(pos, point, force, torque, depth, steps, is_active, outward=outward, normal=normal)
+        contact = point, force, torque, normal
+        expected, left = reference(pos, is_active, depth, outward, *contact, RADIUS, (LEVENBERG,) * steps)
         np.testing.assert_allclose(share, expected, atol=TOLERANCE)
         np.testing.assert_allclose(residual, left, atol=TOLERANCE * RADIUS)
         np.testing.assert_allclose(residual, left_over(pos, point, force, torque, share), atol=1e-15)
@@ -184,6 +206,59 @@ def test_what_is_captured_fades_with_distance():
         assert share.sum() == pytest.approx(expected, abs=1e-12), distance
 
 
+def turned(cosine):
+    """A contact's normal that has an angle of this cosine to straight down."""
+    return np.array([[np.sqrt(1 - cosine**2), 0.0, -cosine]])
+
+
+@pytest.mark.parametrize(
+    ("cosine", "expected"), [(1, 1), (0.5, 1), (0.375, 1), (0.1875, 0.5), (0.09375, 0.15625), (0, 0), (-0.2, 0), (-1, 0)]
+)
+def test_a_contact_is_captured_by_taxels_on_its_side(cosine, expected):
+    """At a taxel, κ is twice the cosine up to 1 and t is 4/3 of that: γ = t²(3 − 2t), whatever way the force points."""
+    for force in ([[0.0, 0.0, -1.0]], [[0.3, 0.2, 1.0]]):
+        share, _ = shared(np.zeros((1, 3)), np.zeros((1, 3)), np.array(force), np.zeros((1, 3)), normal=turned(cosine))
+        assert share.sum() == pytest.approx(expected, abs=1e-12)
+
+
+def test_taxels_that_face_a_contact_more_carry_more():
+    """Two taxels as near and as deep, one at right angles to the other: κ of 1 and 1/2 by a contact at 60° and near 30°."""
+    pos, outward = np.array([[0.003, 0, 0], [-0.003, 0, 0]]), np.array([[0.0, 0, 1], [1.0, 0, 0]])
+    for cosine, expected in ((np.sqrt(15) / 4, [0.8, 0.2]), (1.0, [1, 0]), (0.0, [0, 1])):
+        normal = -turned(cosine) * [[1, 1, -1]]
+        share, _ = shared(
+            pos, np.zeros((1, 3)), np.array([[0, 0, -1.0]]), np.zeros((1, 3)), steps=0, outward=outward, normal=normal
+        )
+        np.testing.assert_allclose(share[0], expected, atol=1e-12)
+
+
+def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
+    """A ball rolls around a round finger of 8 mm whose front has taxels: to the back all is handed over, without a jump.
+
+    The back is 16 mm from the front, nearer than the footprint reaches.
+    """
+    angle = np.radians(np.linspace(-80, 80, 9))
+    outward = np.array([[np.sin(a), 0, np.cos(a)] for a in angle for _ in range(3)])
+    pos = 0.008 * outward + [[0, y, 0] for _ in angle for y in (-0.004, 0, 0.004)]
+    depth = np.random.default_rng(4).uniform(0, 1, len(pos))
+
+    def roll(num):
+        found = []
+        for a in np.linspace(0, np.pi, num):
+            out = np.array([[np.sin(a), 0, np.cos(a)]])
+            force = -out + [[0, 0.3, 0]]
+            share, left = shared(pos, 0.008 * out, force, np.zeros((1, 3)), depth, outward=outward, normal=-out, radius=0.02)
+            found.append(np.concatenate([(share.T @ force).ravel(), left / 0.02, [share.sum()]]))
+        return np.array(found)
+
+    coarse, fine = roll(401), roll(801)
+    np.testing.assert_array_equal(coarse[-1], 0)
+    assert coarse[0, -1] == pytest.approx(1, abs=1e-12)
+    change = np.abs(np.diff(coarse, axis=0)).max()
+    assert change < 12 * np.pi / 400  # some times the force per radian
+    assert np.abs(np.diff(fine, axis=0)).max() == pytest.approx(change / 2, rel=0.2)
+
+
 def test_forces_are_continuous_as_a_contact_slides_off():
     """Over the pad's edge and beyond, no force jumps, and halving the step halves the change."""
     pos, force = pad(), np.array([[0.3, -0.2, -1.0], [0, 0, -0.5]])
@@ -192,11 +267,13 @@ def test_forces_are_continuous_as_a_contact_slides_off():
     def slide(num):
         point = np.tile([[0.0, 0.013, 0.001], [0.01, 0, 0]], (num, 1, 1))
         point[:, 0, 0] = np.linspace(0.016, 0.0285, num)
-        vectors = [torch.tensor(v) for v in (point, np.tile(force, (num, 1, 1)), np.zeros((num, 2, 3)))]
+        tiled = (np.tile(each, (num, 1, 1)) for each in (force, np.zeros((2, 3)), -up(force)))
+        vectors = [torch.tensor(v) for v in (point, *tiled)]
         result = footprint(
             tuple(torch.tensor(pos.T)),
             torch.ones(64, dtype=torch.bool),
             torch.tensor(np.tile(depth, (num, 1))),
+            tuple(torch.tensor(-2.0 * up(pos).T)),
             *(v.unbind(-1) for v in vectors),
             torch.tensor(RADIUS, dtype=torch.float64),
             torch.full((4,), LEVENBERG, dtype=torch.float64),
@@ -233,20 +310,23 @@ def test_derivatives_are_finite_without_a_force(dtype):
     pos = torch.tensor(pad().T, dtype=dtype)
     point = torch.tensor([[0, 0, 0], [0.0025, 0.0025, 0], [1.0, 1.0, 0], [0.0275, 0.0175, 0]], dtype=dtype).T[:, None]
     for force in (torch.zeros(3, 1, 4, dtype=dtype), torch.tensor([0.0, 0, -1], dtype=dtype)[:, None, None].repeat(1, 1, 4)):
-        inputs = [point.clone(), force.clone(), torch.zeros_like(force), torch.zeros(1, 64, dtype=dtype)]
-        point_, force_, torque_, depth = (value.requires_grad_() for value in inputs)
+        down = torch.tensor([0.0, 0, -1], dtype=dtype)[:, None, None] * (force != 0).any(dim=0)
+        inputs = [point.clone(), force.clone(), torch.zeros_like(force), down, torch.zeros(1, 64, dtype=dtype)]
+        point_, force_, torque_, normal_, depth = (value.requires_grad_() for value in inputs)
         result = footprint(
             (pos[0], pos[1], pos[2]),
             torch.ones(64, dtype=torch.bool),
             depth,
+            tuple(torch.tensor(-2.0 * up(pad()).T, dtype=dtype)),
             (point_[0], point_[1], point_[2]),
             (force_[0], force_[1], force_[2]),
             (torque_[0], torque_[1], torque_[2]),
+            (normal_[0], normal_[1], normal_[2]),
             torch.tensor(RADIUS, dtype=dtype),
             torch.full((4,), LEVENBERG, dtype=dtype),
         )
         total = sum(result.residual, (result.share[..., None] * force_[:, 0].T[None, :, None]).square().sum()).sum()
-        for gradient in torch.autograd.grad(total, [point_, force_, torque_, depth]):
+        for gradient in torch.autograd.grad(total, [point_, force_, torque_, normal_, depth]):
             assert torch.isfinite(gradient).all()
 
 
@@ -254,13 +334,15 @@ def test_shares_are_differentiable():
     rng = np.random.default_rng(11)
     point, force, torque = contacts(rng, 3, 0.02)
     pos = tuple(torch.tensor(pad(0.006, 4).T))
-    inputs = [torch.tensor(v.T[:, None], requires_grad=True) for v in (point, force, torque + 1e-4)]
+    normal = np.array([[0.0, 0.0, -1.0], [0.6, 0.6, -0.4], [-0.8, 0.5, -0.3]])
+    inputs = [torch.tensor(v.T[:, None], requires_grad=True) for v in (point, force, torque + 1e-4, normal)]
+    inward = tuple(torch.tensor(-2.0 * up(pad(0.006, 4)).T))
     depth = torch.tensor(rng.uniform(0.1, 1, (1, 16)), requires_grad=True)
 
-    def forces(point, force, torque, depth):
-        planes = [(v[0], v[1], v[2]) for v in (point, force, torque)]
+    def forces(point, force, torque, normal, depth):
+        planes = [(v[0], v[1], v[2]) for v in (point, force, torque, normal)]
         radius, steps = torch.tensor(RADIUS, dtype=torch.float64), torch.full((3,), LEVENBERG, dtype=torch.float64)
-        result = footprint(pos, torch.ones(16, dtype=torch.bool), depth, *planes, radius, steps)
+        result = footprint(pos, torch.ones(16, dtype=torch.bool), depth, inward, *planes, radius, steps)
         return torch.cat(
             [*((result.share * part[..., None]).sum(dim=1) for part in planes[1]), torch.stack(result.residual, 1)], 1
         )

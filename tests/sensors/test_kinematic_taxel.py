@@ -3,7 +3,10 @@ import pytest
 import torch
 
 import tgdsl
+from sensors.cube_on_pad import in_link, pad, wrench
 from sensors.scenes import module, state
+from tgdsl.geometry.contacts import Contacts
+from tgdsl.geometry.query import Felt, Probes
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
 
@@ -174,13 +177,102 @@ def balanced(tmp_path, probes, forces, normals=((0, 0, -1),), item=ABOVE, **sens
     return touch(scene)["s"][0].numpy(), plain(state(plain, **item))["s"][0].numpy()
 
 
-def test_balanced_taxels_press_with_the_solvers_force(tmp_path):
-    """The normal forces sum to Σ f_c · m_c, shear of the solver left out; shear and torque are scaled by the same factor."""
-    probes = [(x, y, 0) for x in (-0.01, 0, 0.01) for y in (0, 0.012)]
-    item = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}
-    found, plain = balanced(tmp_path, probes, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, item)
+SIX = [(x, y, 0) for x in (-0.01, 0, 0.01) for y in (0, 0.012)]
+DRAGGED = {**ABOVE, "linvel": [0.1, -0.3, 0.2], "angvel": [0, 0, 2]}
+
+
+@pytest.mark.parametrize("model", ["tgdsl", "paper"])
+def test_balanced_taxels_press_with_the_solvers_force(tmp_path, model):
+    """The normal forces sum to Σ f_c · m_c in the law's proportions; friction is the solver's where the law's is larger.
+
+    Flat on the box each of six taxels has a sixth of all: 0.5 N/6 of friction, and with its radius of 1 cm that of a torque.
+    """
+    found, plain = balanced(tmp_path, SIX, [[0.3, 0, -1.5], [0, 0.2, -0.5]], [[0, 0, -1]] * 2, DRAGGED, model=model)
     np.testing.assert_allclose(found[:, 2].sum(), -2.0, rtol=1e-12)
-    np.testing.assert_allclose(found, plain * (-2.0 / plain[:, 2].sum()), rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found[:, 2], plain[:, 2] * (-2.0 / plain[:, 2].sum()), rtol=1e-12)
+    along = plain[:, :2] / np.linalg.norm(plain[:, :2], axis=1)[:, None]
+    np.testing.assert_allclose(found[:, :2], 0.5 / 6 * along, rtol=1e-12)
+    twist = {"tgdsl": 0.01, "paper": -0.01}[model] * 0.5 / 6
+    np.testing.assert_allclose(found[:, 3:], np.cross(SIX, found[:, :3]) + [0, 0, twist], rtol=1e-12, atol=1e-15)
+
+
+def test_balanced_friction_below_its_limit_is_the_laws(tmp_path):
+    """k_t v and k_ω ω, whatever the depth is scaled with: under 100 N as under 1 N."""
+    item = {**ABOVE, "linvel": [1e-3, 0, 0], "angvel": [0, 0, 1e-4]}
+    for load in (1.0, 100.0):
+        found, plain = balanced(tmp_path, SIX, [[0.4 * load, 0, -load]], item=item, torque_about="taxel")
+        np.testing.assert_allclose(found[:, 2], -load / 6, rtol=1e-12)
+        np.testing.assert_allclose(found[:, [0, 1, 5]], plain[:, [0, 1, 5]], rtol=1e-12)
+        assert (np.abs(found[:, [0, 5]]) > 1e-4).all()
+
+
+def test_a_contact_without_friction_has_none_when_balanced(tmp_path):
+    found, _ = balanced(tmp_path, SIX, [[0, 0, -2.0]], item=DRAGGED, torque_about="taxel")
+    np.testing.assert_allclose(found, [[0, 0, -2.0 / 6, 0, 0, 0]] * 6, rtol=1e-12, atol=1e-15)
+
+
+def test_a_friction_cone_limits_balanced_friction_in_the_solvers_place(tmp_path):
+    """μ times the balanced normal force, whether the solver's friction is larger or smaller."""
+    for shear in (0.0, 5.0):
+        found, plain = balanced(tmp_path, SIX, [[shear, 0, -2.0]], item=DRAGGED, friction_cone=0.3, torque_about="taxel")
+        along = plain[:, :2] / np.linalg.norm(plain[:, :2], axis=1)[:, None]
+        np.testing.assert_allclose(found[:, :2], 0.3 * 2.0 / 6 * along, rtol=1e-12)
+        np.testing.assert_allclose(found[:, 5], 0.01 * 0.3 * 2.0 / 6, rtol=1e-12)
+
+
+def test_taxels_that_pull_leave_the_others_their_share(tmp_path):
+    """A box that turns about its middle: it approaches on one side and leaves on the other, fast enough to pull there.
+
+    By the law the two sides cancel but for a rest, and to be scaled to the solver's force this rest would be divided by.
+    """
+    two, roll = [(-0.01, 0, 0), (0.01, 0, 0)], {**ABOVE, "angvel": [0, 1e5, 0]}
+    found, plain = balanced(tmp_path, two, [[0, 0, -2.0]], item=roll, outputs=["force"])
+    pulls = plain[:, 2] > 0
+    assert pulls.sum() == 1
+    assert abs(plain[:, 2].sum()) < 1.1 * 2 * 500 * S
+    np.testing.assert_allclose(found[pulls], 0, atol=1e-15)
+    np.testing.assert_allclose(found[~pulls], [[0, 0, -2.0]], rtol=1e-12, atol=1e-15)
+
+
+def pressed_by_hand(tmp_path, depth, load, friction, dtype, **sensor):
+    """Return the readings' planes of two taxels at given depths [m], sliding and spinning, under a load with friction [N]."""
+    touch = module(tmp_path, [(0, 0, 0), (0.01, 0, 0)], BOX, dtype=dtype, kind="kinematic_taxel", balance="solver", **sensor)
+    (own,) = touch.plan.sensors
+    constants = touch.constants.under("sensors/s", own.constants)
+    none, one = torch.zeros_like(depth), torch.ones_like(depth)
+    at = torch.zeros(1, 1, 1, dtype=dtype)
+    down, away = (at, at, at - 1), (at, at, at)
+    contacts = Contacts(away, (at + friction, at, at - load), away, down, (at[0], at[0], at[0]))
+    motion = {"velocity": (0.1 * one, -0.2 * one, none), "angular": (none, none, 5 * one)}
+    rest = {"distances": {}, "frames": {}, "contacts": contacts, "moments": {}, "motions": {}, "area": {}, "points": {}}
+    probes = Probes(tuple(touch.constants["queries/0/pos"]), touch.constants["queries/0/pair"])
+    return KINEMATIC_TAXEL.forward(Felt(depth, (none, none, -one), **motion, **rest), probes, constants, {})[0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("cone", [{}, {"friction_cone": 0.7}], ids=["solver", "cone"])
+def test_nothing_grows_as_depth_vanishes(tmp_path, dtype, cone):
+    """Over 12 decades of depth the readings stay within the solver's force, and derivatives are finite.
+
+    Down to 1 nm the normal forces sum to the solver's; the load that a lesser depth has in the law counts as none.
+    """
+    load, friction = 3.0, 0.5
+    limit = 0.7 * load if cone else friction
+    for exponent in range(-3, -16, -1):
+        depth = torch.tensor([[10.0**exponent, 0.5 * 10.0**exponent]], dtype=dtype, requires_grad=True)
+        sizes = torch.tensor([load, friction], dtype=dtype, requires_grad=True)
+        found = pressed_by_hand(tmp_path, depth, sizes[0], sizes[1], dtype, torque_about="taxel", **cone)
+        normal, shear = -found["force_z"], torch.hypot(found["force_x"], found["force_y"])
+        share = torch.tensor([1.0, 0.5**1.2], dtype=dtype) / (1 + 0.5**1.2)
+        if exponent >= -9:
+            torch.testing.assert_close(normal[0], load * share, rtol=1e-5, atol=0)
+        assert (normal >= 0).all()
+        assert (normal[0] <= load * share * (1 + 1e-5)).all()
+        assert (shear[0] <= limit * share * (1 + 1e-5)).all()
+        assert (found["torque_z"].abs()[0] <= 0.01 * limit * share * (1 + 1e-5)).all()
+        total = sum(plane.sum() for plane in found.values())
+        for gradient in torch.autograd.grad(total, [depth, sizes], allow_unused=True):
+            assert gradient is None or torch.isfinite(gradient).all()
 
 
 def test_the_solvers_normal_is_the_contacts_own(tmp_path):
@@ -223,6 +315,27 @@ def test_a_resting_cube_that_is_balanced_weighs_what_it_weighs(tmp_path):
         pressed[balance] = float(touch(sim.state())["s"][0, :, 2].sum())
     np.testing.assert_allclose(pressed["solver"], -0.25 * 9.81, atol=1e-4)
     assert abs(pressed["none"] + 0.25 * 9.81) > 1
+
+
+def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_path):
+    """MuJoCo's cube on a slippery pad at 0.1 m/s: its weight, and friction along its motion, not above μ of that."""
+    touch = pad(
+        tmp_path, kind="kinematic_taxel", balance="solver", friction=0.3,
+        qvel="0.1 0 0 0 0 0", gravity=f"{0.3 * 9.81} 0 -9.81", place="pos='-.008 0 .0299'",
+    )  # fmt: skip
+    sim = tgdsl.simulate(touch, 1, substeps=100, keyframe="start")
+    sim.step()
+    state = sim.state()
+    assert state.contact_normal is not None and state.contact_force is not None
+    force, normal = touch(state)["s"][0].numpy(), in_link(touch, state, state.contact_normal[0, 0].numpy())
+    each = in_link(touch, state, state.contact_force[0, 0].numpy())
+    along = np.sum(each * normal, axis=1)
+    friction = np.linalg.norm(each - along[:, None] * normal, axis=1).sum()
+    assert wrench(touch, state)[0][2] < -0.5 * 0.25 * 9.81
+    np.testing.assert_allclose(force[:, 2].sum(), -along.sum(), rtol=1e-3)  # it leans by some milliradians, friction with it
+    sizes = np.linalg.norm(force[:, :2], axis=1)
+    assert 0.05 < sizes.sum() <= friction * (1 + 1e-9)
+    assert (force[sizes > 1e-6, 0] > 0).all()
 
 
 @pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5])

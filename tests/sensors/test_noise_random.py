@@ -18,7 +18,7 @@ def batched(seed=0, name="touch", env=1, step=0, episode=0, purpose=random.READI
     """Words (env, count) of a stream."""
     keys = torch.tensor([random.sensor_key(seed, own) for own in ("another", name)], dtype=torch.int32)
     envs, episodes = torch.arange(env) + first_env, torch.full((env,), episode)
-    stream = random.streams(keys, envs, torch.tensor(step), episodes)[1][purpose]
+    stream = random.streams(keys, envs, torch.full((env,), step), episodes)[1][purpose]
     return random.words(stream, torch.arange(count, dtype=torch.int32))
 
 

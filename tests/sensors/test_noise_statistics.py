@@ -216,14 +216,17 @@ def advanced(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """One call of all environments, as a pure function of (env, row), of which a compiler makes one kernel."""
     signal, dt = signal.to(noise.dtype), dt.to(noise.dtype)
-    (streams,) = random.streams(torch.tensor([noise.key], dtype=torch.int32), noise.env, step, noise.episode)
+    (streams,) = random.streams(
+        torch.tensor([noise.key], dtype=torch.int32), noise.env, step.expand(noise.num_envs), noise.episode
+    )
     ages = memory["ages"] + dt
-    now = stages.Now(dt, step, step.expand(noise.num_envs)[:, None], ages, None, None, streams)
+    steps = step.expand(noise.num_envs)[:, None]
+    now = stages.Now(dt, steps, steps, ages, None, None, streams)
     values, past = stages.knob_values(noise.constants, now), {key: memory[key] for key in noise.memory}
     found, new = stages.disturb(signal[:, None], noise.lowered.terms, values, past, now)
     place = (step % memory["ring"].shape[1])[None]
     ring = memory["ring"].index_copy(1, place, new["ring"][:, None])
-    ages = torch.cat([torch.zeros_like(ages[:1]), ages[:-1]])
+    ages = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1]], dim=1)
     return found[:, 0].double(), {**new, "ring": ring, "ages": ages}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import igl
@@ -15,6 +15,7 @@ from tgdsl.compiler.bake import bake
 from tgdsl.compiler.robot import Geom, Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.geometry.surface import Surface
+from tgdsl.plan import ContactPart
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
 from tgdsl.schema.select import matching
 
@@ -67,36 +68,85 @@ class FeltBody:
         body: Its body.
         variants: The geoms that can be felt of each of its variants; of a single one if it is the same everywhere.
         is_sized: Whether the size of its geom is part of the state.
+        bodies: Its body and those that are welded to it, by their indices in the scene.
+        touched: Geoms of the scene that the solver's contacts with it act on.
     """
 
     body: str
     variants: tuple[tuple[FeltGeom, ...], ...]
     is_sized: bool
+    bodies: tuple[int, ...]
+    touched: frozenset[int]
 
 
-def felt_body(body: str, target: ObjectSpec, scenes: Sequence[tuple[Model, tuple[str, ...]]], report: Report) -> FeltBody:
+def felt_body(
+    body: str,
+    target: ObjectSpec,
+    scene: Model,
+    variants: Sequence[tuple[Model, tuple[str, ...]]],
+    others: Collection[str],
+    report: Report,
+) -> FeltBody:
     """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its own.
+
+    Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
+    collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.
 
     Args:
         body: Its body.
         target: What the document says of it.
-        scenes: The scene; or, if it has geoms of its own, the scene with each variant of them, and their names.
+        scene: The scene.
+        variants: If it has geoms of its own, the scene with each variant of them, and their names.
+        others: The other objects' bodies.
         report: Called with mistakes.
     """
-    variants = []
-    for scene, names in scenes:
-        own = tuple(geom for geom in scene.geoms if geom.name in names)
-        geoms = own if target.compounds else _chosen(body, target, scene, report)
-        variants.append(_felt(geoms, body, target, scene, report))
+    bodies = scene.rigid_bodies(body, others)
+    if target.compounds:
+        touched = scene.touchable(body)
+        parts = [tuple(geom for geom in model.geoms if geom.name in names) for model, names in variants]
+        felt = [_felt(own, body, target, model, report) for own, (model, _) in zip(parts, variants, strict=True)]
+    else:
+        own = scene.rigid_geoms(bodies)
+        chosen = _chosen(own, body, target, report)
+        touched = tuple(geom for geom in chosen if geom.is_colliding) or tuple(geom for geom in own if geom.is_colliding)
+        felt = [_felt(chosen, body, target, scene, report)]
+        parts = [own]
     if target.size == "per_env":
-        own = [geom for geom in scenes[0][0].geoms if geom.body == body]
-        for felt in variants if target.compounds else [own]:
-            if len(felt) != 1 or felt[0].shape not in NUM_SIZES:
-                found = ", ".join(geom.shape for geom in felt)
+        for geoms in parts:
+            if len(geoms) != 1 or geoms[0].shape not in NUM_SIZES:
+                found = ", ".join(geom.shape for geom in geoms)
                 hint = f"primitives: {', '.join(NUM_SIZES)}"
                 report(f'with `size: per_env` the body "{body}" has one geom, a primitive; found {found}', hint)
                 break
-    return FeltBody(body, tuple(variants), target.size == "per_env")
+    return FeltBody(body, tuple(felt), target.size == "per_env", bodies, frozenset(geom.id for geom in touched))
+
+
+def contact_parts(scene: Model, felt: FeltBody, report: Report) -> tuple[ContactPart, ...]:
+    """Return the geoms that contacts with an object act on as MuJoCo's contact sensors can name them.
+
+    Args:
+        scene: The scene.
+        felt: The object.
+        report: Called where a geom has no name that would tell it apart.
+    """
+    model, first = scene.compiled, felt.bodies[0]
+    own = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in felt.bodies}
+    below = [first]
+    for i in range(first + 1, model.nbody if first else 0):
+        below += [i] if model.body_parentid[i] in below else []
+    if tuple(below) == felt.bodies and set().union(*own.values()) <= felt.touched:
+        return (ContactPart("subtree" if len(below) > 1 else "body", felt.body),)
+    parts = []
+    for body, geoms in own.items():
+        if geoms and geoms <= felt.touched and model.body(body).name:
+            parts.append(ContactPart("body", model.body(body).name))
+            continue
+        for geom in (geom for geom in scene.rigid_geoms((body,)) if geom.id in geoms & felt.touched):
+            if not geom.name:
+                what = f"{geom.shown} has no name of its own, so the solver's contacts on it cannot be told from others"
+                report(what, "name it, or its body, in the scene")
+            parts.append(ContactPart("geom", geom.name))
+    return tuple(parts) or (ContactPart("body", felt.body),)
 
 
 def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
@@ -113,12 +163,11 @@ def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, re
     return tuple(felt)
 
 
-def _chosen(body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[Geom, ...]:
-    own = tuple(geom for geom in scene.geoms if geom.body == body)
+def _chosen(own: tuple[Geom, ...], body: str, target: ObjectSpec, report: Report) -> tuple[Geom, ...]:
     if not own:
         report(f'body "{body}" has no geoms to feel', "")
     if target.surface == "collision":
-        return scene.touchable(body)
+        return tuple(geom for geom in own if geom.is_colliding) or own
     if target.surface == "visual":
         return tuple(geom for geom in own if not geom.is_colliding) or own
     named = tuple(geom for geom in own if any(matching(target.surface, [name]) for name in geom.names))

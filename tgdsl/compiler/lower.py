@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
-from tgdsl import observations
 from tgdsl.compiler import passes
-from tgdsl.compiler.felt import settle
+from tgdsl.compiler.felt import contact_parts, settle
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.moment_tables import moment_tables
+from tgdsl.compiler.observed import Observed, observed
 from tgdsl.compiler.passes import Draft, DraftQuery, DraftSensor
 from tgdsl.compiler.point_tables import cloud, own_geoms, planned_skin
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.errors import BakeError, LowerError, did_you_mean
+from tgdsl.errors import BakeError, LowerError
 from tgdsl.layout import Link
 from tgdsl.plan import (
+    Inputs,
     Origin,
     Plan,
     PlannedHistory,
     PlannedMemory,
     PlannedNoise,
-    PlannedObservation,
     PlannedReading,
     PlannedSensor,
     SceneFile,
@@ -102,6 +103,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
         what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
         loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
+    _settle_contacts(loaded, work)
     _settle(loaded, work, progress)
     _settle_moments(loaded, work, progress)
     _settle_points(loaded, resolved, work, progress)
@@ -111,22 +113,49 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     arrays: dict[str, np.ndarray] = passes.fold(work)
     objects, inputs = passes.pack(work, queries, arrays)
     sensors = tuple(_sensor(work, part, queries, answer_of[part.name], arrays) for part in work.sensors)
-    terms = _observations(loaded, resolved, work, sensors, arrays)
+    layouts = {part.name: resolved.layout.take(part.taxels) for part in work.sensors}
+    seen = observed(loaded, resolved, sensors, layouts, arrays)
     loaded.raise_problems()
     return Plan(
         origin=origin,
-        inputs=inputs,
+        inputs=_with_joints(inputs, seen),
         links=work.layout.links,
         groups=work.layout.groups,
         objects=objects,
         skin=planned_skin(work.skins),
         queries=tuple(query.planned for query in queries),
         sensors=sensors,
-        observations=terms,
+        proprioception=seen.proprioception,
+        observations=seen.terms,
         dropped=tuple(work.dropped),
         arrays={name: _frozen(arrays[name]) for name in sorted(arrays)},
         scene=SceneFile("", {}, ()),
     )
+
+
+def _settle_contacts(loaded: Loaded, work: Draft) -> None:
+    """Decide which geoms' contacts are an object's; what cannot be told apart is a mistake."""
+    for name in sorted({pair.object for pair in work.gated}):
+
+        def report(what: str, hint: str, at: Path = ("objects", name, "surface")) -> None:
+            loaded.problems.append(loaded.problem(at, what, hint))
+
+        work.contacts_of[name] = contact_parts(work.scene, work.objects[name], report)
+    for sensor in (sensor for sensor in work.sensors if "contacts" in sensor.lowered.needs):
+        for (_, first), (i, second) in itertools.combinations(enumerate(sensor.feels), 2):
+            one, two = work.objects[first].touched, work.objects[second].touched
+            if one & two and not (one <= two or two <= one):
+                what = f'"{second}" and "{first}" share some of their geoms, whose force would be counted twice'
+                path: Path = ("sensors", sensor.sensor, "feels", i)
+                loaded.problems.append(loaded.problem(path, what, "give each a sensor of its own, or surfaces apart"))
+
+
+def _with_joints(inputs: Inputs, seen: Observed) -> Inputs:
+    """Return a module's inputs with what its observations want besides."""
+    own = [reading.name for reading in seen.proprioception]
+    last = [name for name in inputs.fields if name == "dt"]
+    fields = [name for name in inputs.fields if name not in last] + own + last
+    return dataclasses.replace(inputs, fields=tuple(fields), joints=seen.joints, actuators=seen.actuators)
 
 
 def _settle(loaded: Loaded, work: Draft, progress: Progress) -> None:
@@ -256,7 +285,7 @@ def _sensor(
         readings=(*readings, *reports),
         noise=None if part.noise is None else _noise(part.noise),
         period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
-        history=None if history is None else PlannedHistory(history.length, history.reduce),
+        history=None if history is None else PlannedHistory(history.length, history.reduce, history.view),
     )
 
 
@@ -268,40 +297,6 @@ def _rows(part: DraftSensor) -> tuple[int, int]:
 
 def _noise(noise: LoweredNoise) -> PlannedNoise:
     return PlannedNoise(noise.terms, tuple(sorted(noise.constants)), noise.streams)
-
-
-def _observations(
-    loaded: Loaded, resolved: Resolved, work: Draft, sensors: tuple[PlannedSensor, ...], arrays: dict[str, np.ndarray]
-) -> tuple[PlannedObservation, ...]:
-    layouts = {part.name: resolved.layout.take(part.taxels) for part in work.sensors}
-    found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
-    terms = []
-    for group, specs in loaded.spec.observations.items():
-        for i, spec in enumerate(specs):
-            path: Path = ("observations", group, i)
-            if not isinstance(spec, observations.OfReading):
-                count = observations.HAND_ONLY.get(spec.type, 0)
-                terms.append(PlannedObservation(group, i, spec.type, None, (), (), count))
-                continue
-            if spec.of not in found:
-                hint = did_you_mean(spec.of, found, "readings")
-                loaded.problems.append(loaded.problem((*path, "of"), f'there is no reading "{spec.of}"', hint))
-                continue
-            reading, layout = found[spec.of]
-            wanted, rows = observations.WANTED[spec.type]
-            if reading.rows != rows or not set(wanted) <= set(reading.channels):
-                what = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
-                has = f"it reads {', '.join(reading.channels)} of each {reading.rows}"
-                loaded.problems.append(loaded.problem(path, what, has))
-                continue
-            constants = observations.lower(spec, layout)
-            for name, value in constants.items():
-                arrays[f"observations/{group}/{i}/{name}"] = value
-            channels = tuple(reading.channels.index(channel) for channel in wanted)
-            count = max(reading.steps, 1) * observations.num_features(spec.type, reading.num_rows, len(layout.links))
-            axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
-            terms.append(PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count, axes))
-    return tuple(terms)
 
 
 def _frozen(array: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set
+from dataclasses import replace
 
 from tgdsl.compiler.felt import FeltBody, felt_body
 from tgdsl.compiler.robot import Model
@@ -33,15 +34,22 @@ def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, O
             loaded.problems.append(loaded.problem(("objects", name, *place), what, hint))
 
         others = [other for other, part in body_of.items() if part == body and other != name]
-        if body in links:
-            report(("body",), f'body "{body}" carries taxels, so its geoms cannot be others')
+        rigid = [scene.compiled.body(i).name for i in scene.rigid_bodies(body, _others(loaded, body))]
+        if carrying := [part for part in rigid if part in links]:
+            report(("body",), f'body "{carrying[0]}" carries taxels, so its geoms cannot be others')
         elif others:
             report(("body",), f'the geoms of body "{body}" are this object\'s, but object "{others[0]}" has it too')
         elif not any(geom.body == body for geom in scene.geoms):
             report(("body",), f'body "{body}" has no geom', "its first geom says what `geom` does not, such as friction")
         else:
-            objects.append(scene_object(name, target, loaded.folder, meshes, report))
+            own = scene_object(name, target, loaded.folder, meshes, report)
+            objects.append(replace(own, others=tuple(sorted(_others(loaded, body)))))
     return scene, OwnObjects(bodies, tuple(objects), meshes)
+
+
+def _others(loaded: Loaded, body: str) -> set[str]:
+    """Return the bodies of the objects that are not of a body."""
+    return {target.body_of(name) for name, target in loaded.spec.objects.items()} - {body}
 
 
 def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
@@ -75,8 +83,8 @@ def felt_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, Fel
         def report(what: str, hint: str, at: Path = path) -> None:
             loaded.problems.append(loaded.problem(at, what, hint))
 
-        scenes = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else [(scene, ())]
-        found = felt_body(body, target, scenes, report)
+        variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
+        found = felt_body(body, target, scene, variants, _others(loaded, body), report)
         if name in felt:
             objects[name] = found
     return objects

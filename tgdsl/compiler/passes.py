@@ -7,7 +7,7 @@ inactive probes into constants, `pack` numbers bodies and pairs and writes the i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Hashable, Iterator, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,7 +18,7 @@ from tgdsl.compiler.moment_tables import MomentTables, pack_moments
 from tgdsl.compiler.point_tables import Skin, pack_points, skin_rows
 from tgdsl.compiler.robot import Model
 from tgdsl.layout import Layout
-from tgdsl.plan import SLOT_FIELDS, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
+from tgdsl.plan import SLOT_FIELDS, ContactPart, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
 from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest, ProbeSpec
 from tgdsl.sensors.noise.lower import LoweredNoise
 
@@ -94,6 +94,7 @@ class Draft:
         moments: The moments of each object, for each way in which some sensor wants them found; set like `settled`.
         clouds: The points of each object, by their number; set like `settled`, as the next.
         skins: The own geoms of each link that points may meet, by its name.
+        contacts_of: The geoms that the contacts of `gated` act on, by object.
     """
 
     layout: Layout
@@ -107,6 +108,7 @@ class Draft:
     moments: dict[tuple[MomentsRequest, str], MomentTables] = field(default_factory=dict)
     clouds: dict[tuple[int, str], dict[str, np.ndarray]] = field(default_factory=dict)
     skins: dict[str, Skin] = field(default_factory=dict)
+    contacts_of: dict[str, tuple[ContactPart, ...]] = field(default_factory=dict)
 
     def bodies_of(self, taxels: np.ndarray) -> list[str]:
         """Return the body of each taxel."""
@@ -145,12 +147,8 @@ class DraftQuery:
     planned: PlannedQuery = field(init=False)
 
 
-def prune(work: Draft) -> Iterator[tuple[str, str]]:
-    """Set the pairs that are needed, and drop those that can never meet.
-
-    Yields:
-        Sensor and object of each wish that can never come true.
-    """
+def prune(work: Draft) -> list[tuple[str, str]]:
+    """Set the pairs that are needed, drop those that can never meet; return sensors that can never feel an object of theirs."""
     wanted: set[Pair] = set()
     gated: set[Pair] = set()
     never: set[Pair] = set()
@@ -158,11 +156,11 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
     for sensor in work.sensors:
         bodies = set(work.bodies_of(sensor.taxels))
         for target in sensor.feels:
-            pairs = {Pair(body, target) for body in bodies}
-            meeting = {p for p in pairs if work.scene.can_meet(p.link, work.objects[target].body)}
+            pairs, felt = {Pair(body, target) for body in bodies}, work.objects[target]
+            meeting = {p for p in pairs if work.scene.can_touch(p.link, felt.touched)}
             if sensor.is_gated or "contacts" in sensor.lowered.needs:
                 gated |= meeting
-            itself = {p for p in pairs if p.link == work.objects[target].body}
+            itself = {p for p in pairs if work.scene.compiled.body(p.link).id in felt.bodies}
             apart = pairs - meeting if sensor.is_gated else itself
             wanted |= pairs - apart
             never |= apart
@@ -172,7 +170,7 @@ def prune(work: Draft) -> Iterator[tuple[str, str]]:
         work.dropped.append((f"pair {pair.link} – {pair.object}", "they can never be in contact"))
     work.pairs = sorted(wanted, key=_order)
     work.gated = sorted(gated, key=_order)
-    yield from hopeless
+    return hopeless
 
 
 def _order(pair: Pair) -> tuple[str, str]:
@@ -228,6 +226,16 @@ def share(work: Draft) -> tuple[list[DraftQuery], dict[str, tuple[int, int]]]:
         answers[key].needs.update(sensor.lowered.needs)
         answer_of[sensor.name] = list(queries).index(probes), query.answers.index(answers[key])
     return list(queries.values()), answer_of
+
+
+def is_counted(work: Draft, name: str, felt: Sequence[str]) -> bool:
+    """Return whether the contacts with an object are among those with another one that is felt too.
+
+    Objects may be made of the same body, whose force is one. Of two that share all contacts the first one counts.
+    """
+    own, before = work.objects[name].touched, list(felt).index(name)
+    others = [work.objects[other].touched for other in felt]
+    return any(own < other or (own == other and i < before) for i, other in enumerate(others) if own)
 
 
 def reach_of(work: Draft, sensor: DraftSensor) -> np.ndarray:
@@ -289,9 +297,9 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
     varied = [target for target in objects if target.is_sized or target.num_variants > 1]
     fields = ["body_pos", "body_quat"]
     fields += ["body_linvel", "body_angvel"] if "motion" in needs else []
-    fields += ["contact_found"] if any(answer.is_gated for answer in answers) else []
+    fields += ["contact_found"] if slots or any(answer.is_gated for answer in answers) else []
     fields += SLOT_FIELDS if slots else []
-    fields += ["contact_netforce"] if "contacts" in needs else []
+    fields += ["contact_netforce"] if slots or "contacts" in needs else []
     fields += ["variant"] if any(target.num_variants > 1 for target in varied) else []
     fields += ["object_size"] if any(target.is_sized for target in varied) else []
     fields += ["dt"] if any(_is_timed(sensor) for sensor in work.sensors) else []
@@ -303,6 +311,7 @@ def pack(work: Draft, queries: Sequence[DraftQuery], arrays: dict[str, np.ndarra
         slots=slots,
         objects=tuple(target.name for target in varied),
         num_variants=tuple(target.num_variants for target in varied),
+        contacts_of={n: parts for n, parts in work.contacts_of.items() if parts != (ContactPart("body", body_of[n]),)},
     )
     return objects, inputs
 
@@ -349,7 +358,8 @@ def _pack_query(work: Draft, query: DraftQuery, names: list[str], i: int, arrays
         can_meet = np.array([[pair in allowed for pair in pairs[name]] for name in chosen], dtype=bool)
         arrays[f"queries/{i}/{a}/reach"] = np.where(can_meet.reshape(len(chosen), len(bodies)), answer.radius, -np.inf)
         if "contacts" in answer.needs:
-            places = [[Pair(body, name) for name in reachable] for body in dict.fromkeys(bodies)]
+            counted = [name for name in reachable if not is_counted(work, name, answer.objects)]
+            places = [[Pair(body, name) for name in counted] for body in dict.fromkeys(bodies)]
             table = [[work.gated.index(p) if p in work.gated else len(work.gated) for p in row] for row in places]
             arrays[f"queries/{i}/{a}/contacts"] = np.array(table, dtype=np.int64)
         moments = None

@@ -109,7 +109,9 @@ def compile(
         resolution: Instead of the document's own.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
         kinds: Sensor kinds of your own, beside those of tgdsl.
-        dtype: Dtype of the readings, float32 or float64; its name will do.
+        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
+            are refused, as their rounding of places is as large as the depths; cast the readings instead,
+            `readings["s"].to(torch.bfloat16)`.
         device: Where the module lives.
         progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
             that are met for the first time take seconds.
@@ -120,7 +122,8 @@ def compile(
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
-        TgdslError: If there is no such dtype or device, a kind is none, or the overrides are no mapping.
+        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides
+            are no mapping.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     if not isinstance(overrides, Mapping | None):

@@ -107,7 +107,8 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
     listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
-    others = [body for body in scene.bodies if body not in robot.bodies[1:] and body not in listed_bodies]
+    welded = {scene.compiled.body(i).name for felt in objects.values() for i in felt.bodies}
+    others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {patch.link.name: patch for patch in patches})
 

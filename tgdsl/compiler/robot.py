@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -105,50 +106,84 @@ class Model:
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
         """All geoms of named bodies."""
+        found = (self._geom(i) for i in range(self.compiled.ngeom))
+        return tuple(geom for geom in found if geom.body)
+
+    def _geom(self, i: int) -> Geom:
         model = self.compiled
-        paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-        found = []
-        for i in range(model.ngeom):
-            body = model.body(model.geom_bodyid[i]).name
-            shape = SHAPE_NAMES.get(int(model.geom_type[i]), "unknown")
-            if not body:
-                continue
-            found.append(
-                Geom(
-                    id=i,
-                    name=model.geom(i).name,
-                    mesh=model.mesh(model.geom_dataid[i]).name if shape in ("mesh", "sdf") else "",
-                    body=body,
-                    shape=shape,
-                    size=model.geom_size[i].copy(),
-                    pos=model.geom_pos[i].copy(),
-                    rotation=Rotation.from_quat(model.geom_quat[i], scalar_first=True).as_matrix(),
-                    is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i] or i in paired),
-                )
-            )
-        return tuple(found)
+        shape = SHAPE_NAMES.get(int(model.geom_type[i]), "unknown")
+        return Geom(
+            id=i,
+            name=model.geom(i).name,
+            mesh=model.mesh(model.geom_dataid[i]).name if shape in ("mesh", "sdf") else "",
+            body=model.body(model.geom_bodyid[i]).name,
+            shape=shape,
+            size=model.geom_size[i].copy(),
+            pos=model.geom_pos[i].copy(),
+            rotation=_matrix(model.geom_quat[i]),
+            is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i] or i in self._paired),
+        )
+
+    @cached_property
+    def _paired(self) -> frozenset[int]:
+        """Geoms of explicit contact pairs."""
+        return frozenset((*self.compiled.pair_geom1.tolist(), *self.compiled.pair_geom2.tolist()))
 
     def touchable(self, body: str) -> tuple[Geom, ...]:
         """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
         own = tuple(geom for geom in self.geoms if geom.body == body)
         return tuple(geom for geom in own if geom.is_colliding) or own
 
+    def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
+        """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
+
+        What is fixed to the world is no part of it.
+
+        Args:
+            body: Name of the body.
+            others: Names of bodies that are none of its parts.
+        """
+        model = self.compiled
+        found = [int(model.body(body).id)]
+        for i in range(found[0] + 1, model.nbody if found[0] else 0):
+            if model.body_parentid[i] in found and not model.body_jntnum[i] and model.body(i).name not in others:
+                found.append(i)
+        return tuple(found)
+
+    def rigid_geoms(self, bodies: Sequence[int]) -> tuple[Geom, ...]:
+        """Return the geoms of bodies that are one rigid body, see `rigid_bodies`, in the first one's frame."""
+        model = self.compiled
+        placed = {bodies[0]: (np.zeros(3), np.eye(3))}
+        for i in bodies[1:]:
+            pos, rotation = placed[int(model.body_parentid[i])]
+            placed[i] = pos + rotation @ model.body_pos[i], rotation @ _matrix(model.body_quat[i])
+        found = []
+        for i in np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist():
+            geom, body = self._geom(i), int(model.geom_bodyid[i])
+            if body != bodies[0]:
+                pos, rotation = placed[body]
+                geom = replace(geom, pos=pos + rotation @ geom.pos, rotation=rotation @ geom.rotation)
+            found.append(geom)
+        return tuple(found)
+
     def can_meet(self, first: str, second: str) -> bool:
         """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
+        return self.can_touch(first, [geom.id for geom in self.touchable(second)])
+
+    def can_touch(self, body: str, geoms: Iterable[int]) -> bool:
+        """Return whether MuJoCo can ever report a contact between a body's geoms and some others, by their indices."""
         model = self.compiled
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
             return False
-        one, two = model.body(first).id, model.body(second).id
-        signature = (min(one, two) << 16) + max(one, two)
         pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-        for a in self.touchable(first):
-            for b in self.touchable(second):
-                if frozenset((a.id, b.id)) in pairs:
-                    return True
-                masks = model.geom_contype[a.id] & model.geom_conaffinity[b.id]
-                masks |= model.geom_contype[b.id] & model.geom_conaffinity[a.id]
-                if masks and signature not in model.exclude_signature and not self._welded(one, two):
-                    return True
+        for a, b in itertools.product([geom.id for geom in self.touchable(body)], geoms):
+            if frozenset((a, b)) in pairs:
+                return True
+            one, two = sorted(int(model.geom_bodyid[i]) for i in (a, b))
+            masks = model.geom_contype[a] & model.geom_conaffinity[b]
+            masks |= model.geom_contype[b] & model.geom_conaffinity[a]
+            if masks and (one << 16) + two not in model.exclude_signature and not self._welded(one, two):
+                return True
         return False
 
     def _welded(self, one: int, two: int) -> bool:
@@ -216,6 +251,10 @@ class Model:
         else:
             raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
         return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def _matrix(quat: Float[np.ndarray, 4]) -> Float[np.ndarray, "3 3"]:
+    return Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
 
 def load_model(path: Path) -> Model:

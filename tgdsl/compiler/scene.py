@@ -6,6 +6,7 @@ import hashlib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,11 +14,17 @@ import numpy as np
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError
-from tgdsl.plan import SLOT_FIELDS, Asset, Inputs, SceneFile, contact_sensor_names
+from tgdsl.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
 from tgdsl.scene import compiled, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""
+SENSED = ("found", "force", "torque", "dist", "pos", "normal", "tangent")
+"""The same and the distance, in MuJoCo's order."""
+MIXED_NUM = 64
+"""Contacts that a sensor shows where geoms have gaps and different margins: the nearest need not be those that carry force."""
+OBJECT_TYPES = {"body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY, "geom": mujoco.mjtObj.mjOBJ_GEOM}
+"""MuJoCo's types of what an object's part is."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
 """MuJoCo's ways to reduce contacts, in the order of its numbers."""
 COMPARED = (
@@ -77,34 +84,79 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
     if not isinstance(spec, mujoco.MjSpec):
         what = f"tgdsl.instrument wants a mujoco.MjSpec, found {type(spec).__name__}: a compiled model takes no more sensors"
         raise RobotError(f"{what}; read it with mujoco.MjSpec.from_file, and compile it afterwards")
-    bodies = {body.name for body in spec.bodies}
     present = {sensor.name for sensor in spec.sensors}
-    for name, target, link, data, reduce, num in _contact_sensors(inputs):
-        for body in (link, target):
-            if body not in bodies:
-                raise RobotError(f'this model has no body "{body}", which the module wants contacts of')
-        if name not in present:
-            fields = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part.upper()}")) for part in data)
+    for own in _contact_sensors(inputs, spec):
+        if own.name not in present:
+            fields = sum(1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{part.upper()}")) for part in own.data)
             spec.add_sensor(
-                name=name,
+                name=own.name,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=mujoco.mjtObj.mjOBJ_BODY,
-                objname=target,
+                objtype=OBJECT_TYPES[own.part.kind],
+                objname=own.part.name,
                 reftype=mujoco.mjtObj.mjOBJ_BODY,
-                refname=link,
-                intprm=[fields, REDUCTIONS.index(reduce), num],
+                refname=own.link,
+                intprm=[fields, REDUCTIONS.index(own.reduce), own.num],
             )
     return spec
 
 
-def _contact_sensors(inputs: Inputs) -> Iterator[tuple[str, str, str, tuple[str, ...], str, int]]:
-    """Yield name, object's body, link, data fields, reduction and number of contacts of each sensor that is wanted."""
-    data = SLOT_DATA if any(name in inputs.fields for name in SLOT_FIELDS) else ("found",)
+class ContactSensor(NamedTuple):
+    """A contact sensor: between a part of an object and a link's body, what it shows, how it reduces, of how many contacts."""
+
+    name: str
+    part: ContactPart
+    link: str
+    data: tuple[str, ...]
+    reduce: str
+    num: int
+
+
+def _contact_sensors(inputs: Inputs, spec: mujoco.MjSpec) -> Iterator[ContactSensor]:
+    """Yield the contact sensors that are wanted of a model.
+
+    Where a gap has MuJoCo report contacts that carry no force, the nearest ones are shown, with their distance.
+
+    Raises:
+        RobotError: If the model lacks a body or geom.
+    """
+    wants_slots, wants_net = inputs.slots > 0, "contact_netforce" in inputs.fields
     for pair in inputs.pairs:
-        point, net = contact_sensor_names(pair)
-        yield point, inputs.bodies_of[pair.object], pair.link, data, "none", max(inputs.slots, 1)
-        if "contact_netforce" in inputs.fields:
-            yield net, inputs.bodies_of[pair.object], pair.link, ("found", "force"), "netforce", 1
+        for i, part in enumerate(inputs.parts_of(pair.object)):
+            point, net = contact_sensor_names(pair, i)
+            margins, has_gap = _margins(spec, part, pair.link)
+            data = SLOT_DATA if wants_slots else ("found", "force") if has_gap else ("found",)
+            num = max(inputs.slots, 1)
+            if has_gap:
+                data = tuple(name for name in SENSED if name in (*data, "dist"))
+                num = max(num, MIXED_NUM) if len(margins) > 1 else num
+            yield ContactSensor(point, part, pair.link, data, "mindist" if has_gap else "none", num)
+            if wants_net:
+                yield ContactSensor(net, part, pair.link, ("found", "force"), "netforce", 1)
+
+
+def _margins(spec: mujoco.MjSpec, part: ContactPart, link: str) -> tuple[set[tuple[float, float]], bool]:
+    """Return the margins [m] of all pairs of geoms of an object and a link, and whether any of them has a gap."""
+    first, second = _geoms(spec, part), _geoms(spec, ContactPart("body", link))
+    names = [{geom.name for geom in own} for own in (first, second)]
+    ways = (names, names[::-1])
+    pairs = [pair for pair in spec.pairs if any(pair.geomname1 in a and pair.geomname2 in b for a, b in ways)]
+    margins = {(float(a.margin), float(b.margin)) for a in first for b in second}
+    has_gap = any(geom.gap > 0 for geom in (*first, *second, *pairs))
+    return margins | {(float(pair.margin), 0.0) for pair in pairs}, has_gap
+
+
+def _geoms(spec: mujoco.MjSpec, part: ContactPart) -> list[mujoco.MjsGeom]:
+    found = (spec.geom if part.kind == "geom" else spec.body)(part.name)
+    if found is None:
+        kind = "geom" if part.kind == "geom" else "body"
+        raise RobotError(f'this model has no {kind} "{part.name}", which the module wants contacts of')
+    if part.kind == "geom":
+        return [found]
+    return [*found.geoms, *(geom for child in found.bodies if part.kind == "subtree" for geom in _below(child))]
+
+
+def _below(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
+    return [*body.geoms, *(geom for child in body.bodies for geom in _below(child))]
 
 
 def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> SceneFile:
@@ -131,9 +183,10 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
     if own.bodies:
         main.append(as_worldbody(own.bodies))
     sensors = ET.SubElement(main, "sensor")
-    for name, body1, body2, data, reduce, num in _contact_sensors(inputs):
-        attributes = {"name": name, "body1": body1, "body2": body2, "data": " ".join(data), "reduce": reduce, "num": str(num)}
-        ET.SubElement(sensors, "contact", attributes)
+    for sensor in _contact_sensors(inputs, model.spec):
+        ends = {f"{sensor.part.kind}1": sensor.part.name, "body2": sensor.link}
+        shown = {"data": " ".join(sensor.data), "reduce": sensor.reduce, "num": str(sensor.num)}
+        ET.SubElement(sensors, "contact", {"name": sensor.name, **ends, **shown})
     scene = SceneFile(
         mjcf=ET.tostring(main, encoding="unicode"),
         parts=dict(sorted(kept.parts.items())),

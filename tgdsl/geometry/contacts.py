@@ -6,11 +6,11 @@ after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
@@ -20,11 +20,16 @@ from tgdsl.geometry.planes import Vec
 class Contacts(NamedTuple):
     """Contacts on each body, in its frame; planes (env, body, contact), but `net` (env, body). Unused slots are all zero.
 
+    Contacts beyond the slots have no place of their own. What a pair's slots lack of its whole force, r = f_net − Σ_c f_c, acts
+    at the centre of the contacts shown, weighted by their forces: each takes r |f_c| / Σ_c |f_c| on itself, or equal shares
+    where none has a force. The forces then sum to the whole; the moment of r about that centre is not known, nor are torques
+    beyond the slots. Where no contact is shown there is nowhere to act, and `net` alone has r.
+
     Attributes:
         pos: Contact points [m].
         force: Force on the body at each [N].
         torque: Torque on the body at each [N·m].
-        normal: Unit normal out of the object at each.
+        normal: Unit normal out of the object at each; not-a-number where the state has none beside a force.
         net: Whole force on the body from the objects felt [N], contacts beyond the slots included.
     """
 
@@ -51,21 +56,47 @@ def contacts(
         dtype: Dtype of the result.
     """
     rotation = planes.rotation(state["body_quat"][:, bodies])
-    net = _of_pairs(state["contact_netforce"], index).sum(dim=2)
-    net = planes.rotate_back(rotation, planes.split(net))
+    whole = _of_pairs(state["contact_netforce"], index)
+    net = planes.rotate_back(rotation, planes.split(whole.sum(dim=2)))
     if "contact_force" not in state:
         none = net[0].new_zeros((*net[0].shape, 0))
         own = [(none, none, none)] * 4
     else:
         each = planes.rot(part[..., None] for part in rotation)
         names = ("contact_force", "contact_torque", "contact_normal", "contact_pos")
-        force, torque, normal, pos = (planes.split(_of_pairs(state[name], index).flatten(2, 3)) for name in names)
+        force, torque, normal, pos = (planes.split(_of_pairs(state[name], index)) for name in names)
+        is_used = _is_any((*force, *torque, *normal))
+        force, normal = _completed(planes.split(whole), force, is_used), _told(normal, is_used)
+        force, torque, normal, pos = (planes.vec(part.flatten(2) for part in vector) for vector in (force, torque, normal, pos))
         origin = planes.split(state["body_pos"][:, bodies, None])
-        is_used = planes.dot(normal, normal) > 0
-        away = planes.vec(torch.where(is_used, part, 0.0) for part in planes.sub(pos, origin))
+        away = planes.vec(torch.where(is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
         own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
     pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
     return Contacts(pos, force, torque, normal, net)
+
+
+def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
+    """Return where any of some numbers is not zero; not-a-number is none."""
+    found = parts[0] != 0
+    for part in parts[1:]:
+        found = found | (part != 0)
+    return found
+
+
+def _told(normal: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
+    """Return normals, not-a-number where a contact has none."""
+    is_missing = is_used & (planes.dot(normal, normal) == 0)
+    return planes.vec(torch.where(is_missing, torch.nan, part) for part in normal)
+
+
+def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object slot"]) -> Vec:
+    """Return the contacts' forces with what they lack of each pair's whole force, (env, body, object) [N], shared out."""
+    lacking = planes.vec(total - part.sum(dim=-1) for total, part in zip(whole, force, strict=True))
+    size = planes.safe_sqrt(planes.dot(force, force))
+    total = size.sum(dim=-1, keepdim=True)
+    is_loaded, used = total > 0, is_used.to(size.dtype)
+    weight = torch.where(is_loaded, size, used) / torch.where(is_loaded, total, used.sum(dim=-1, keepdim=True).clamp(min=1.0))
+    return planes.vec(part + weight * rest[..., None] for part, rest in zip(force, lacking, strict=True))
 
 
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:

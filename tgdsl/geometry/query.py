@@ -270,7 +270,8 @@ def feel(
             linear = planes.where(is_deeper, gathered(pairs.motion.linear, target.pairs, target.pair), linear)
             angular = planes.where(is_deeper, gathered(pairs.motion.angular, target.pairs, target.pair), angular)
         if "distance" in needs:
-            value = torch.where(radius > -torch.inf, target.distance, torch.inf)
+            value = torch.where(radius.isnan(), radius, target.distance)
+            value = torch.where(radius == -torch.inf, torch.inf, value)
             distances[target.name] = Distance(value, target.gradient)
         if "frame" in needs:
             rotation = planes.rot(at_probes(part, target.pairs, target.pair) for part in pairs.rotation)

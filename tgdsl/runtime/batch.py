@@ -5,38 +5,40 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, overload
 
 import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Float, Int
 
 from tgdsl.env_ids import EnvIds, env_indices
-from tgdsl.errors import SimulationError, listed
+from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
-from tgdsl.runtime.controls import control_tensor, refuse_unfinite
-from tgdsl.runtime.lookup import body_id, contact_sensor, keyframe_id
+from tgdsl.runtime.batch_reading import BatchReader
+from tgdsl.runtime.faults import DIVERGED, EnvFaults, OnFault
+from tgdsl.runtime.joint_fields import JointPlaces, KeptJoints
+from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import EnvObjects, Values
 from tgdsl.runtime.room import bytes_per_env, refuse_beyond_memory
+from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene import SceneModels
 from tgdsl.state import SceneState
 
 Array = np.ndarray
-_SLOT_SIZE = 16
 _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
-_DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 
 
-class BatchSimulation:
+class BatchSimulation(Simulation):
     """Environments in MuJoCo's `Batch`, read by one module.
 
     Everything `state` hands out is of one instant: after `step`, MuJoCo's poses, velocities and contacts are those at the
-    start of the last substep, and so is the state. After `reset` they are those of the start.
+    start of the last substep, and so is the state, its joints included. After `reset`, `set_state` and `forward` they are of
+    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float64 that share MuJoCo's memory, and of now.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
@@ -53,6 +55,7 @@ class BatchSimulation:
         threads: int = 0,
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
+        on_fault: OnFault = "raise",
     ):
         """Start all environments.
 
@@ -64,17 +67,17 @@ class BatchSimulation:
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
             model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
                 artefact's scene. Its objects are the same in all environments.
+            on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
+                them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
+                with controls that are not finite, which "raise" refuses.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
             SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
-                bodies may sleep, if there is nothing to step, or more environments than this computer has memory for.
+                bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
+                module's state is another simulation's or of other environments.
         """
-        if num_envs < 1 or substeps < 1:
-            raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
-        if model is not None and touch.inputs.objects:
-            what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
-            raise SimulationError(f"{what}; leave `model` out")
+        refuse_unfit(touch, num_envs, substeps, model)
         self._objects: EnvObjects | None = None
         if model is None:
             scenes = SceneModels(touch.plan.scene)
@@ -90,17 +93,16 @@ class BatchSimulation:
         self.substeps = substeps
         self._touch = touch
         self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
-        self._body_ids = np.array([body_id(model, name) for name in touch.inputs.bodies], dtype=np.intp)
-        self._root_ids = self.model.body_rootid[self._body_ids]
-        self._slots = [contact_sensor(model, pair, 0) for pair in touch.inputs.pairs]
-        nets = touch.inputs.pairs if "contact_netforce" in touch.inputs.fields else ()
-        self._nets = [contact_sensor(model, pair, 1) for pair in nets]
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
-        self._readers = {name: _READERS[name] for name in touch.inputs.fields if name != "dt"}
-        for name in _DERIVED:
-            self.batch.bind(name)  # an array is filled only by calls that come after its first use
+        self._reader = BatchReader(touch.inputs, self.model, self.batch)
+        self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
+        with torch.inference_mode(False):
+            self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
+            self._table = StateTable(self.model, self._arrays)
+            self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
         if self._objects is not None:
             self.batch.set_models(self._objects.models())
+        claim(touch, self)
         self.reset()
 
     @property
@@ -108,58 +110,10 @@ class BatchSimulation:
         """Number of environments."""
         return self.batch.nsim
 
-    @property
-    def control_step(self) -> float:
-        """Duration of one control step [s]."""
-        return self.substeps * float(self.model.opt.timestep)
-
-    def step(self, control: Tensor | Array | None = None) -> None:
-        """Advance all environments by one control step.
-
-        Args:
-            control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were.
-
-        Raises:
-            SimulationError: If the controls are not finite or do not fit, an environment diverges, or MuJoCo reports one as
-                failed. The other environments have then made their step.
-        """
-        self._set_control(control)
-        self._advance(self.substeps)
-
-    def substates(self, control: Tensor | Array | None = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and hand out the state after each of its physics steps.
-
-        For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
-        simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps.
-
-        Args:
-            control: Actuator controls, as for `step`; they are set when the first state is asked for.
-
-        Yields:
-            What `state` returns after each physics step; its `dt` is that of one physics step.
-
-        Raises:
-            SimulationError: As `step` does, at the physics step where it happens.
-        """
-        self._set_control(control)
-        for _ in range(self.substeps):
-            self._advance(1)
-            yield self._state(float(self.model.opt.timestep))
-
-    def state(self) -> SceneState:
-        """Return what the module wants, of one instant, in float64 on the module's device; `dt` is that of a control step."""
-        return self._state(self.control_step)
-
-    def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start some environments anew (default: all), in the simulator and in the module.
-
-        Raises:
-            SimulationError: If there are no such environments, or MuJoCo reports one as failed.
-        """
-        ids = np.unique(env_indices(env_ids, self.num_envs))  # MuJoCo takes them in ascending order, each once
-        if len(ids):
-            self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe))
-            self._touch.reset(torch.from_numpy(ids))
+    def forward(self, env_ids: EnvIds | None = None) -> None:
+        """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
+        self._refuse_if_closed()
+        self._evaluate(self._ascending(env_ids))
 
     def set_objects(
         self,
@@ -196,86 +150,68 @@ class BatchSimulation:
         """Return the model of one environment."""
         return self.batch.get_model(env)
 
-    def _set_control(self, control: Tensor | Array | None) -> None:
-        if control is None:
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+        ids = self._ascending(env_ids)
+        if not len(ids):
             return
-        values = control_tensor(control, self.num_envs, self.model.nu).cpu()
-        refuse_unfinite(values)
-        self.batch.ctrl[...] = values.numpy()
+        self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
+        self._write(ids, rows)
+        self._evaluate(ids)
+        self._touch.reset(torch.from_numpy(ids))
+        is_new = torch.zeros(self.num_envs, dtype=torch.bool)
+        is_new[torch.from_numpy(ids)] = True
+        self._faults.clear(is_new)
+
+    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
+        ids = self._ascending(env_ids)
+        self._write(ids, rows)
+        self._evaluate(ids)
+
+    def _ascending(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
+        """Return environments as MuJoCo takes them: in ascending order, each once."""
+        return np.unique(env_indices(env_ids, self.num_envs))
+
+    def _write(self, ids: Int[Array, " n"], rows: Rows) -> None:
+        chosen = torch.from_numpy(ids)
+        for name, values in rows.values.items():
+            self._arrays[name][chosen] = values[chosen]
+
+    def _evaluate(self, ids: Int[Array, " n"]) -> None:
+        if len(ids):
+            self._run(lambda: self.batch.forward(ids))
+            self._kept.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
+        if self._kept.is_wanted:
+            if num_steps > 1:
+                self._run(lambda: self.batch.step(nstep=num_steps - 1))
+            self._kept.keep()
+            num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
-        diverged = np.flatnonzero(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1))
-        if len(diverged):
-            which = listed([str(env) for env in diverged])
-            raise SimulationError(f"environments {which} diverged, and MuJoCo has started them anew; reset them to go on")
+        self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
+        is_faulty = self._faults.settle()
+        if not is_faulty.any():
+            return
+        if self._faults.on_fault == "raise":
+            raise SimulationError("; ".join(self._faults.accounts(diverged=", and MuJoCo has started them anew")))
+        self._begin_episodes(is_faulty, Rows({}))
+        self._faults.note_restarted(is_faulty)
+        self._faults.warn_once()
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = {}
-        for name, reader in self._readers.items():
-            values[name] = torch.from_numpy(np.ascontiguousarray(reader(self))).to(self._touch.device)
-        if "dt" in self._touch.inputs.fields:
-            values["dt"] = dt
-        return SceneState(**values)
+        values: dict[str, Any] = self._reader.read() | self._kept.read()
+        if self._objects is not None:
+            values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
+        tensors: dict[str, Any] = {name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}
+        tensors["dt"] = dt
+        return SceneState(**{name: value for name, value in tensors.items() if name in self._touch.inputs.fields})
 
     def _run(self, call: Callable[[], None]) -> None:
         try:
             call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
-
-    def _body_pos(self) -> Float[Array, "env body 3"]:
-        return self.batch.xpos[:, self._body_ids]
-
-    def _body_quat(self) -> Float[Array, "env body 4"]:
-        return self.batch.xquat[:, self._body_ids]
-
-    def _body_angvel(self) -> Float[Array, "env body 3"]:
-        return self.batch.cvel[:, self._body_ids, :3]
-
-    def _body_linvel(self) -> Float[Array, "env body 3"]:
-        """Move MuJoCo's spatial velocity from the centre of mass of the kinematic tree to the body frame's origin."""
-        angular, linear = self._body_angvel(), self.batch.cvel[:, self._body_ids, 3:]
-        return linear + np.cross(angular, self._body_pos() - self.batch.subtree_com[:, self._root_ids])
-
-    def _contact_found(self) -> Float[Array, "env pair"]:
-        return self.batch.sensordata[:, [part.start for part in self._slots]]
-
-    def _slot_part(self, first: int) -> Float[Array, "env pair slot 3"]:
-        """Return three numbers of each slot: 1 force, 4 torque, 7 position, 10 normal, 13 tangent."""
-        slots = np.stack([self.batch.sensordata[:, part.start : part.stop] for part in self._slots], axis=1)
-        return slots.reshape(*slots.shape[:2], -1, _SLOT_SIZE)[..., first : first + 3]
-
-    def _in_world(self, first: int) -> Float[Array, "env pair slot 3"]:
-        """Rotate a vector from the contact's frame (normal, tangent, their cross product) to the world."""
-        normal, tangent = self._slot_part(10), self._slot_part(13)
-        axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=-2)
-        return np.einsum("...i,...ij->...j", self._slot_part(first), axes)
-
-    def _contact_netforce(self) -> Float[Array, "env pair 3"]:
-        return np.stack([self.batch.sensordata[:, part.start + 1 : part.start + 4] for part in self._nets], axis=1)
-
-
-_READERS: dict[str, Callable[[BatchSimulation], Array]] = {
-    "body_pos": BatchSimulation._body_pos,
-    "body_quat": BatchSimulation._body_quat,
-    "body_linvel": BatchSimulation._body_linvel,
-    "body_angvel": BatchSimulation._body_angvel,
-    "contact_found": BatchSimulation._contact_found,
-    "contact_pos": lambda sim: sim._slot_part(7),
-    "contact_force": lambda sim: sim._in_world(1),
-    "contact_torque": lambda sim: sim._in_world(4),
-    "contact_normal": lambda sim: sim._slot_part(10),
-    "contact_netforce": BatchSimulation._contact_netforce,
-    "variant": lambda sim: _present(sim._objects).variant,
-    "object_size": lambda sim: _present(sim._objects).object_size,
-}
-
-
-def _present(objects: EnvObjects | None) -> EnvObjects:
-    assert objects is not None
-    return objects
 
 
 @overload
@@ -287,6 +223,7 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    on_fault: OnFault = "raise",
 ) -> BatchSimulation: ...
 @overload
 def simulate(
@@ -297,6 +234,7 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
 ) -> BatchSimulation | WarpSimulation: ...
@@ -308,6 +246,7 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
 ) -> BatchSimulation | WarpSimulation:
@@ -318,9 +257,12 @@ def simulate(
         num_envs: Number of environments.
         device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. The state is handed out on the
             module's device; both on one GPU need no copies.
-        substeps: Physics steps per control step.
+        substeps: Physics steps per control step. What `state` hands out after a step is of the start of the last one: with
+            `substeps=1`, of the instant before the step. `sim.forward()` evaluates where the environments are now.
         threads: CPU threads; 0: one per CPU.
         keyframe: Name of the keyframe to start from.
+        on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
+            until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
         nconmax: On a GPU, room for contacts per environment, in a pool that all share: see `WarpSimulation`.
         njmax: On a GPU, room for rows of constraints in each environment.
 
@@ -332,8 +274,8 @@ def simulate(
     if device == "cpu":
         if nconmax is not None or njmax is not None:
             raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
-        return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe)
+        return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, on_fault=on_fault)
     if threads:
         raise SimulationError(f'threads is {threads}, but only physics on "cpu" has threads, and the device is "{device}"')
     keys: dict[str, Any] = {"nconmax": nconmax, "njmax": njmax}
-    return WarpSimulation(touch, num_envs, device=device, substeps=substeps, keyframe=keyframe, **keys)
+    return WarpSimulation(touch, num_envs, device=device, substeps=substeps, keyframe=keyframe, on_fault=on_fault, **keys)

@@ -23,7 +23,7 @@ from tgdsl.observations import HAND_ONLY, hand_only_error
 from tgdsl.runtime.batch import BatchSimulation, simulate
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
-from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S, XHand1
+from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.link import LinkTiming
@@ -91,6 +91,7 @@ class Connection:
         observe: Callable[[], dict[str, Float[Tensor, "env feature"]]],
         *,
         control: Callable[[Control], Control] = lambda control: control,
+        note: Callable[[Control], None] = lambda control: None,
         forget: Callable[[], None] = lambda: None,
         close: Callable[[], None] = lambda: None,
     ):
@@ -100,11 +101,12 @@ class Connection:
             source: The source.
             observe: Returns the observation groups of this instant.
             control: From controls in the order of the model's actuators to those of the source.
+            note: Takes note of the controls of a step that was made.
             forget: Forgets past observations; called with a reset.
             close: Lets go of the source.
         """
         self.source = source
-        self._observe, self._control, self._forget, self._close = observe, control, forget, close
+        self._observe, self._control, self._note, self._forget, self._close = observe, control, note, forget, close
         self._groups: dict[str, Tensor] | None = None
         self._is_read = True
 
@@ -136,6 +138,7 @@ class Connection:
         """
         self._groups, self._is_read = None, False
         self.source.step(self._control(control))
+        self._note(control)
         self._is_read = True
 
     def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
@@ -245,7 +248,7 @@ def _simulation(touch: TactileModule, num_envs: int, control_step: float, keyfra
         if term.type in HAND_ONLY:
             raise hand_only_error(term.group, term.index, term.type)
     sim = _scene(touch, num_envs, control_step, keyframe)
-    return Connection(sim, lambda: touch.observe(touch(sim.state())))
+    return Connection(sim, lambda: touch.observe(touch(sim.state())), close=sim.close)
 
 
 def _scene(touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None) -> BatchSimulation:
@@ -291,10 +294,8 @@ def _hand(
     control = _Controls(touch, motion, "the hand")
     warn_of_noise(touch.plan)
     with ExitStack() as opened:
-        patience = max(READ_TIMEOUT_S, 2 * (timing or LinkTiming()).reply_timeout_s)
-        age = max(MAX_AGE_S, patience)
-        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing, max_age_s=age))
-        source = XHand1Source(hand, control_step=control_step, calibration=calibration, read_timeout_s=patience)
+        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing))
+        source = XHand1Source(hand, control_step=control_step, calibration=calibration)
         opened.pop_all()
     return _hand_connection(source, observer, control)
 
@@ -308,7 +309,7 @@ def _replay(
     source = ReplaySource(path, control_step=control_step, speed=speed, calibration=calibration)
     with ExitStack() as opened:
         opened.callback(source.close)
-        observer = HandObserver(touch, source.calibration, control_step)
+        observer = HandObserver(touch, source.calibration, control_step, is_log=True)
         warn_of_noise(touch.plan)
         opened.pop_all()
     return _hand_connection(source, observer, lambda control: None)
@@ -316,7 +317,12 @@ def _replay(
 
 def _hand_connection(source: HandSteps, observer: HandObserver, control: Callable[[Control], Control]) -> Connection:
     return Connection(
-        source, lambda: observer.observe(source.sample()), control=control, forget=observer.reset, close=source.close
+        source,
+        lambda: observer.observe(source.sample()),
+        control=control,
+        note=observer.note,
+        forget=observer.reset,
+        close=source.close,
     )
 
 

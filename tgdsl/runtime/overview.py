@@ -71,10 +71,10 @@ def drawing(
     title: str = "",
     view: str | None = None,
 ) -> Figure:
-    """Return what `overview` writes; its axes are the panels, in the order of the module's outputs."""
-    outputs = [output for output in touch.outputs if output.name in readings]
+    """Return what `overview` writes; its axes are the panels, one for each reading of taxels or bodies."""
+    outputs = [output for output in touch.outputs if output.name in readings and output.rows in ("taxel", "body")]
     if not outputs:
-        raise ViewError("there is nothing to draw: the readings given hold none of this module's")
+        raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
     dots = [dots_of(touch, sim, output, readings[output.name], env) for output in outputs]

@@ -20,12 +20,13 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
 
     Each reading has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
     of taxels in contact; any other vector, and any other channel, as the largest magnitude. Readings of bodies show the
-    link's body.
+    link's body; those of joints and actuators are of no link, and are left out.
     """
     taxels = touch.taxels
+    outputs = [output for output in touch.outputs if output.rows in ("taxel", "body")]
     links = list(dict.fromkeys(link for sensor in taxels.values() for link in sensor["link"]))
-    header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in touch.outputs]
-    rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in touch.outputs] for link in links]
+    header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in outputs]
+    rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = [
         "  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))

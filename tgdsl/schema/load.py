@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
+from tgdsl.proprioception import QUANTITIES
 from tgdsl.schema import files, yaml
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.faults import read_as
@@ -227,13 +228,20 @@ def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
             if objects is not None and target not in objects:
                 hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
+            elif target in sensor.feels[:i]:
+                problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
         problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
+    for name in QUANTITIES.keys() & set(sensors):
+        what = f'"{name}" is the name of a reading that no sensor makes'
+        problems.append(source.problem(("sensors", name), what, "give the sensor another name", on_key=True))
     for group in names("observations") or []:
         terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
             target = term.get("of") if isinstance(term, dict) else None
-            if isinstance(target, str) and target.removesuffix("/clean") not in sensors:
+            if isinstance(target, str) and target.split("/")[0] not in sensors:
                 hint = did_you_mean(target, sensors, "sensors")
+                if target in QUANTITIES:
+                    hint = f"no sensor makes it: {{type: {target}}} observes it"
                 problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
     if loaded.layout is not None:
         resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})

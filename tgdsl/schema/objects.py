@@ -90,9 +90,11 @@ class ObjectSpec(SpecModel):
 
     body: str | None = None
     """Name of its body in the scene (or in the robot's file, if there is no scene); default: a body of its own, of the object's
-    name, is added to the scene."""
+    name, is added to the scene. Bodies below it that have no joint are part of it, unless they are objects themselves; what is
+    fixed to the world is no part of `world`."""
     geom: Variant | None = None
-    """Geom that the body has instead of its own. What else the scene says of the body's first geom, such as friction, stays."""
+    """Geom that the body has instead of its own, and of those of bodies that are part of it. What else the scene says of the
+    body's first geom, such as friction, stays."""
     variants: Annotated[tuple[Variant, ...], Field(min_length=1)] | None = None
     """The same, of which each environment takes one: see `SceneState.variant`."""
     size: Literal["fixed", "per_env"] = "fixed"
@@ -105,7 +107,8 @@ class ObjectSpec(SpecModel):
     """Whether a body of its own moves freely (the default) or is fixed to the world."""
     surface: str = "collision"
     """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
-    the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is."""
+    the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is. The
+    solver's contacts with it are those on its geoms that collide, and on all that do of its body where it has none itself."""
     query: Literal["sdf", "raycast"] = "sdf"
     """How distances to its meshes are found: on a grid baked at compile time, or to the nearest triangle at run time (needs
     warp-lang). Primitives are exact either way."""

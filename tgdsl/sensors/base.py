@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import BeforeValidator, Field, StrictInt, WithJsonSchema
+from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
 from tgdsl.fields import Frequency, Selector, SpecModel
@@ -33,6 +33,14 @@ class HistorySpec(SpecModel):
     """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
     reduce: Literal["stack", "last", "median", "mean"] = "stack"
     """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
+    view: StrictBool = False
+    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites; default: a copy."""
+
+    @model_validator(mode="after")
+    def _is_used(self) -> HistorySpec:
+        if self.view and self.reduce != "stack":
+            raise ValueError("`view` is used by `reduce: stack` alone, expected it to be left out")
+        return self
 
 
 History = Annotated[

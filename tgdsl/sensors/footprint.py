@@ -2,17 +2,20 @@
 
 A solver knows a contact as a point x_c with force f_c and torque τ_c; a skin has taxels around that point. The shares are
 
-    w_cj = (d_j/R_j + 10⁻³) k(|x_j − x_c|/r_f),   k(s) = (1 − s²)² for s < 1, else 0
-    λ⁰_cj = w_cj / Σ_j w_cj,   λ_cj ∝ λ⁰_cj exp(β · g_cj),   g_cj = (x_j − x_c) × f̂_c / r_f,   Σ_j λ_cj = 1
-    γ_c = t² (3 − 2t),   t = (1 − min_j |x_j − x_c|²/r_f²) / (3/4) between 0 and 1
+    κ_cj = b_cj max(0, 1 − |x_j − x_c|²/r_f²),   b_cj = −2 n_j · m_c between 0 and 1
+    w_cj = (d_j/R_j + 10⁻³) κ_cj²,   λ⁰_cj = w_cj / Σ_j w_cj
+    λ_cj ∝ λ⁰_cj exp(β · g_cj),   g_cj = (x_j − x_c) × f̂_c / r_f,   Σ_j λ_cj = 1
+    γ_c = t² (3 − 2t),   t = max_j κ_cj / (3/4) up to 1
 
-d_j depth and R_j radius of the probe, r_f the footprint's radius [m], f̂_c the force's direction, γ_c the fraction of the
-contact's force that the skin captures: 1 up to half a footprint from the nearest active taxel, 0 from a whole one. β is one
-vector per body. Of all shares it picks those with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c = Σ_c γ_c τ_c and the least relative
-entropy to λ⁰, contacts weighted by γ_c |f_c|: they never become negative, and a contact that is split in two of the same
-place and direction counts as the one. To first order β is the λ⁰-weighted least-norm correction. It is found by Newton's
-method on the convex dual in a fixed number of steps: with H the mean covariance of g and e the excess moment, both over Σ_c
-γ_c |f_c|,
+d_j depth and R_j radius of the probe, n_j its outward normal, m_c the contact's normal out of the object, r_f the footprint's
+radius [m], f̂_c the force's direction. b_cj says whether the contact is on the taxel's side of the body: wholly where it
+presses within 60° of straight in, not at all from 90° on, as on the back of a finger. γ_c is the fraction of the contact's
+force that the skin captures: of a contact on an active taxel's side all up to half a footprint from that, nothing from a whole
+one. Both fade continuously. β is one vector per body. Of all shares it picks those with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c =
+Σ_c γ_c τ_c and the least relative entropy to λ⁰, contacts weighted by γ_c |f_c|: they never become negative, and a contact that
+is split in two of the same place and direction counts as the one. To first order β is the λ⁰-weighted least-norm correction.
+It is found by Newton's method on the convex dual in a fixed number of steps: with H the mean covariance of g and e the excess
+moment, both over Σ_c γ_c |f_c|,
 
     s = (H + ε)⁻¹ H (H + ε)⁻¹ e,   β ← β − s / √(1 + s · H s + s · s / 10)
 
@@ -82,9 +85,11 @@ def footprint(
     pos: Vec,
     is_active: Bool[Tensor, "*padding taxel"],
     depth: Float[Tensor, "*body taxel"],
+    inward: Vec,
     point: Vec,
     force: Vec,
     torque: Vec,
+    normal: Vec,
     radius: Float[Tensor, "*padding"],
     levenberg: Float[Tensor, " iteration"],
 ) -> Footprint:
@@ -94,16 +99,20 @@ def footprint(
         pos: Taxel positions [m], planes (taxel,) or (body, taxel).
         is_active: Which taxels can carry.
         depth: Depth of each probe over its radius [1].
+        inward: −2 n of each taxel, planes like those of `pos` [1].
         point: Contact points [m], planes (*body, contact).
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
+        normal: Unit normals out of the objects.
         radius: Radius of a footprint r_f [m], one for all or (body,).
         levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
     """
     arm = planes.vec((to[..., None, :] - at[..., None]) / radius[..., None, None] for to, at in zip(pos, point, strict=True))
     apart = torch.where(is_active[..., None, :], planes.dot(arm, arm), 4.0)
-    weight = (depth[..., None, :] + unreached()) * (1 - apart).clamp(min=0) ** 2
-    near = ((1 - apart.amin(dim=-1)) / 0.75).clamp(0, 1)
+    each, of = planes.vec(part[..., None] for part in normal), planes.vec(part[..., None, :] for part in inward)
+    pull = (1 - apart).clamp(min=0) * planes.dot(each, of).clamp(0, 1)
+    weight = (depth[..., None, :] + unreached()) * pull**2
+    near = (pull.amax(dim=-1) / 0.75).clamp(max=1)
     captured = near * near * (3 - 2 * near)
     strength = torch.sqrt(planes.dot(force, force) + no_force() ** 2)
     lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
@@ -127,7 +136,8 @@ class Bodies(NamedTuple):
         row: Place of each taxel in these, flattened.
         first: First taxel of each body, and the number of all.
         box: Least and largest coordinates of its active taxels [m].
-        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none.
+        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none; and
+            −2 times its outward normal.
     """
 
     taxel: Int[Tensor, "body padded"]
@@ -135,7 +145,7 @@ class Bodies(NamedTuple):
     row: Int[Tensor, " taxel"]
     first: Int[Tensor, " bodies_and_one"]
     box: Float[Tensor, "body 6"]
-    place: Float[Tensor, "taxel 3"]
+    place: Float[Tensor, "taxel 6"]
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
@@ -143,9 +153,11 @@ def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
     return np.concatenate([pos.min(axis=0), pos.max(axis=0)]) if len(pos) else np.zeros(6)
 
 
-def place(pos: Float[np.ndarray, "taxel 3"], is_active: Bool[np.ndarray, " taxel"]) -> Float[np.ndarray, "taxel 3"]:
-    """Return the positions of taxels [m], `FAR` away if they cannot carry."""
-    return np.where(is_active[:, None], pos, FAR)
+def place(
+    pos: Float[np.ndarray, "taxel 3"], normal: Float[np.ndarray, "taxel 3"], is_active: Bool[np.ndarray, " taxel"]
+) -> Float[np.ndarray, "taxel 6"]:
+    """Return the positions of taxels [m], `FAR` away if they cannot carry, and −2 n."""
+    return np.concatenate([np.where(is_active[:, None], pos, FAR), -2.0 * normal], axis=1)
 
 
 class Shared(NamedTuple):
@@ -169,6 +181,7 @@ def shared_forces(
     point: Vec,
     force: Vec,
     torque: Vec,
+    normal: Vec,
     radius: Float[Tensor, " body"],
     levenberg: Float[Tensor, " iteration"],
 ) -> Shared:
@@ -181,25 +194,28 @@ def shared_forces(
         point: Contact points [m], planes (env, body, contact).
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
+        normal: Unit normals out of the objects.
         radius: Radius of a footprint r_f [m].
         levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
     """
     taxel, inverse_radius = bodies.taxel, bodies.inverse_radius
-    if takes_kernel(depth, *point, *force, *torque):
+    if takes_kernel(depth, *point, *force, *torque, *normal):
         from tgdsl.sensors import footprint_kernel
 
         own = inverse_radius.flatten()[bodies.row]
         weight = depth * own + unreached()
         args = radius, levenberg, bodies.first, bodies.box
-        shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, *args)
+        shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
         return Shared(shared, sums[:, :3], sums[:, 3:])
     share, residual = footprint(
         planes.vec(part[taxel] for part in pos),
         inverse_radius > 0,
         depth[:, taxel] * inverse_radius,
+        planes.split(bodies.place[taxel, 3:]),
         point,
         force,
         torque,
+        normal,
         radius,
         levenberg,
     )
@@ -260,20 +276,26 @@ def reference(
     pos: Float[np.ndarray, "taxel 3"],
     is_active: Bool[np.ndarray, " taxel"],
     depth: Float[np.ndarray, " taxel"],
+    outward: Float[np.ndarray, "taxel 3"],
     point: Float[np.ndarray, "contact 3"],
     force: Float[np.ndarray, "contact 3"],
     torque: Float[np.ndarray, "contact 3"],
+    normal: Float[np.ndarray, "contact 3"],
     radius: float,
     levenberg: Sequence[float],
 ) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, 3]]:
-    """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m]."""
+    """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m].
+
+    `outward` are the taxels' own normals n, `normal` those of the contacts.
+    """
     num = len(point)
     weight, captured = np.zeros((num, len(pos))), np.zeros(num)
     strength = np.sqrt(np.sum(force**2, axis=1) + no_force() ** 2)
     for c in range(num):
         apart = np.where(is_active, np.sum((pos - point[c]) ** 2, axis=1) / radius**2, 4.0)
-        weight[c] = (depth + unreached()) * np.maximum(0.0, 1.0 - apart) ** 2
-        t = np.clip((1.0 - apart.min()) / 0.75, 0.0, 1.0)
+        pull = np.maximum(0.0, 1.0 - apart) * np.clip(-2.0 * outward @ normal[c], 0.0, 1.0)
+        weight[c] = (depth + unreached()) * pull**2
+        t = min(1.0, pull.max() / 0.75)
         captured[c] = t**2 * (3.0 - 2.0 * t)
     lever = [np.cross(pos - point[c], force[c] / strength[c]) / radius for c in range(num)]
     load = captured * strength

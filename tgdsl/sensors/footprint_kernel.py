@@ -51,6 +51,7 @@ def shared_forces(
     point: Sequence[Tensor],
     force: Sequence[Tensor],
     torque: Sequence[Tensor],
+    normal: Sequence[Tensor],
     radius: Tensor,
     levenberg: Tensor,
     first: Tensor,
@@ -61,17 +62,18 @@ def shared_forces(
     These are the sum of its taxels' forces [N], and what they leave of the moment [N·m].
 
     Args:
-        pos: Taxel positions in their body's frame, (taxel, 3) [m]; inactive ones are far away.
+        pos: Taxel positions in their body's frame [m], inactive ones far away, and −2 times their normals: (taxel, 6).
         weight: Depth of each probe over its radius, and `unreached()`, (env, taxel) [1].
         point: Contact points, three planes (env, body, contact) [m].
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
+        normal: Unit normals out of the objects.
         radius: Radius of a footprint, (body,) [m].
         levenberg: Least curvature of each step towards the moment [1].
         first: First taxel of each body, and the number of all: (body + 1,).
         box: Least and largest coordinates of each body's active taxels, (body, 6) [m].
     """
-    return launch(wrap_triton(footprint_kernel), pos, weight, point, force, torque, radius, levenberg, first, box)
+    return launch(wrap_triton(footprint_kernel), pos, weight, point, force, torque, normal, radius, levenberg, first, box)
 
 
 def launch(
@@ -81,6 +83,7 @@ def launch(
     point: Sequence[Tensor],
     force: Sequence[Tensor],
     torque: Sequence[Tensor],
+    normal: Sequence[Tensor],
     radius: Tensor,
     levenberg: Tensor,
     first: Tensor,
@@ -91,7 +94,7 @@ def launch(
     num_taxels = weight.shape[1]
     shared = weight.new_empty((num_envs, 3, num_taxels))
     sums = weight.new_empty((num_envs, 6, num_bodies))
-    planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque)]
+    planes = [plane.contiguous() for plane in (pos, weight, *point, *force, *torque, *normal)]
     run[(triton.cdiv(num_envs, ENVS), num_bodies)](
         *planes, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
         STEPS=levenberg.shape[0], FEW=FEW_STEPS, ENVS=ENVS, GROUP=GROUP, TILE=TILE, num_warps=1,
@@ -102,7 +105,7 @@ def launch(
 @triton.jit
 def footprint_kernel(
     pos, weight, point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z,
-    radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
+    normal_x, normal_y, normal_z, radius, levenberg, first, box, shared, sums, num_envs, num_bodies, num_contacts, num_taxels,
     STEPS: tl.constexpr, FEW: tl.constexpr, ENVS: tl.constexpr, GROUP: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
     """Find β of one body in a block of environments, and share out its contacts."""
@@ -112,9 +115,10 @@ def footprint_kernel(
     row = env * num_bodies + body
     first_taxel = tl.load(first + body)
     num_own = tl.load(first + body + 1) - first_taxel
-    pos += 3 * first_taxel
+    pos += 6 * first_taxel
     weights = weight + first_taxel + tl.where(is_env, env, 0) * num_taxels
     planes = (point_x, point_y, point_z, force_x, force_y, force_z, torque_x, torque_y, torque_z)
+    normals = (normal_x, normal_y, normal_z)
     inverse = 1.0 / tl.load(radius + body)
     box += 6 * body
     IS_LONG: tl.constexpr = STEPS > FEW
@@ -126,12 +130,12 @@ def footprint_kernel(
         excess = (zero, zero, zero)
         spread = (zero, zero, zero, zero, zero, zero)
         for start in range(0, num_contacts, GROUP):
-            point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
+            point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
             if is_any:
                 strength, way = _direction(force)
                 slope = _slope(way, tilt, inverse)
                 captured, norm, top, mean, covariance = _moments(
-                    pos, weights, num_own, box, point, force, slope, inverse, IS_LONG
+                    pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG
                 )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
@@ -146,32 +150,38 @@ def footprint_kernel(
 
     carried, unmet = (zero, zero, zero), (zero, zero, zero)
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
-        point, force, torque, is_any = _contacts(planes, row, is_env, start, num_contacts, GROUP)
+        point, force, torque, normal, is_any = _contacts(planes, normals, row, is_env, start, num_contacts, GROUP)
         if is_any | (start == 0):
             strength, way = _direction(force)
             slope = _slope(way, tilt, inverse)
-            captured, norm, top, mean, covariance = _moments(pos, weights, num_own, box, point, force, slope, inverse, IS_LONG)
+            captured, norm, top, mean, covariance = _moments(
+                pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG
+            )
             unmet = _add3(unmet, _unmet(captured, mean, force, torque))
             each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
             carried = _add3(carried, _summed(_scale3(norm, each)))
             x, y, z = _each3(point)
+            nx, ny, nz = _each3(normal)
             u, v, w = _each3(slope)
             fx, fy, fz = _each3(each)
             tops = _each(top)
             for taxel in range(0, num_own, TILE):
                 own = taxel + tl.arange(0, TILE)
                 is_own = is_env[:, None] & (own < num_own)[None, :]
-                at = pos + 3 * own
-                place = (
-                    _load(at, own < num_own)[None, :],
-                    _load(at + 1, own < num_own)[None, :],
-                    _load(at + 2, own < num_own)[None, :],
-                )
+                place, inward = _tile(pos + 6 * own, own < num_own), _tile(pos + 6 * own + 3, own < num_own)
                 pull = _load(weights[:, None] + own[None, :], is_own)
-                p0 = _pulled(place, pull, (x[0], y[0], z[0]), (u[0], v[0], w[0]), tops[0], inverse)
-                p1 = _pulled(place, pull, (x[1], y[1], z[1]), (u[1], v[1], w[1]), tops[1], inverse)
-                p2 = _pulled(place, pull, (x[2], y[2], z[2]), (u[2], v[2], w[2]), tops[2], inverse)
-                p3 = _pulled(place, pull, (x[3], y[3], z[3]), (u[3], v[3], w[3]), tops[3], inverse)
+                p0 = _pulled(
+                    place, inward, pull, (x[0], y[0], z[0]), (nx[0], ny[0], nz[0]), (u[0], v[0], w[0]), tops[0], inverse
+                )
+                p1 = _pulled(
+                    place, inward, pull, (x[1], y[1], z[1]), (nx[1], ny[1], nz[1]), (u[1], v[1], w[1]), tops[1], inverse
+                )
+                p2 = _pulled(
+                    place, inward, pull, (x[2], y[2], z[2]), (nx[2], ny[2], nz[2]), (u[2], v[2], w[2]), tops[2], inverse
+                )
+                p3 = _pulled(
+                    place, inward, pull, (x[3], y[3], z[3]), (nx[3], ny[3], nz[3]), (u[3], v[3], w[3]), tops[3], inverse
+                )
                 out = shared + first_taxel + env[:, None] * (3 * num_taxels) + own[None, :]
                 _accumulate(out, _weighted(p0, p1, p2, p3, fx), is_own, start)
                 _accumulate(out + num_taxels, _weighted(p0, p1, p2, p3, fy), is_own, start)
@@ -187,8 +197,8 @@ def footprint_kernel(
 
 
 @triton.jit
-def _contacts(planes, row, is_env, start, num_contacts, GROUP: tl.constexpr):
-    """Return points, forces and torques of a group of contacts, (env, contact), and whether there is any."""
+def _contacts(planes, normals, row, is_env, start, num_contacts, GROUP: tl.constexpr):
+    """Return points, forces, torques and normals of a group of contacts, (env, contact), and whether there is any."""
     contact = start + tl.arange(0, GROUP)
     at = row[:, None] * num_contacts + contact[None, :]
     is_contact = is_env[:, None] & (contact < num_contacts)[None, :]
@@ -198,13 +208,20 @@ def _contacts(planes, row, is_env, start, num_contacts, GROUP: tl.constexpr):
     acts = (fx != 0) | (fy != 0) | (fz != 0) | (tx != 0) | (ty != 0) | (tz != 0)
     is_strange = (px != px) | (py != py) | (pz != pz)
     is_any = tl.max(tl.max((acts | is_strange).to(tl.int32), axis=1), axis=0) != 0
-    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), is_any
+    normal = _load(normals[0] + at, is_contact), _load(normals[1] + at, is_contact), _load(normals[2] + at, is_contact)
+    return (px, py, pz), (fx, fy, fz), (tx, ty, tz), normal, is_any
 
 
 @triton.jit
 def _load(at, is_there):
     """Return what is there, else 0."""
     return tl.load(at, is_there, 0.0)
+
+
+@triton.jit
+def _tile(at, is_there):
+    """Return the vectors of a tile of taxels, (1, taxel)."""
+    return _load(at, is_there)[None, :], _load(at + 1, is_there)[None, :], _load(at + 2, is_there)[None, :]
 
 
 @triton.jit
@@ -230,9 +247,11 @@ def _arm(place, point):
 
 
 @triton.jit
-def _pull(arm, weight, slope, top, inverse):
-    """Return 1 − s², not below 0, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels."""
-    near = tl.maximum(1.0 - inverse * inverse * _dot(arm, arm), 0.0, propagate_nan=tl.PropagateNan.ALL)
+def _pull(arm, facing, weight, slope, top, inverse):
+    """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m."""
+    near = 1.0 - inverse * inverse * _dot(arm, arm)
+    near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # what is negative remains so
+    near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
     exponent = tl.minimum(_dot(slope, arm) - top, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
     return near, weight * near * near * tl.exp2(exponent)
 
@@ -249,30 +268,31 @@ def _away(box, point, force, inverse):
 
 
 @triton.jit
-def _moments(pos, weights, num_own, box, point, force, slope, inverse, IS_LONG: tl.constexpr):
+def _moments(pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
     away, is_beside = _away(box, point, force, inverse)
     if is_beside:
-        found = _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG, True)
+        found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
     else:
-        found = _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG, False)
+        found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, False)
     return found
 
 
 @triton.jit
-def _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
+def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG: tl.constexpr, IS_BESIDE: tl.constexpr):
     """Return what `_moments` does; sums are about the contacts, or beside the box about what is `away` from them."""
     zero = tl.zeros_like(point[0])
     top = zero
     if IS_LONG:
-        top += _highest(pos, num_own, point, slope, inverse)
+        top += _highest(pos, num_own, point, normal, slope, inverse)
     nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
-        at = pos + 3 * taxel
+        at = pos + 6 * taxel
         arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
+        facing = _dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
         weight = tl.load(weights + taxel)[:, None]
-        near, part = _pull(arm, weight, slope, top, inverse)
+        near, part = _pull(arm, facing, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
         if IS_BESIDE:
             arm = _arm(arm, away)
@@ -294,11 +314,12 @@ def _moments_about(pos, weights, num_own, point, slope, inverse, away, IS_LONG: 
 
 
 @triton.jit
-def _pulled(place, weight, point, slope, top, inverse):
+def _pulled(place, inward, weight, point, normal, slope, top, inverse):
     """Return what one contact of each environment pulls at a tile of taxels with, (env, taxel)."""
     arm = _arm(place, (point[0][:, None], point[1][:, None], point[2][:, None]))
+    facing = _dot(inward, (normal[0][:, None], normal[1][:, None], normal[2][:, None]))
     slope = (slope[0][:, None], slope[1][:, None], slope[2][:, None])
-    _near, part = _pull(arm, weight, slope, top[:, None], inverse)
+    _near, part = _pull(arm, facing, weight, slope, top[:, None], inverse)
     return part
 
 
@@ -324,13 +345,14 @@ def _weighted(p0, p1, p2, p3, force):
 
 
 @triton.jit
-def _highest(pos, num_own, point, slope, inverse):
-    """Return the largest exponent of 2 among the taxels in reach, (env, contact)."""
+def _highest(pos, num_own, point, normal, slope, inverse):
+    """Return the largest exponent of 2 among the taxels in reach on the contact's side, (env, contact)."""
     top = tl.full(point[0].shape, float("-inf"), tl.float32)
     for taxel in range(num_own):
-        at = pos + 3 * taxel
+        at = pos + 6 * taxel
         arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
-        is_reached = inverse * inverse * _dot(arm, arm) < 1.0
+        facing = _dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
+        is_reached = (inverse * inverse * _dot(arm, arm) < 1.0) & (facing > 0.0)
         top = tl.maximum(top, tl.where(is_reached, _dot(slope, arm), float("-inf")))
     return tl.where(top == float("-inf"), 0.0, top)
 

@@ -7,14 +7,15 @@
 
 with c the solver's contacts of the sensor's objects on one body, f_c their forces on the link, τ_c their torques at the
 contact points x_c, f_net their whole; j that body's taxels with place x_j, outward normal n_j and area A_j, all in the link's
-frame. The captured fraction γ_c and the shares λ_cj ≥ 0, which sum to 1, are those of `footprint`: near the contact, by
-depth, and such that the moment of the taxel forces is that of the contacts as far as shares can meet it.
+frame. The captured fraction γ_c and the shares λ_cj ≥ 0, which sum to 1, are those of `footprint`: near the contact and on its
+side of the body, by depth, and such that the moment of the taxel forces is that of the contacts as far as shares can meet it.
 
 So Σ_j f_j + missed = f_net always: no load is lost or made up, static shear included. As every f_j is a sum of contact forces
 with weights ≥ 0, it leaves no cone that they share, such as the friction cone of a flat face. A contact that slides off the
-sensor hands its force to `missed` continuously; so do contacts beyond `slots`, and those further than a footprint from every
-active taxel. Inactive taxels carry nothing. `missed` and `residual` have one row per body. The residual is a pure couple, since
-the shared forces sum to those they came from: it is the same about any point.
+sensor, or around an edge of its body, hands its force to `missed` continuously. So is missed what lies further than a footprint
+from every active taxel, or on the back of the body. What contacts beyond `slots` carry acts at the centre of the others, see
+`geometry.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per body. The residual is a pure
+couple, since the shared forces sum to those they came from: it is the same about any point.
 
 Source: a solver's contacts are rigid points; this is the distribution of a resultant on a Winkler foundation, whose pressure is
 proportional to depth (Johnson, *Contact Mechanics*, §4.3), with its moment corrected.
@@ -60,7 +61,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
     """Newton steps towards the contacts' moment; 0: shares by depth and distance alone [1]."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that are shared out; what is beyond them is missed [1]."""
+    """Contacts per pair of body and object that are shared out; what others carry acts at the centre of these [1]."""
 
     def radii(self, layout: Layout) -> np.ndarray:
         """Return r_f of each body [m]."""
@@ -94,8 +95,9 @@ def reference_reports(spec: ForceTaxelSpec, layout: Layout, touch: Touch) -> tup
     for b in range(len(layout.bodies)):
         own, at = layout.body_id == b, contacts.body == b
         share, residual[b] = footprint.reference(
-            layout.pos[own], is_active[own], depth[own],
-            contacts.pos[at], contacts.force[at], contacts.torque[at], spec.radii(layout)[b], spec.levenberg,
+            layout.pos[own], is_active[own], depth[own], layout.normal[own],
+            contacts.pos[at], contacts.force[at], contacts.torque[at], contacts.normal[at],
+            spec.radii(layout)[b], spec.levenberg,
         )  # fmt: skip
         force[own] = share.T @ contacts.force[at]
         missed[b] -= force[own].sum(axis=0)
@@ -118,7 +120,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "first": first,
         "row": layout.body_id * counts.max() + rank,
         "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
-        "place": footprint.place(layout.pos, is_active),
+        "place": footprint.place(layout.pos, layout.normal, is_active),
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
     }
@@ -149,6 +151,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
         contacts.pos,
         contacts.force,
         contacts.torque,
+        contacts.normal,
         constants["footprint"],
         constants["levenberg"],
     )

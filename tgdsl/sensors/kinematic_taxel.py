@@ -11,13 +11,21 @@ Force and torque act on the link, the torque about the link's origin: friction p
 
 Options, all off by default, in this order:
 
-    friction_cone μ     f_t ← f_t min(1, μ max(0, f_n)/|f_t|), f_t = k_t v_t, f_n = f · m; the spin term is left as it is
+    balance solver      f_n,j ← λ_j W,  λ_j = q_j Q/(Q² + ε²),  q_j = max(0, f_n,j),  Q = Σ_j q_j,  W = Σ_c f_c · m_c
+                        f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = λ_j Σ_c |f_c − (f_c · m_c) m_c|,  spin within ± l_j R_j
+    friction_cone μ     f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = μ max(0, f_n,j), which takes the place of the l_j above
     torque_about taxel  τ_j without x_j × f_j
-    balance solver      f_j ← g f_j, τ_j ← g τ_j for all j of a body, g = Σ_c f_c · m_c / Σ_j f_n,j
 
-with f_c the solver's forces on the body at its contacts c with the sensor's objects and m_c their normals: the taxels then
-press with what the solver presses with. Where Σ_j f_n,j is not positive there is nothing to scale: the body's taxels read
-zero, and the solver's force is not carried. Of contacts beyond `slots` nothing is known. `force_taxel` shares out forces.
+with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin k_ω (ω · m_j) as above; j the taxels of one body, c the solver's contacts
+on that body with all of the sensor's objects, f_c their forces on it and m_c their normals.
+
+Balanced, the normal forces of a body's taxels sum to the solver's W, in the proportions of the law above. Their friction is
+that of the law up to a limit: the cone of `friction_cone`, or else all together the solver's own, so that a contact without
+friction has none. A taxel's patch is no larger than its probe, so friction twists it with no more than l_j R_j, R_j its radius
+[m]. Nothing grows as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. What pulls has no share of W. ε is the normal force up
+to which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. What
+contacts beyond `slots` carry acts at the centre of the others, and counts. Static friction is not of this law: `force_taxel`
+shares out forces.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 
@@ -38,8 +46,9 @@ from torch import Tensor
 
 from tgdsl.fields import NonNegative, Positive
 from tgdsl.geometry import planes
+from tgdsl.geometry.contacts import Contacts
 from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
+from tgdsl.geometry.reference import ReferenceContacts, Touch
 from tgdsl.layout import Layout
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import FORCE
@@ -69,9 +78,9 @@ class KinematicTaxelSpec(ContactProbeSpec):
     torque_about: Literal["link", "taxel"] = "link"
     """Point that torques are about: the link's origin as in the paper, or each taxel."""
     balance: Literal["none", "solver"] = "none"
-    """`solver` scales a body's taxels so that they press with the solver's normal force; `none` as in the paper."""
+    """`solver` has a body's taxels press with the solver's normal force, and bounds their friction; `none` as in the paper."""
     slots: Annotated[StrictInt, Field(ge=1)] = 8
-    """Contacts per pair of body and object that `balance` counts [1]."""
+    """Contacts per pair of body and object whose normals `balance` takes [1]."""
 
     @model_validator(mode="after")
     def _is_used(self) -> KinematicTaxelSpec:
@@ -91,28 +100,42 @@ def reference(
     spec: KinematicTaxelSpec, layout: Layout, touch: Touch, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6)."""
-    forces, torques, pressed = np.zeros_like(layout.pos), np.zeros_like(layout.pos), np.zeros(layout.num_taxels)
-    for j, (x, d, m) in enumerate(zip(layout.pos, touch.depth, touch.normal, strict=True)):
+    forces, torques, num = np.zeros_like(layout.pos), np.zeros_like(layout.pos), layout.num_taxels
+    pressed, shear, spin = np.zeros(num), np.zeros_like(layout.pos), np.zeros(num)
+    for j, (d, m) in enumerate(zip(touch.depth, touch.normal, strict=True)):
         if d > 0:
             s, v = d**spec.depth_exponent, touch.velocity[j]
-            v_n = (v @ m) * m
-            shear = spec.shear_sign * spec.shear_damping * (v - v_n)
-            normal = spec.normal_stiffness * s * m + spec.normal_damping * s * v_n
-            pressed[j], size = normal @ m, np.linalg.norm(shear)
-            if spec.friction_cone is not None and size > 0:
-                shear *= min(1.0, spec.friction_cone * max(0.0, pressed[j]) / size)
-            forces[j] = normal + shear
-            torques[j] = spec.shear_sign * spec.spin_damping * (touch.angular[j] @ m) * m
-            if spec.torque_about == "link":
-                torques[j] += np.cross(x, forces[j])
+            pressed[j] = spec.normal_stiffness * s + spec.normal_damping * s * (v @ m)
+            shear[j] = spec.shear_sign * spec.shear_damping * (v - (v @ m) * m)
+            spin[j] = spec.shear_sign * spec.spin_damping * (touch.angular[j] @ m)
+    limit = np.full(num, np.inf)
     if spec.balance == "solver":
         assert touch.contacts is not None
-        for b in range(len(layout.bodies)):
-            own, at = layout.body_id == b, touch.contacts.body == b
-            wanted = np.sum(touch.contacts.force[at] * touch.contacts.normal[at])
-            factor = wanted / pressed[own].sum() if pressed[own].sum() > no_force() else 0.0
-            forces[own], torques[own] = factor * forces[own], factor * torques[own]
+        pressed, limit = reference_balance(pressed, layout.body_id, touch.contacts)
+    if spec.friction_cone is not None:
+        limit = spec.friction_cone * np.maximum(0.0, pressed)
+    for j, (x, m) in enumerate(zip(layout.pos, touch.normal, strict=True)):
+        size = np.linalg.norm(shear[j])
+        forces[j] = pressed[j] * m + shear[j] * (limit[j] / size if size > limit[j] else 1.0)
+        if spec.balance == "solver":
+            spin[j] = np.clip(spin[j], -limit[j] * layout.radius[j], limit[j] * layout.radius[j])
+        torques[j] = spin[j] * m
+        if spec.torque_about == "link":
+            torques[j] += np.cross(x, forces[j])
     return np.concatenate([{"force": forces, "torque": torques}[name] for name in _ordered(spec)], axis=1), {}
+
+
+def reference_balance(pressed: np.ndarray, body_id: np.ndarray, contacts: ReferenceContacts) -> tuple[np.ndarray, np.ndarray]:
+    """Return normal forces f_n that sum to the solver's on each body [N], and the limits l of friction [N]: (taxel,)."""
+    normal, limit = np.zeros_like(pressed), np.zeros_like(pressed)
+    for b in np.unique(body_id):
+        own, at = body_id == b, contacts.body == b
+        along = np.sum(contacts.force[at] * contacts.normal[at], axis=1)
+        across = np.linalg.norm(contacts.force[at] - along[:, None] * contacts.normal[at], axis=1)
+        part = np.maximum(0.0, pressed[own])
+        share = part * part.sum() / (part.sum() ** 2 + unloaded() ** 2)
+        normal[own], limit[own] = share * along.sum(), share * across.sum()
+    return normal, limit
 
 
 def _ordered(spec: KinematicTaxelSpec) -> tuple[str, ...]:
@@ -144,6 +167,8 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
         return Lowered(tuple(channels), constants, needs=frozenset(needs))
     member = layout.body_id[:, None] == np.arange(len(layout.bodies))
     constants |= {"member": member.astype(np.float64), "body": layout.body_id}
+    if "spin_damping" in constants:
+        constants["patch"] = np.maximum(layout.radius, 0.0)
     return Lowered(tuple(channels), constants, needs=frozenset({*needs, "contacts"}), slots=spec.slots)
 
 
@@ -154,49 +179,55 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     """
     assert felt.normal is not None
     stiffness = planes.power(felt.depth, constants["depth_exponent"])
-    pressed = constants["normal_stiffness"] * stiffness
-    force = planes.scale(pressed, felt.normal)
+    pressed, shear, limit = constants["normal_stiffness"] * stiffness, None, None
     if felt.velocity is not None:
         approach = planes.dot(felt.velocity, felt.normal)
         pressed = pressed + constants["normal_damping"] * stiffness * approach
-        shear = planes.sub(felt.velocity, planes.scale(approach, felt.normal))
-        shear = _in_cone(planes.scale(constants["shear_damping"], shear), pressed, constants.get("friction_cone"))
-        force = planes.add(planes.scale(pressed, felt.normal), shear)
-    factor = _balance(pressed, felt, constants) if "member" in constants else None
-    force = force if factor is None else planes.scale(factor, force)
+        shear = planes.scale(constants["shear_damping"], planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
+    if "member" in constants:
+        assert felt.contacts is not None
+        pressed, limit = _balanced(pressed, felt.contacts, constants)
+    if "friction_cone" in constants:
+        limit = constants["friction_cone"] * pressed.clamp(min=0)
+    force = planes.scale(pressed, felt.normal)
+    if shear is not None:
+        force = planes.add(force, shear if limit is None else _within(limit, shear))
     readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
     if "spin_damping" in constants:
         none = felt.depth * 0.0  # not-a-number where the pose is
         torque = planes.cross(probes.pos, force) if "about_link" in constants else (none, none, none)
         if felt.angular is not None:
             spin = constants["spin_damping"] * planes.dot(felt.angular, felt.normal)
-            torque = planes.add(torque, planes.scale(spin if factor is None else spin * factor, felt.normal))
+            if "patch" in constants and limit is not None:
+                largest = constants["patch"] * limit
+                spin = torch.minimum(torch.maximum(spin, -largest), largest)
+            torque = planes.add(torque, planes.scale(spin, felt.normal))
         readings |= {f"torque_{axis}": plane for axis, plane in zip("xyz", torque, strict=True)}
     return readings, {}
 
 
-def no_force() -> float:
-    """Return up to which normal force of a body's taxels [N] there is nothing to balance."""
-    return 1e-9
+def unloaded() -> float:
+    """Return ε, up to which normal force of its taxels [N] a body counts as unloaded."""
+    return 1e-12
 
 
-def _in_cone(shear: planes.Vec, pressed: Tensor, friction: Tensor | None) -> planes.Vec:
-    """Return tangential forces [N], scaled back to the friction cone of the normal forces where they leave it."""
-    if friction is None:
-        return shear
-    size, limit = planes.safe_sqrt(planes.dot(shear, shear)), friction * pressed.clamp(min=0)
+def _within(limit: Tensor, shear: planes.Vec) -> planes.Vec:
+    """Return tangential forces [N], scaled back to their limits where they are larger."""
+    size = planes.safe_sqrt(planes.dot(shear, shear))
     is_outside = size > limit
     return planes.scale(torch.where(is_outside, limit / torch.where(is_outside, size, 1.0), 1.0), shear)
 
 
-def _balance(pressed: Tensor, felt: Felt, constants: Constants) -> Tensor:
-    """Return the factor of each taxel, (env, taxel), that makes its body's normal forces sum to the solver's."""
-    contacts = felt.contacts
-    assert contacts is not None
-    wanted = planes.dot(contacts.force, contacts.normal).sum(dim=-1)
-    total = pressed @ constants["member"]
-    is_pressed = total > no_force()
-    return torch.where(is_pressed, wanted / torch.where(is_pressed, total, 1.0), 0.0)[:, constants["body"]]
+def _balanced(pressed: Tensor, contacts: Contacts, constants: Constants) -> tuple[Tensor, Tensor]:
+    """Return normal forces that sum to the solver's on each body [N], and the limits of friction [N]: (env, taxel)."""
+    along = planes.dot(contacts.force, contacts.normal)
+    across = planes.sub(contacts.force, planes.scale(along, contacts.normal))
+    part = pressed.clamp(min=0)
+    total = part @ constants["member"]
+    per_part = total / (total * total + unloaded() ** 2)
+    normal = per_part * along.sum(dim=-1)
+    limit = per_part * planes.safe_sqrt(planes.dot(across, across)).sum(dim=-1)
+    return part * normal[:, constants["body"]], part * limit[:, constants["body"]]
 
 
 KINEMATIC_TAXEL = Kind(KinematicTaxelSpec, lower, forward, reference, knobs=FORCE, is_pointwise=True)

@@ -6,6 +6,8 @@ Shapes: `env` environments, `taxel` taxels, `channel` numbers per taxel.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +23,7 @@ from torch._dynamo.utils import counters
 from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.module import TactileModule
-from tgdsl.plan import SLOT_FIELDS
+from tgdsl.plan import SLOT_FIELDS, Plan
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
 from tgdsl.state import SceneState
@@ -78,6 +80,12 @@ def conformance_document(scene: Path, sensor: Mapping[str, Any], palm: list[Any]
     }
 
 
+@functools.lru_cache(maxsize=8)
+def _plan_of(document: str, kinds: tuple[Kind, ...]) -> Plan:
+    """Return the plan of a document, which is given as JSON."""
+    return compile_plan(json.loads(document), kinds=kinds)
+
+
 class KindConformance:
     """Inherit this in a test class and set `kind`, and `parameters` if its defaults are not what should be tested."""
 
@@ -97,9 +105,9 @@ class KindConformance:
     """Gates that the kind knows; empty if it has none."""
 
     @pytest.fixture
-    def scene(self, tmp_path: Path) -> Path:
-        """The conformance scene, as a file."""
-        path = tmp_path / "scene.xml"
+    def scene(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        """The conformance scene, as a file: the same for all tests, so that plans can be taken again."""
+        path = tmp_path_factory.getbasetemp() / "conformance.xml"
         path.write_text(SCENE)
         return path
 
@@ -109,8 +117,8 @@ class KindConformance:
         return conformance_document(scene, {"kind": self.kind.name, **self.parameters, **changes}, palm, tip)
 
     def build(self, document: dict[str, Any], dtype: torch.dtype) -> tuple[TactileModule, ReferenceModule]:
-        """Return a document's module, and its reference."""
-        plan = compile_plan(document, kinds=self._extra())
+        """Return a document's module, and its reference; a plan that the class has made before is taken again."""
+        plan = _plan_of(json.dumps(document), self._extra())
         spec = load(document, kinds=self._known()).spec.sensors["s"]
         return TactileModule(plan, self._known(), dtype), ReferenceModule(plan, self.kind, spec)
 

@@ -137,15 +137,16 @@ class ReferenceModule:
 
     def _contacts(self, state: SceneState, env: int) -> ReferenceContacts:
         """Return the contacts of the sensor's bodies with the objects that it feels, pair by pair and slot by slot."""
-        inputs, own = self.plan.inputs, self.spec.feels
+        inputs, sensor = self.plan.inputs, self.sensor
+        table = self.plan.arrays[f"queries/{sensor.query}/{sensor.answer}/contacts"]
         rows: list[tuple[int, list[np.ndarray]]] = []
         net = np.zeros((len(self.layout.bodies), 3))
         for b, name in enumerate(self.layout.bodies):
             body = self._body(state, env, name, np.zeros(3))
-            for p in (p for p, pair in enumerate(inputs.pairs) if pair.link == name and pair.object in own):
+            for p in (p for p in table[b].tolist() if p < len(inputs.pairs)):
                 net[b] += body.rotation.T @ _row(state.contact_netforce, env, p)
-                for slot in range(inputs.slots):
-                    pos, *vectors = (_row(getattr(state, field), env, p, slot) for field in SLOT_FIELDS)
+                own = [[_row(getattr(state, field), env, p, slot) for field in SLOT_FIELDS] for slot in range(inputs.slots)]
+                for pos, *vectors in _completed([row for row in own if np.any(row[1:])], _row(state.contact_netforce, env, p)):
                     rows.append((b, [body.rotation.T @ vector for vector in (pos - body.pos, *vectors)]))
         pos, force, torque, normal = np.array([row for _, row in rows]).reshape(len(rows), 4, 3).transpose(1, 0, 2)
         return ReferenceContacts(np.array([b for b, _ in rows], dtype=np.int64), pos, force, torque, normal, net)
@@ -221,6 +222,17 @@ class MomentTable:
         way = self._points - point
         weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.arrays["weight"][self.variant]
         return np.array([weight.sum(), *(weight @ way)])
+
+
+def _completed(contacts: list[list[np.ndarray]], whole: np.ndarray) -> list[list[np.ndarray]]:
+    """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
+    sizes = [float(np.linalg.norm(force)) for _, force, _, _ in contacts]
+    sizes = sizes if sum(sizes) > 0 else [1.0] * len(contacts)
+    lacking = whole - sum((force for _, force, _, _ in contacts), np.zeros(3))
+    return [
+        [pos, force + size / sum(sizes) * lacking, torque, normal]
+        for size, (pos, force, torque, normal) in zip(sizes, contacts, strict=True)
+    ]
 
 
 def _row(field: Tensor | None, *index: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any, no_type_check
 
 import mujoco
@@ -20,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.plan import SLOT_FIELDS, Inputs, contact_sensor_names
-from tgdsl.runtime.lookup import body_id
+from tgdsl.runtime.lookup import body_id, part_geoms
 from tgdsl.runtime.warp.lane import libraries
 from tgdsl.state import shape_of
 
@@ -31,12 +32,13 @@ _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", 
 class PairContacts:
     """Contacts of the pairs that a module wants, on the device. Only what the module wants is found and kept.
 
-    Pairs whose link and object are the same bodies are found once. Contacts fill slots in no certain order; if there are more
-    than slots, which are kept is not certain either, but the net force is that of all.
+    Pairs of the same link whose objects have the same geoms are found once. Contacts fill slots in no certain order; if there
+    are more than slots, which are kept is not certain either, but the net force is that of all. Contacts that a `gap` adds
+    beyond the margin carry no force, and are none.
 
     Attributes:
-        arrays: Live tensors (env, row, …) of the fields of a state, float32; a row is a pair of bodies. Where slots are wanted,
-            `contact_found` is among them.
+        arrays: Live tensors (env, row, …) of the fields of a state, float32; a row is a link and an object's geoms. Where slots
+            are wanted, `contact_found` is among them.
     """
 
     arrays: dict[str, Float[Tensor, "env ..."]]
@@ -51,18 +53,17 @@ class PairContacts:
             device: Where physics runs.
 
         Raises:
-            SimulationError: If the model lacks a body.
+            SimulationError: If the model lacks a body or geom.
         """
         wp, mjw = libraries()
         self._fields = [name for name in ("contact_found", *_VECTORS) if name in inputs.fields]
-        bodies = [(body_id(model, inputs.bodies_of[pair.object]), body_id(model, pair.link)) for pair in inputs.pairs]
-        rows = {own: row for row, own in enumerate(dict.fromkeys(bodies))}
-        row_of_bodies = np.full((model.nbody, model.nbody), -1, dtype=np.int32)
-        for (target, link), row in rows.items():
-            row_of_bodies[target, link] = row
+        parts = {name: [part_geoms(model, part) for part in inputs.parts_of(name)] for name in inputs.bodies_of}
+        geoms = {name: tuple(np.unique(np.concatenate(own)).tolist()) for name, own in parts.items()}
+        pairs = [(geoms[pair.object], body_id(model, pair.link)) for pair in inputs.pairs]
+        rows = {own: row for row, own in enumerate(dict.fromkeys(pairs))}
         self._row_of_pair: Int[Tensor, " pair"] | None = None
-        if len(rows) < len(bodies):
-            self._row_of_pair = torch.tensor([rows[own] for own in bodies], dtype=torch.int64, device=device)
+        if len(rows) < len(pairs):
+            self._row_of_pair = torch.tensor([rows[own] for own in pairs], dtype=torch.int64, device=device)
         names = list(self._fields)
         if any(name in names for name in SLOT_FIELDS) and "contact_found" not in names:
             names.append("contact_found")  # it says which slot is free
@@ -73,7 +74,7 @@ class PairContacts:
         self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
         self._launch, self._kernel = wp.launch, _kernel(wp, mjw)
         self._outputs: list[Any] = [
-            wp.array(row_of_bodies, dtype=int, device=wp.device_from_torch(device)),
+            wp.array(_row_table(rows, model), dtype=int, device=wp.device_from_torch(device)),
             inputs.slots,
             wp.from_torch(self.arrays["contact_found"]) if "contact_found" in names else None,
             *(wp.from_torch(self.arrays[name], dtype=wp.vec3) if name in names else None for name in _VECTORS),
@@ -86,7 +87,8 @@ class PairContacts:
         self._memory.zero_()
         own = warp_data.contact
         inputs = [warp_model.opt.cone, warp_model.geom_bodyid, warp_data.nacon, own.worldid, own.geom, own.type, own.pos]
-        inputs += [own.frame, own.friction, own.dim, own.efc_address, own.adhesion, warp_data.efc.force, warp_data.njmax]
+        inputs += [own.dist, own.includemargin, own.frame, own.friction, own.dim, own.efc_address, own.adhesion]
+        inputs += [warp_data.efc.force, warp_data.njmax]
         self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
 
     def read(self) -> dict[str, Float[Tensor, "env pair ..."]]:
@@ -95,9 +97,23 @@ class PairContacts:
         return {name: self.arrays[name].clone() if rows is None else self.arrays[name][:, rows] for name in self._fields}
 
 
+def _row_table(rows: Mapping[tuple[tuple[int, ...], int], int], model: mujoco.MjModel) -> Int[np.ndarray, "layer geom body"]:
+    """Return the rows that contacts of an object's geom and a link's body belong to; −1 where there are no more."""
+    layers: list[np.ndarray] = []
+    for (geoms, link), row in rows.items():
+        for geom in geoms:
+            free = next((layer for layer in layers if layer[geom, link] < 0), None)
+            if free is None:
+                free = np.full((model.ngeom, model.nbody), -1, dtype=np.int32)
+                layers.append(free)
+            free[geom, link] = row
+    return np.stack(layers) if layers else np.full((1, model.ngeom, model.nbody), -1, dtype=np.int32)
+
+
 def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " sensor"]:
     """Return the indices of a model's sensors, those left out that would find a module's contacts."""
-    ours = {name for pair in inputs.pairs for name in contact_sensor_names(pair)}
+    parts = [(pair, i) for pair in inputs.pairs for i in range(len(inputs.parts_of(pair.object)))]
+    ours = {name for pair, i in parts for name in contact_sensor_names(pair, i)}
     is_contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
     is_ours = [bool(is_contact[i]) and model.sensor(i).name in ours for i in range(model.nsensor)]
     return np.flatnonzero(~np.array(is_ours, dtype=bool))
@@ -120,9 +136,10 @@ def _kernel(wp: Any, mjw: Any) -> Any:
     @wp.kernel(enable_backward=False)
     def gather(
         cone: int, geom_body: wp.array[int], nacon: wp.array[int], world: wp.array[int], geom: wp.array[wp.vec2i],
-        kind: wp.array[int], pos: wp.array[wp.vec3], frame: wp.array[wp.mat33], friction: Any, dim: wp.array[int],
-        efc_address: wp.array2d[int], adhesion: wp.array[float], efc_force: wp.array2d[float], njmax: int,
-        row_of_bodies: wp.array2d[int], num_slots: int, found: wp.array2d[float], place: wp.array3d[wp.vec3],
+        kind: wp.array[int], pos: wp.array[wp.vec3], dist: wp.array[float], margin: wp.array[float], frame: wp.array[wp.mat33],
+        friction: Any, dim: wp.array[int], efc_address: wp.array2d[int], adhesion: wp.array[float],
+        efc_force: wp.array2d[float], njmax: int,
+        row_of: wp.array3d[int], num_slots: int, found: wp.array2d[float], place: wp.array3d[wp.vec3],
         normal: wp.array3d[wp.vec3], force: wp.array3d[wp.vec3], torque: wp.array3d[wp.vec3], netforce: wp.array2d[wp.vec3],
     ):
         # fmt: on
@@ -132,28 +149,31 @@ def _kernel(wp: Any, mjw: Any) -> Any:
         geoms = geom[contact]
         if (kind[contact] & constraint) == 0 or geoms[0] < 0 or geoms[1] < 0:  # a flex has no geom
             return
+        if dist[contact] >= margin[contact] and efc_address[contact, 0] < 0:  # a gap alone brings no force
+            return
         env = world[contact]
-        for turned in range(2):  # a body may be the object of one pair and the link of another
-            row = row_of_bodies[geom_body[geoms[turned]], geom_body[geoms[1 - turned]]]
-            if row >= 0:
-                sign = 1.0 - 2.0 * float(turned)
-                slot = num_slots
-                if found:
-                    slot = int(wp.atomic_add(found, env, row, 1.0))
-                is_kept = slot < num_slots
-                if netforce or (is_kept and (force or torque)):
-                    wrench = wrench_of(
-                        cone, frame, friction, dim, efc_address, adhesion, efc_force, njmax, nacon, env, contact, True
-                    )
-                    if netforce:
-                        wp.atomic_add(netforce, env, row, sign * wp.spatial_top(wrench))
-                    if force and is_kept:
-                        force[env, row, slot] = sign * wp.spatial_top(wrench)
-                    if torque and is_kept:
-                        torque[env, row, slot] = sign * wp.spatial_bottom(wrench)
-                if place and is_kept:
-                    place[env, row, slot] = pos[contact]
-                if normal and is_kept:
-                    normal[env, row, slot] = sign * frame[contact][0]
+        for turned in range(2):  # a geom may be the object's of one pair and the link's of another
+            for layer in range(row_of.shape[0]):  # and it may be of several objects
+                row = row_of[layer, geoms[turned], geom_body[geoms[1 - turned]]]
+                if row >= 0:
+                    sign = 1.0 - 2.0 * float(turned)
+                    slot = num_slots
+                    if found:
+                        slot = int(wp.atomic_add(found, env, row, 1.0))
+                    is_kept = slot < num_slots
+                    if netforce or (is_kept and (force or torque)):
+                        wrench = wrench_of(
+                            cone, frame, friction, dim, efc_address, adhesion, efc_force, njmax, nacon, env, contact, True
+                        )
+                        if netforce:
+                            wp.atomic_add(netforce, env, row, sign * wp.spatial_top(wrench))
+                        if force and is_kept:
+                            force[env, row, slot] = sign * wp.spatial_top(wrench)
+                        if torque and is_kept:
+                            torque[env, row, slot] = sign * wp.spatial_bottom(wrench)
+                    if place and is_kept:
+                        place[env, row, slot] = pos[contact]
+                    if normal and is_kept:
+                        normal[env, row, slot] = sign * frame[contact][0]
 
     return gather

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import listed
+from tgdsl.runtime.faults import DIVERGED, EnvFaults
 
 POOLS = {
     0: "njmax={njmax} is too small in environments {envs}: constraints are left out, {nefc} were wanted last",
@@ -26,67 +27,63 @@ POOLS = {
     11: "contacts of MuJoCo's tactile sensors are left out in environments {envs}",
 }
 """What each bit of MuJoCo Warp's `overflow` says. Bits 9 and 10, a solver at its last iteration, are no faults: it goes on."""
-_DIVERGED = 16
-_BAD_CONTROL = 17
 _MASK = sum(1 << bit for bit in POOLS)
 _LARGEST = 1e10
 """Positions and velocities above it have diverged: MuJoCo's own limit, `mjMAXVAL`."""
 
 
-class Faults:
-    """What has gone wrong in each environment since it was last reset.
+class Faults(EnvFaults):
+    """What has gone wrong in each environment since it was last reset: its own faults, and full pools, which many share.
 
-    Shapes: `env` environments.
-
-    Attributes:
-        is_any: Whether there is any fault; filled by `update`.
+    Shapes: `env` environments, `count` what the host is told.
     """
 
-    is_any: Bool[Tensor, ""]
+    def __init__(self, arrays: Mapping[str, Tensor], on_fault: str):
+        """Watch over MuJoCo Warp's arrays `overflow`, `qpos` and `qvel`.
 
-    def __init__(self, arrays: Mapping[str, Tensor]):
-        """Watch over MuJoCo Warp's arrays `overflow`, `qpos` and `qvel`."""
+        Raises:
+            SimulationError: If `on_fault` is no choice.
+        """
+        device = arrays["qpos"].device
+        super().__init__(len(arrays["qpos"]), device, on_fault)
         self._arrays = arrays
-        num_envs, device = len(arrays["qpos"]), arrays["qpos"].device
-        self._has_diverged = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._has_bad_control = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self.is_any = torch.zeros((), dtype=torch.bool, device=device)
-        self._seen = torch.zeros((), dtype=torch.bool, pin_memory=device.type == "cuda")
+        self._peak = torch.zeros(len(arrays["qpos"]), device=device)
+        self._counts: Int[Tensor, " count"] = torch.zeros(1 + len(self.totals), dtype=torch.int64, device=device)
+        self._seen = torch.zeros(self._counts.shape, dtype=torch.int64, pin_memory=device.type == "cuda")
         self._copied: torch.cuda.Event | None = None
 
-    def note_control(self, is_bad: Bool[Tensor, " env"] | Bool[Tensor, ""]) -> None:
-        """Note environments whose controls are not finite."""
-        self._has_bad_control |= is_bad
-
-    def update(self) -> None:
-        """Look for divergence, on the device."""
+    def look(self) -> None:
+        """Look for divergence after a physics step, on the device."""
         for name in ("qpos", "qvel"):
             if self._arrays[name].shape[1]:
-                # Where a number is not one, no comparison holds.
-                self._has_diverged |= ~(self._arrays[name].abs().amax(dim=1) < _LARGEST)
-        self.is_any.copy_((self.codes() != 0).any())
+                # Of what is no number, the maximum is none either.
+                torch.maximum(self._peak, self._arrays[name].abs().amax(dim=1), out=self._peak)
 
-    def clear(self, mask: Bool[Tensor, " env"]) -> None:
-        """Forget the faults of some environments."""
-        self._has_diverged &= ~mask
-        self._has_bad_control &= ~mask
+    def settle(self) -> Bool[Tensor, " env"]:
+        """Count faults that are new; return which environments have any of their own."""
+        self.note(DIVERGED, ~(self._peak < _LARGEST))
+        self._peak.zero_()
+        is_faulty = super().settle()
+        has_pool_fault = (self._arrays["overflow"] & _MASK) != 0
+        to_raise = (has_pool_fault | is_faulty) if self.on_fault == "raise" else has_pool_fault
+        self._counts.copy_(torch.cat([to_raise.any()[None].long(), self.totals]))
+        return is_faulty
 
-    def codes(self) -> Int[Tensor, " env"]:
-        """Return the faults of each environment as bits."""
-        own = (self._has_diverged.int() << _DIVERGED) | (self._has_bad_control.int() << _BAD_CONTROL)
-        return (self._arrays["overflow"] & _MASK) | own
+    def shown(self) -> tuple[bool, list[int]]:
+        """Return whether to raise, and the number of faults of each kind so far.
 
-    def have_shown(self) -> bool:
-        """Return whether there is any fault, without waiting for a GPU: there it may be seen a call or more later."""
-        if self.is_any.device.type == "cpu":
-            return bool(self.is_any)
+        A GPU is not waited for: there both are of an earlier call.
+        """
+        if self._counts.device.type == "cpu":
+            first, *totals = self._counts.tolist()
+            return bool(first), totals
         if self._copied is not None and not self._copied.query():
-            return False
-        has_shown = self._copied is not None and bool(self._seen)
+            return False, []
+        first, *totals = self._seen.tolist() if self._copied is not None else [0]
         self._copied = torch.cuda.Event()
-        self._seen.copy_(self.is_any, non_blocking=True)
-        self._copied.record(torch.cuda.current_stream(self.is_any.device))
-        return has_shown
+        self._seen.copy_(self._counts, non_blocking=True)
+        self._copied.record(torch.cuda.current_stream(self._counts.device))
+        return bool(first), totals
 
     def account(self, sizes: Mapping[str, int]) -> str:
         """Return what went wrong and where, in words; nothing if nothing did. It waits for a GPU.
@@ -94,18 +91,9 @@ class Faults:
         Args:
             sizes: Values for the pools' messages.
         """
-        codes = self.codes().cpu()
-        found: list[str] = []
-        if (envs := _where(codes, _BAD_CONTROL)) is not None:
-            found.append(f"control is not finite in environments {envs}; reset them to go on")
-        if (envs := _where(codes, _DIVERGED)) is not None:
-            found.append(f"environments {envs} diverged; reset them to go on")
+        found, overflow = self.accounts(), self._arrays["overflow"].cpu()
         for bit, text in POOLS.items():
-            if (envs := _where(codes, bit)) is not None:
-                found.append("MuJoCo Warp: " + text.format(envs=envs, **sizes))
+            envs = torch.nonzero((overflow >> bit) & 1).flatten().tolist()
+            if envs:
+                found.append("MuJoCo Warp: " + text.format(envs=listed([str(env) for env in envs]), **sizes))
         return "; ".join(found)
-
-
-def _where(codes: Int[Tensor, " env"], bit: int) -> str | None:
-    envs = torch.nonzero((codes >> bit) & 1).flatten().tolist()
-    return listed([str(env) for env in envs]) if envs else None

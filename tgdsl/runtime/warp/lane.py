@@ -61,6 +61,11 @@ class Lane:
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
 
+    @property
+    def is_capturing(self) -> bool:
+        """Whether torch is capturing a CUDA graph: a user's, into which work goes as it is."""
+        return self.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
+
     @contextlib.contextmanager
     def work(self) -> Iterator[None]:
         """Put what Warp and torch are told inside after all that torch has been told before, and before what comes then.
@@ -71,12 +76,26 @@ class Lane:
             if self._stream is None:
                 yield
                 return
+            # What Warp's own stream did before is in no graph that torch is capturing.
+            after_warp = not self.is_capturing
             self._stream.wait_stream(torch.cuda.current_stream(self.device))
             try:
-                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream):
+                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream, sync_enter=after_warp):
                     yield
             finally:
                 torch.cuda.current_stream(self.device).wait_stream(self._stream)
+
+    @contextlib.contextmanager
+    def work_in_capture(self) -> Iterator[None]:
+        """Put what Warp and torch are told inside into the graph that torch is capturing, and tell Warp of it."""
+        was_enabled = gc.isenabled()
+        gc.disable()
+        try:
+            with self.work(), self._warp.ScopedCapture(stream=self._warp_stream, external=True):
+                yield
+        finally:
+            if was_enabled:
+                gc.enable()
 
     def capture(self, body: Callable[[], T]) -> tuple[torch.cuda.CUDAGraph, T]:
         """Capture work without doing it; return the graph, and what the body returned: tensors that a replay fills.
@@ -136,6 +155,9 @@ class Replay(Generic[T]):
 
     def __call__(self) -> T:
         """Do the work; tensors that a replay returns are the same each time."""
+        if self._lane.is_capturing:
+            with self._lane.work_in_capture():
+                return self._body()
         if not self._lane.is_captured or self._eager_calls < _EAGER_CALLS:
             self._eager_calls += 1
             with self._lane.work():

@@ -138,13 +138,13 @@ def shared_model(scenes: SceneModels, inputs: Inputs) -> mujoco.MjModel:
     by its bounding box.
     """
     model = copy.copy(scenes.model({}))
+    lacking = {geom for geom in range(model.ngeom) if is_absent(model, geom)}
     for name, num_variants in zip(inputs.objects, inputs.num_variants, strict=True):
         for variant in range(num_variants):
             own = scenes.model({name: Choice(variant)})
             model.body_contype |= own.body_contype
             model.body_conaffinity |= own.body_conaffinity
-            for geom in range(own.ngeom):
-                if is_absent(model, geom) and not is_absent(own, geom):
-                    model.geom_contype[geom], model.geom_conaffinity[geom] = own.geom_contype[geom], own.geom_conaffinity[geom]
-                    model.geom_rgba[geom] = own.geom_rgba[geom]  # present from now on
+            for geom in [geom for geom in lacking if not is_absent(own, geom)]:
+                model.geom_contype[geom], model.geom_conaffinity[geom] = own.geom_contype[geom], own.geom_conaffinity[geom]
+                lacking.remove(geom)
     return model

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.plan import Inputs
+from tgdsl.runtime.joint_fields import JointPlaces
 from tgdsl.runtime.lookup import body_id
 from tgdsl.runtime.warp.contacts import PairContacts
 
@@ -23,17 +24,25 @@ SOURCES = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 class StateReader:
     """Gathers the fields of a state by index, on the device."""
 
-    def __init__(self, inputs: Inputs, model: mujoco.MjModel, sources: Mapping[str, Tensor], contacts: PairContacts):
+    def __init__(
+        self,
+        inputs: Inputs,
+        model: mujoco.MjModel,
+        sources: Mapping[str, Tensor],
+        kept: Mapping[str, Tensor],
+        contacts: PairContacts,
+    ):
         """Look up where everything is.
 
         Args:
             inputs: What the module wants.
             model: The scene.
-            sources: The arrays that `SOURCES` names, (env, …).
+            sources: The arrays that `SOURCES` names and those of `joints.FORCES`, (env, …).
+            kept: The arrays of joints and actuators at the state's instant, (env, …).
             contacts: The contacts that the module wants.
 
         Raises:
-            SimulationError: If the model lacks a body.
+            SimulationError: If the model lacks a body, a joint or an actuator.
         """
         self._fields = inputs.fields
         self._sources, self._contacts = sources, contacts
@@ -41,9 +50,14 @@ class StateReader:
         bodies = [body_id(model, name) for name in inputs.bodies]
         self._bodies = torch.tensor(bodies, dtype=torch.int64, device=device)
         self._roots = torch.tensor(model.body_rootid[bodies], dtype=torch.int64, device=device)
+        places = JointPlaces.of(inputs, model)
+        self._joints = {
+            name: ({**sources, **kept}[array], torch.from_numpy(places.by_array[array]).to(device))
+            for name, array in places.fields.items()
+        }
 
     def read(self) -> dict[str, Tensor]:
-        """Return the fields of a state that are poses, velocities or contacts, each a tensor of its own."""
+        """Return the fields of a state that are poses, velocities, contacts or joints, each a tensor of its own."""
         values: dict[str, Tensor] = {}
         if "body_pos" in self._fields:
             values["body_pos"] = self._sources["xpos"][:, self._bodies]
@@ -52,6 +66,7 @@ class StateReader:
         if "body_linvel" in self._fields or "body_angvel" in self._fields:
             values |= self._velocities()
         values |= self._contacts.read()
+        values |= {name: array[:, columns] for name, (array, columns) in self._joints.items()}
         return {name: value for name, value in values.items() if name in self._fields}
 
     def _velocities(self) -> dict[str, Float[Tensor, "env body 3"]]:

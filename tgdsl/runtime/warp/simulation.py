@@ -5,21 +5,22 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.env_ids import EnvIds, env_indices, env_mask
 from tgdsl.errors import SimulationError
 from tgdsl.module import TactileModule
-from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
+from tgdsl.runtime.faults import OnFault
 from tgdsl.runtime.lookup import keyframe_id
 from tgdsl.runtime.objects import Values
+from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.state_values import Rows, StateTable
 from tgdsl.runtime.warp.lane import Lane, Replay
 from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
@@ -28,13 +29,14 @@ from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.state import SceneState
 
 
-class WarpSimulation:
+class WarpSimulation(Simulation):
     """Environments in MuJoCo Warp, read by one module.
 
     It offers what `BatchSimulation` does, in float32, and everything `state` hands out is of one instant: after `step`, poses,
-    velocities and contacts are those at the start of the last substep. After `reset` they are those of the start. Contacts of a
-    pair come in any order; where there are more than slots, any of them are kept. Its solver stops at 1e-6 where MuJoCo's stops
-    at 1e-8: forces of sliding contacts agree to 3e-3 of the largest one, and to 2e-4 after
+    velocities and contacts are those at the start of the last substep. After `reset`, `set_state` and `forward` they are of
+    where the environments are. `qpos`, `qvel` and `ctrl` are live tensors in float32 on the physics' device. Contacts of a
+    pair come in any order; where there are more than slots, any of them are kept. Its solver stops at 1e-6 where MuJoCo's
+    stops at 1e-8: forces of sliding contacts agree to 3e-3 of the largest one, and to 2e-4 after
     `warp_model.opt.tolerance.fill_(1e-8)`; those of contacts that stick to 1e-5 either way.
 
     On a GPU nothing waits for it unless the host's own numbers are handed in or asked for. What goes wrong there is therefore
@@ -65,6 +67,7 @@ class WarpSimulation:
         per_env: Sequence[str] = (),
         device: str = "cuda",
         graph: bool = True,
+        on_fault: OnFault = "raise",
     ):
         """Start all environments.
 
@@ -80,17 +83,18 @@ class WarpSimulation:
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
+            on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step`
+                raise until they are reset; "reset" starts them anew, in the simulator and in the module, counts them in
+                `fault_counts` and warns once. On a GPU that is done there, without waiting, and each `state` then evaluates
+                all environments once more. Pools that are too small raise either way.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
             SimulationError: If the model lacks a body or the keyframe, holds something that MuJoCo Warp does
-                not support, if there is nothing to step, or no such device or library.
+                not support, if there is nothing to step, no such device or library, or if the module's state is another
+                simulation's or of other environments.
         """
-        if num_envs < 1 or substeps < 1:
-            raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
-        if model is not None and touch.inputs.objects:
-            what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
-            raise SimulationError(f"{what}; leave `model` out")
+        refuse_unfit(touch, num_envs, substeps, model)
         self._touch, self.substeps = touch, substeps
         self._lane = Lane(device, graph)
         self._objects: WorldObjects | None = None
@@ -109,25 +113,25 @@ class WarpSimulation:
             nconmax=nconmax,
             njmax=njmax,
             per_env=list(dict.fromkeys([*per_env, *(OWN_FIELDS if self._objects else ())])),
+            on_fault=on_fault,
         )
+        self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
+        with self._lane.work():
+            self._table = StateTable(model, self._arrays)
         if self._objects is not None:
             self._objects.tell(self._worlds)
-        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.contacts)
+        self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
         self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
         self._substep = Replay(self._lane, lambda: self._worlds.step(1))
         self._step_and_read = Replay(self._lane, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
+        claim(touch, self)
         self.reset()
 
     @property
     def num_envs(self) -> int:
         """Number of environments."""
         return int(self._worlds.data.nworld)
-
-    @property
-    def control_step(self) -> float:
-        """Duration of one control step [s]."""
-        return self.substeps * float(self.model.opt.timestep)
 
     @property
     def arrays(self) -> Mapping[str, Tensor]:
@@ -149,50 +153,13 @@ class WarpSimulation:
         """MuJoCo Warp's data."""
         return self._worlds.data
 
-    def step(self, control: Tensor | np.ndarray | None = None) -> None:
-        """Advance all environments by one control step.
-
-        Args:
-            control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on the GPU
-                are checked there.
-
-        Raises:
-            SimulationError: If the controls are not finite or do not fit, an environment has diverged, or a pool was too small:
-                on a GPU as soon as that is known. The other environments have then made their step.
-        """
-        self._set_control(control)
-        self._step()
-        self._finish_step()
-
-    def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and hand out the state after each of its physics steps.
-
-        For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
-        simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps.
-
-        Args:
-            control: Actuator controls, as for `step`; they are set when the first state is asked for.
-
-        Yields:
-            What `state` returns after each physics step; its `dt` is that of one physics step.
-
-        Raises:
-            SimulationError: As `step` does.
-        """
-        self._set_control(control)
-        for _ in range(self.substeps):
-            self._substep()
-            self._finish_step()
-            yield self._state(float(self.model.opt.timestep)).to(self._touch.device)
-
     def step_and_read(self, control: Tensor | np.ndarray | None = None) -> dict[str, Tensor]:
         """Advance by one control step and return the module's readings: on a GPU all in one CUDA graph.
 
         It is `step(control)` and then `touch(state())`, without gradients, and for the price of one launch. As with any CUDA
         graph, the next call overwrites the readings; `clone` what is to be kept. The first two calls run eagerly, the third
         captures; the graph is captured anew when the module holds other tensors than before: when it was moved, compiled,
-        seeded or given another dt. A module that stacks or averages its last calls counts them on the host: it reads after the
-        graph, not in it.
+        freed, or given another dt.
 
         Args:
             control: As for `step`.
@@ -202,20 +169,17 @@ class WarpSimulation:
         """
         if self._touch.device != self._lane.device:
             raise SimulationError(f"the module is on {self._touch.device}, physics on {self._lane.device}; expected one device")
-        if len(self._touch.histories):
-            self.step(control)
-            with torch.no_grad():
-                return self._touch(self.state())
         self._forget_other_tensors()
-        self._set_control(control)
+        self._begin_step(control)
         readings = self._step_and_read()
-        self._finish_step()
+        self._touch.hand_out(readings)
+        self._finish_step(is_evaluated=True)
         return readings
 
-    def state(self) -> SceneState:
-        """Return what the module wants, of one instant, in float32 on the module's device."""
-        self._worlds.refresh()
-        return self._state(self.control_step).to(self._touch.device)
+    def forward(self, env_ids: EnvIds | None = None) -> None:
+        """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
+        self._refuse_if_closed()
+        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._lane.device))
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -226,18 +190,6 @@ class WarpSimulation:
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment, its objects as they are there; `parameters` are not in it."""
         return self.model if self._objects is None else self._objects.env_model(env)
-
-    def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start some environments anew (default: all), in the simulator and in the module.
-
-        A boolean mask on the physics' device is used as it is; with indices there, the host waits to look at them.
-
-        Raises:
-            SimulationError: If there are no such environments.
-        """
-        mask = env_mask(env_ids, self.num_envs, self._lane.device)
-        self._worlds.reset(mask)
-        self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
     def set_objects(
         self,
@@ -290,31 +242,43 @@ class WarpSimulation:
 
     def _physics_and_touch(self) -> dict[str, Tensor]:
         self._worlds.step(self.substeps)
-        return self._touch(self._state(self.control_step))
+        if self._faults.on_fault == "reset":
+            self._touch.reset(self._faults.restarted)
+            self._worlds.evaluate_stale()
+        return self._touch(self._read(self.control_step))
 
     def _state(self, dt: float) -> SceneState:
+        self._worlds.refresh()
+        return self._read(dt).to(self._touch.device)
+
+    def _read(self, dt: float) -> SceneState:
         values: dict[str, Any] = dict(self._reader.read())
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         values["dt"] = dt
         return SceneState(**{name: value for name, value in values.items() if name in self._touch.inputs.fields})
 
-    def _set_control(self, control: Tensor | np.ndarray | None) -> None:
-        """Take controls over.
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+        mask = env_mask(env_ids, self.num_envs, self._lane.device)
+        self._worlds.reset(mask, rows)
+        self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
-        Raises:
-            SimulationError: If they do not fit, or are the host's and not finite.
-        """
-        if control is None:
+    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
+        self._worlds.put(env_mask(env_ids, self.num_envs, self._lane.device), rows)
+
+    def _advance(self, num_steps: int) -> None:
+        (self._step if num_steps == self.substeps else self._substep)()
+        if self._faults.on_fault == "reset":
+            self._touch.reset(self._faults.restarted.to(self._touch.device))
+        self._finish_step()
+
+    def _finish_step(self, is_evaluated: bool = False) -> None:
+        self._worlds.stepped(is_evaluated)
+        if self._lane.is_capturing:
             return
-        values = control_tensor(control, self.num_envs, self.model.nu)
-        if values.device.type == "cpu":
-            refuse_unfinite(values)
-        else:
-            self._worlds.faults.note_control(is_unfinite(values).to(self._lane.device))
-        self._worlds.arrays["ctrl"].copy_(values)
-
-    def _finish_step(self) -> None:
-        self._worlds.stepped()
-        if self._worlds.faults.have_shown():
+        self._touch.slot_watch.warn()
+        to_raise, totals = self._worlds.faults.shown()
+        if to_raise:
             self.check()
+        if self._faults.on_fault == "reset":
+            self._faults.warn_once(totals)

@@ -16,16 +16,15 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan import Inputs
+from tgdsl.runtime.faults import BAD_VALUES
+from tgdsl.runtime.joint_fields import FORCES, JointPlaces
+from tgdsl.runtime.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
 from tgdsl.runtime.warp.reading import SOURCES
 
-INTEGRATED = (
-    *("time", "qpos", "qvel", "act", "history", "qacc_warmstart", "ctrl", "qfrc_applied", "xfrc_applied", "eq_active"),
-    *("mocap_pos", "mocap_quat", "userdata"),
-)
-"""What the future of an environment follows from: MuJoCo's `mjSTATE_INTEGRATION`."""
+_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat")
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
 """Contacts per environment that there is room for, unless said otherwise."""
@@ -39,6 +38,7 @@ class Worlds:
         data: MuJoCo Warp's data.
         arrays: Live tensors of `data`, (env, …): what is integrated, what a state is read from, `geom_xpos` and `geom_xmat`.
         parameters: Live tensors of those fields of `model` that environments have of their own, (env, …).
+        kept: Those of `qpos`, `qvel` and `ctrl` that the module wants, at the instant of poses and contacts.
         contacts: The contacts that the module wants.
         faults: What has gone wrong.
     """
@@ -54,6 +54,7 @@ class Worlds:
         nconmax: int | None = None,
         njmax: int | None = None,
         per_env: Sequence[str] = (),
+        on_fault: str = "raise",
     ):
         """Put model and data on the device, all environments at the start.
 
@@ -66,6 +67,7 @@ class Worlds:
             nconmax: Room for contacts per environment; all environments share it.
             njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts make.
             per_env: Fields of the model that environments have of their own.
+            on_fault: What becomes of environments with a fault of their own.
 
         Raises:
             SimulationError: If MuJoCo Warp does not support something of the model, a field cannot differ, or the model lacks a
@@ -89,19 +91,22 @@ class Worlds:
             # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
-            names = (*INTEGRATED, *SOURCES, *_WATCHED, "geom_xpos", "geom_xmat")
+            joints = JointPlaces.of(inputs, model)
+            names = (*INTEGRATED, *_DERIVED, *_WATCHED, *FORCES.values())
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
+            self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
+            self._forces = tuple(array for name, array in joints.fields.items() if name in FORCES)
             self.contacts = PairContacts(inputs, model, num_envs, lane.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
             self._is_reset = torch.zeros_like(self._is_stale)
-        self._has_stale = True
-        self.faults = Faults(self.arrays)
-        self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self._evaluate_stale)
+            self.faults = Faults(self.arrays, on_fault)
+        self._has_stale, self._lane = True, lane
+        self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self.evaluate_stale)
 
     def step(self, num_steps: int) -> None:
-        """Advance all environments by some physics steps: work for a `Replay`.
+        """Advance all environments by some physics steps, and start those anew that shall not wait: work for a `Replay`.
 
         Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
         some of them remember earlier steps.
@@ -111,29 +116,85 @@ class Worlds:
         try:
             for i in reversed(range(num_steps)):
                 self.model.opt.disableflags = idle if i else whole
+                if not i:
+                    for name, kept in self.kept.items():
+                        kept.copy_(self.arrays[name])
                 self._mjw.step(self.model, self.data)
+                self.faults.look()
         finally:
             self.model.opt.disableflags = whole
         # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
         self.contacts.update(self.model, self.data)
         self._is_stale.zero_()
-        self.faults.update()
+        is_faulty = self.faults.settle()
+        if self.faults.on_fault == "reset":
+            self._is_reset.copy_(is_faulty)
+            self._restart()
+            self.faults.note_restarted(is_faulty)
 
-    def stepped(self) -> None:
-        """Take note, on the host, that all environments have been stepped."""
-        self._has_stale = False
+    def stepped(self, is_evaluated: bool = False) -> None:
+        """Take note, on the host, that all environments have been stepped.
 
-    def reset(self, mask: Bool[Tensor, " env"]) -> None:
-        """Start some environments anew. Their poses and contacts are evaluated when they are next asked for."""
+        Args:
+            is_evaluated: Whether those that were started anew have been evaluated; which these are, only the device knows.
+        """
+        self._has_stale = self.faults.on_fault == "reset" and not is_evaluated
+        self._evaluate_if_captured()
+
+    def reset(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Start some environments anew, with values. Their poses and contacts are evaluated when they are next asked for."""
         self._is_reset.copy_(mask)
         self._reset()
+        self.put(mask, rows)
+
+    def put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
+        """Put values into the state of some environments; those that cannot be used are left out and noted."""
+        with torch.no_grad():
+            is_put = mask
+            if rows.is_bad is not None:
+                is_put = mask & ~rows.is_bad
+                self.faults.note(BAD_VALUES, mask & rows.is_bad)
+            for name, values in rows.values.items():
+                array = self.arrays[name]
+                if array.numel():
+                    array.copy_(torch.where(_like(is_put, array), values, array))
+        self.make_stale(mask)
+
+    def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
+        """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
+        self._is_stale |= mask
         self._has_stale = True
+        self._evaluate_if_captured()
 
     def refresh(self) -> None:
-        """Evaluate poses, velocities and contacts of the environments that have been reset since the last step."""
-        if self._has_stale:
+        """Evaluate poses, velocities and contacts of the environments that are elsewhere than at the last evaluation."""
+        if not self._has_stale:
+            return
+        if self._is_stale.is_cuda or self._is_stale.any():
             self._refresh()
-            self._has_stale = False
+        self._has_stale = False
+
+    def _evaluate_if_captured(self) -> None:
+        """Evaluate at once in a graph that is being captured: what the host notes now, it does not when this is replayed."""
+        if self._lane.is_capturing:
+            self.refresh()
+
+    def evaluate_stale(self) -> None:
+        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant.
+
+        It is work for a `Replay`.
+        """
+        arrays = {name: self.arrays[name] for name in (*_DERIVED, *self._forces, "history")} | self.contacts.arrays
+        earlier = {name: array.clone() for name, array in arrays.items()}
+        self._mjw.forward(self.model, self.data)
+        self.contacts.update(self.model, self.data)
+        for name, before in earlier.items():
+            array = arrays[name]
+            if array.numel():
+                array.copy_(torch.where(_like(self._is_stale, array), array, before))
+        for name, kept in self.kept.items():
+            kept.copy_(torch.where(_like(self._is_stale, kept), self.arrays[name], kept))
+        self._is_stale.zero_()
 
     def forget_graphs(self) -> None:
         """Capture anew at the next calls."""
@@ -169,18 +230,6 @@ class Worlds:
                 array.copy_(torch.where(_like(self._is_reset, array), start, array))
         self.faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
-
-    def _evaluate_stale(self) -> None:
-        """Evaluate all environments where they are now, then give those that are not stale back their earlier instant."""
-        arrays = {name: self.arrays[name] for name in SOURCES} | self.contacts.arrays
-        kept = {name: array.clone() for name, array in arrays.items()}
-        self._mjw.forward(self.model, self.data)
-        self.contacts.update(self.model, self.data)
-        for name, before in kept.items():
-            array = arrays[name]
-            if array.numel():
-                array.copy_(torch.where(_like(self._is_stale, array), array, before))
-        self._is_stale.zero_()
 
 
 def check_supported(model: mujoco.MjModel) -> None:

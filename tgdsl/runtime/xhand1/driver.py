@@ -21,7 +21,9 @@ from tgdsl.runtime.xhand1.replies import Addresses
 from tgdsl.runtime.xhand1.serial_port import Port, open_serial_port
 
 MAX_AGE_S = 0.1
+"""Readings that are older are not handed out [s], unless replies may take longer."""
 READ_TIMEOUT_S = 0.08
+"""How long a call waits for a new reading [s], unless replies may take longer."""
 _PATIENCE_S = 1.0
 _CLOSE_TIMEOUT_S = 5.0
 
@@ -52,11 +54,13 @@ class XHand1:
     last command is not published.
     """
 
-    def __init__(self, reader: HandReader, max_age_s: float, patience_s: float):
+    def __init__(self, reader: HandReader, timing: LinkTiming, max_age_s: float | None = None):
         """Take over a reader that runs; use `open`."""
         self._reader = reader
-        self._max_age_s = max_age_s
-        self._patience_s = patience_s
+        two_replies_s = 2 * timing.reply_timeout_s
+        self._max_age_s = max(MAX_AGE_S, two_replies_s) if max_age_s is None else max_age_s
+        self._read_timeout_s = max(READ_TIMEOUT_S, two_replies_s)
+        self._patience_s = _PATIENCE_S + 2 * two_replies_s  # three requests for the version, and another
         self._handed_out = 0
         atexit.register(self._leave)
 
@@ -68,7 +72,7 @@ class XHand1:
         *,
         motion: MotionLimits | None = None,
         timing: LinkTiming | None = None,
-        max_age_s: float = MAX_AGE_S,
+        max_age_s: float | None = None,
         open_port: Callable[[str, int], Port] = open_serial_port,
     ) -> XHand1:
         """Open a hand and wait for its first reading.
@@ -78,7 +82,7 @@ class XHand1:
             addresses: Which hand; default: the one with id 0.
             motion: Leave to move it; default: none.
             timing: Times of the line.
-            max_age_s: Readings older than this are not handed out [s].
+            max_age_s: Readings older than this are not handed out [s]; default: 0.1 s, or as long as two replies may take.
             open_port: Opens a port, given its name and baud rate.
 
         Raises:
@@ -93,11 +97,10 @@ class XHand1:
 
         reader = HandReader(connect(LinkCounters()), connect, Motion(motion) if motion else None)
         reader.start()
-        patience = _PATIENCE_S + 4 * timing.reply_timeout_s  # three requests for the version, and another
-        hand = cls(reader, max_age_s, patience)
+        hand = cls(reader, timing, max_age_s)
         try:
             with reader.changed:
-                reader.changed.wait_for(lambda: reader.reading or reader.ended, patience)
+                reader.changed.wait_for(lambda: reader.reading or reader.ended, hand._patience_s)
                 if reader.reading is None:
                     raise hand._why_no_reading()
         except BaseException:
@@ -105,20 +108,20 @@ class XHand1:
             raise
         return hand
 
-    def read(self, timeout_s: float = READ_TIMEOUT_S) -> Reading:
+    def read(self, timeout_s: float | None = None) -> Reading:
         """Return the newest reading, one that was not handed out before; wait for it if need be.
 
         Args:
-            timeout_s: How long to wait [s].
+            timeout_s: How long to wait [s]; default: 0.08 s, or as long as two replies may take.
 
         Raises:
             HandError: What kept a new reading from coming, by name: `HandTimeoutError`, `HandChecksumError`,
                 `HandDisconnectedError` and so on; `StaleReadingError` if nothing failed but none came in time.
             HandClosedError: If the hand was closed.
         """
-        reader = self._reader
+        reader, wait_s = self._reader, self._read_timeout_s if timeout_s is None else timeout_s
         with reader.changed:
-            reader.changed.wait_for(lambda: self._is_new(reader.reading) or reader.ended, timeout_s)
+            reader.changed.wait_for(lambda: self._is_new(reader.reading) or reader.ended, wait_s)
             if reader.ended is not None:
                 raise reader.ended
             reading = reader.reading

@@ -12,9 +12,10 @@ from torch import Tensor
 from tgdsl.env_ids import EnvIds
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import MAX_AGE_S, XHand1
+from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand
 from tgdsl.runtime.xhand1.emulator import Emulator
+from tgdsl.runtime.xhand1.errors import WatchdogError
 from tgdsl.runtime.xhand1.link import LinkTiming
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.simulated_body import Lockstep, SimulatedBody
@@ -55,16 +56,15 @@ class EmulatedSource(XHand1Source):
         Raises:
             HandError: If the hand does not answer.
         """
+        self._is_lockstep = lockstep
         with ExitStack() as opened:
             opened.callback(body.close)
             emulator = opened.enter_context(Emulator(EmulatedHand(body=body)))
-            timing = PATIENT if timing is None else timing
-            patience = max(MAX_AGE_S, 2 * timing.reply_timeout_s)
-            hand = opened.enter_context(XHand1.open(emulator.device, motion=motion, timing=timing, max_age_s=patience))
+            hand = opened.enter_context(XHand1.open(emulator.device, motion=motion, timing=timing or PATIENT))
             if not lockstep:
                 body.run()
             pace = Lockstep(body) if lockstep else None
-            super().__init__(hand, control_step=control_step, calibration=calibration, pace=pace, read_timeout_s=patience)
+            super().__init__(hand, control_step=control_step, calibration=calibration, pace=pace)
             self.emulator, self.body = emulator, body
             self._opened = opened.pop_all()
         self._told = False
@@ -74,11 +74,12 @@ class EmulatedSource(XHand1Source):
 
         Raises:
             SimulationError: If the simulation ended, as it diverged.
-            HandError: As with a real hand.
+            HandError: As with a real hand, or if the emulator ended.
         """
-        super().step(control)
-        if self.body.failure is not None:
-            raise SimulationError(f"the emulated hand's simulation ended: {self.body.failure}") from self.body.failure
+        try:
+            super().step(control)
+        finally:
+            self._look_for_failures()
         if self.body.clipped and not self._told:
             self._told = True
             who = ", ".join(sorted(self.body.clipped))
@@ -89,15 +90,43 @@ class EmulatedSource(XHand1Source):
         """Make the hand passive, then start the scene anew.
 
         Raises:
-            HandError: If no new reading comes.
+            SimulationError: If the simulation ended, as it diverged.
+            HandError: If no new reading comes, or the emulator ended.
         """
         if env_ids is not None and not is_chosen(env_ids):
             return
+        try:
+            self._start_anew()
+        finally:
+            self._look_for_failures()
+
+    def _start_anew(self) -> None:
         super().reset()
         self._read(time.monotonic())  # the command of this one was made after the hand was told to be passive
         self.body.reset()
         self._velocity.reset()
         self._sample = self._read(time.monotonic())
+
+    def _look_for_failures(self) -> None:
+        """Raise what ended one of the threads, in the place of what follows from it.
+
+        Raises:
+            SimulationError: If the simulation ended.
+            HandError: If the emulator ended.
+        """
+        if self.body.failure is not None:
+            raise SimulationError(f"the emulated hand's simulation ended: {self.body.failure}") from self.body.failure
+        self.emulator.check()
+
+    def _command(self) -> None:
+        """Repeat the step's command; where nothing runs in real time, a caller who took long to give it is not late."""
+        try:
+            super()._command()
+        except WatchdogError:
+            if not self._is_lockstep:
+                raise
+            self.hand.resume()
+            super()._command()
 
     def close(self) -> None:
         """Close the hand, pull the plug and end the simulation."""

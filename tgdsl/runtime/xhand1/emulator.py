@@ -12,20 +12,18 @@ import time
 import tty
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from concurrent.futures import Future
 from pathlib import Path
 from types import TracebackType
 
 from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulated_wire import EmulatedWire
 from tgdsl.runtime.xhand1.errors import HandError
-from tgdsl.runtime.xhand1.faulty_line import Faults, FaultyLine
-from tgdsl.runtime.xhand1.parser import FrameParser
-from tgdsl.runtime.xhand1.protocol import HAND_ADDRESS, OVERHEAD, Frame, encode_frame
+from tgdsl.runtime.xhand1.faulty_line import Faults
+from tgdsl.runtime.xhand1.protocol import Frame
 from tgdsl.runtime.xhand1.serial_port import BAUD
 
 _IDLE_S = 0.05
-_KEPT_REQUESTS = 20_000
-_CALL_TIMEOUT_S = 10.0
 
 
 class Emulator:
@@ -33,9 +31,8 @@ class Emulator:
 
     Attributes:
         device: The serial port's name. It stays the same when the hand is unplugged and plugged in again.
-        hand: The hand.
-        requests: The latest requests that arrived, with the time of `time.monotonic` [s].
         num_lost_bytes: Bytes that nobody read in time.
+        failure: What ended its thread; None if nothing did. The port is then gone, and every call says why.
     """
 
     def __init__(
@@ -56,30 +53,37 @@ class Emulator:
             turnaround_s: Time from a request's last byte to the reply's first [s].
             seed: Seed of the faults.
         """
-        self.hand = hand or EmulatedHand()
-        self.requests: deque[tuple[float, Frame]] = deque(maxlen=_KEPT_REQUESTS)
         self.num_lost_bytes = 0
-        self._second_hand = EmulatedHand((self.hand.address ^ 1) - HAND_ADDRESS)
-        self._line = FaultyLine(baud, faults or Faults(), seed)
-        self._turnaround_s = turnaround_s
-        self._parser = FrameParser()
+        self.failure: Exception | None = None
+        self._wire = EmulatedWire(hand or EmulatedHand(), faults or Faults(), baud, turnaround_s, seed)
         self._folder = tempfile.TemporaryDirectory(prefix="xhand1-")
         self.device = str(Path(self._folder.name) / "ttyXHAND1")
         self._ends: tuple[int, int] | None = None
-        self._calls: queue.SimpleQueue[tuple[Callable[[], None], threading.Event]] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = queue.SimpleQueue()
+        self._calling = threading.Lock()
         self._wake_read, self._wake_write = os.pipe()
-        self._is_running = True
+        self._is_running = self._is_serving = True
         self._plug()
         self._thread = threading.Thread(target=self._run, name="xhand1-emulator", daemon=True)
         self._thread.start()
 
+    @property
+    def hand(self) -> EmulatedHand:
+        """The hand."""
+        return self._wire.hand
+
+    @property
+    def requests(self) -> deque[tuple[float, Frame]]:
+        """The latest requests that arrived, with the time of `time.monotonic` [s]."""
+        return self._wire.requests
+
     def set_faults(self, faults: Faults) -> None:
         """Let other faults strike from now on."""
-        self._call(lambda: setattr(self._line, "faults", faults))
+        self._call(lambda: setattr(self._wire.line, "faults", faults))
 
     def fault_counts(self) -> dict[str, int]:
         """Return how often each fault has struck, by its name."""
-        return dict(self._line.counts)
+        return dict(self._wire.line.counts)
 
     def unplug(self) -> None:
         """Pull the cable: the port goes away, and what is on its way is lost."""
@@ -89,15 +93,31 @@ class Emulator:
         """Plug it in again: the port is there under the same name. The hand was on all the time."""
         self._call(self._plug)
 
+    def check(self) -> None:
+        """Look whether the emulator still answers.
+
+        Raises:
+            HandError: If its thread has ended, and why.
+        """
+        if self.failure is not None:
+            raise self._ended()
+
     def close(self) -> None:
-        """Switch the hand off and remove the port."""
+        """Switch the hand off and remove the port.
+
+        Raises:
+            HandError: If the emulator's thread had ended before, and why.
+        """
         if self._is_running:
-            self._call(self._stop)
+            with contextlib.suppress(HandError):
+                self._call(self._stop)
+            self._is_running = False
             self._thread.join()
             self._unplug()
             for end in (self._wake_read, self._wake_write):
                 os.close(end)
             self._folder.cleanup()
+            self.check()
 
     def __enter__(self) -> Emulator:
         return self
@@ -106,19 +126,25 @@ class Emulator:
         self.close()
 
     def _call(self, call: Callable[[], None]) -> None:
-        """Run something in the emulator's thread and wait until it is done.
+        """Run something in the emulator's thread, wait until it is done, and raise what it raises.
 
         Raises:
-            HandError: If it is not done in time.
+            HandError: If the thread has ended, or ends before it is done, and why.
         """
-        done = threading.Event()
-        self._calls.put((call, done))
+        done: Future[None] = Future()
+        with self._calling:
+            self.check()
+            self._calls.put((call, done))
         os.write(self._wake_write, b"!")
-        if not done.wait(_CALL_TIMEOUT_S):
-            raise HandError(f"the emulator did not do within {_CALL_TIMEOUT_S:g} s what it was told; its thread may have ended")
+        done.result()
+
+    def _ended(self) -> HandError:
+        error = HandError(f"the emulator's thread ended: {self.failure!r}")
+        error.__cause__ = self.failure
+        return error
 
     def _stop(self) -> None:
-        self._is_running = False
+        self._is_serving = False
 
     def _plug(self) -> None:
         if self._ends is None:
@@ -134,43 +160,42 @@ class Emulator:
             for end in self._ends:
                 os.close(end)
             self._ends = None
-            self._line.clear()
-            self._parser = FrameParser()
+            self._wire.cut()
 
     def _run(self) -> None:
-        while self._is_running:
-            next_due = self._line.next_due()
+        try:
+            self._serve()
+        except Exception as error:
+            with self._calling:
+                self.failure = error
+            self._unplug()
+            while not self._calls.empty():
+                self._calls.get()[1].set_exception(self._ended())
+
+    def _serve(self) -> None:
+        while self._is_serving:
+            next_due = self._wire.next_due()
             wait = _IDLE_S if next_due is None else max(next_due - time.monotonic(), 0.0)
             watched = [self._wake_read] if self._ends is None else [self._wake_read, self._ends[0]]
             ready = select.select(watched, [], [], min(wait, _IDLE_S))[0]
             if self._ends is not None and self._ends[0] in ready:
                 self._listen(self._ends[0])
-            if self._ends is not None and (data := self._line.due(time.monotonic())):
+            if self._ends is not None and (data := self._wire.due(time.monotonic())):
                 self._speak(self._ends[0], data)
             if self._wake_read in ready:
                 os.read(self._wake_read, 1)
                 call, done = self._calls.get()
-                call()
-                done.set()
+                try:
+                    call()
+                    done.set_result(None)
+                except Exception as error:
+                    done.set_exception(error)
 
     def _listen(self, end: int) -> None:
         data = b""
         with contextlib.suppress(OSError):
             data = os.read(end, 65536)
-        now = time.monotonic()
-        for frame in self._parser.feed(data):
-            self.requests.append((now, frame))
-            if self._line.strikes("silence"):
-                continue
-            arrived_at = now + self._line.wire_time(OVERHEAD + len(frame.payload))
-            if (reply := self.hand.answer(frame, arrived_at)) is not None:
-                self._line.send(encode_frame(reply), self._foreign(frame, arrived_at), arrived_at + self._turnaround_s)
-
-    def _foreign(self, frame: Frame, now: float) -> bytes:
-        """Return what a second hand would reply, if the line ever lets it."""
-        own = replace(frame, destination=self._second_hand.address)
-        reply = self._second_hand.answer(own, now) if self._line.faults.foreign else None
-        return b"" if reply is None else encode_frame(reply)
+        self._wire.hear(data, time.monotonic())
 
     def _speak(self, end: int, data: bytes) -> None:
         try:

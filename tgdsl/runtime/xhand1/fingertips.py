@@ -1,4 +1,4 @@
-"""Which observations a hand can give, and from which of its fingertips: looked at before the hand is touched."""
+"""Which observations a hand can give, and from which of its fingertips and joints: looked at before the hand is touched."""
 
 from __future__ import annotations
 
@@ -8,13 +8,18 @@ from dataclasses import dataclass
 from tgdsl.errors import ObservationError
 from tgdsl.observations import HAND_ONLY
 from tgdsl.plan import Plan, PlannedObservation, PlannedSensor
-from tgdsl.runtime.xhand1.payloads import FINGERS
+from tgdsl.proprioception import QUANTITIES
+from tgdsl.runtime.xhand1.controls import JointControls
+from tgdsl.runtime.xhand1.errors import MotionError
+from tgdsl.runtime.xhand1.payloads import FINGERS, JOINTS
+from tgdsl.scene import scene_model
 
 TIP_BODIES = ("thumb_rota_link2", "index_rota_link2", "mid_link2", "ring_link2", "pinky_link2")
 """The fingertips' bodies, without the `right_hand_` or `left_hand_` that they have in robot files."""
 _GIVES = (
     "it can give: none, agg_force and agg_bool of sensors whose links are fingertips, one per finger "
-    f"(bodies {', '.join(f'*_hand_{name}' for name in TIP_BODIES)}), taxel_counts, taxel_saturated"
+    f"(bodies {', '.join(f'*_hand_{name}' for name in TIP_BODIES)}), "
+    "joint_pos and joint_vel of its own joints, last_action, taxel_counts, taxel_saturated"
 )
 _KEPT = ("stack", "last")
 
@@ -29,6 +34,7 @@ class HandTerm:
         axes: Axes of an aggregate force, in order.
         steps: How many control steps are stacked, the oldest first.
         period: Time between samples [s]; 0: one at every control step.
+        joints: Joints that it is of, by the hand's ids; of a `last_action`, those whose actuators it is of.
     """
 
     planned: PlannedObservation
@@ -36,6 +42,7 @@ class HandTerm:
     axes: tuple[int, ...] = ()
     steps: int = 1
     period: float = 0.0
+    joints: tuple[int, ...] = ()
 
     @property
     def label(self) -> str:
@@ -43,12 +50,13 @@ class HandTerm:
         return _label(self.planned)
 
 
-def hand_terms(plan: Plan, contact_threshold: float | None) -> tuple[HandTerm, ...]:
+def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False) -> tuple[HandTerm, ...]:
     """Return the observations of a plan as a hand gives them.
 
     Args:
         plan: The plan.
         contact_threshold: Force above which a fingertip is in contact, if it is known.
+        is_log: Whether the hand is a recorded one, which does not say what it was told.
 
     Raises:
         ObservationError: If a hand cannot give some: all of them, each with its reason, and what it can give.
@@ -56,7 +64,8 @@ def hand_terms(plan: Plan, contact_threshold: float | None) -> tuple[HandTerm, .
     found, problems = [], []
     for planned in plan.observations:
         try:
-            found.append(_hand_term(plan, planned, contact_threshold))
+            is_joint = planned.type in QUANTITIES
+            found.append(_joint_term(plan, planned, is_log) if is_joint else _hand_term(plan, planned, contact_threshold))
         except ObservationError as error:
             problems.append(f"  {_label(planned)}: {error}")
     if problems:
@@ -66,7 +75,7 @@ def hand_terms(plan: Plan, contact_threshold: float | None) -> tuple[HandTerm, .
 
 def warn_of_noise(plan: Plan) -> None:
     """Warn that the noise of sensors that are observed is not added to what a real hand says."""
-    observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading is not None]
+    observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading not in (None, *QUANTITIES)]
     noisy = sorted({sensor.sensor for sensor in observed if sensor.noise is not None})
     if noisy:
         what = f"the noise of {', '.join(noisy)} is that of a simulated sensor"
@@ -79,7 +88,7 @@ def finger_of(body: str) -> int | None:
 
 
 def _label(planned: PlannedObservation) -> str:
-    of = f" of {planned.reading}" if planned.reading is not None else ""
+    of = f" of {planned.reading}" if planned.reading not in (None, *QUANTITIES) else ""
     return f"{planned.group}[{planned.index}] {planned.type}{of}"
 
 
@@ -97,6 +106,33 @@ def _hand_term(plan: Plan, planned: PlannedObservation, contact_threshold: float
         raise ObservationError(f"`history` with `reduce: {sensor.history.reduce}` is not done; expected {' or '.join(_KEPT)}")
     steps = sensor.history.length if sensor.history is not None and sensor.history.reduce == "stack" else 1
     return HandTerm(planned, fingers, tuple("xyz".index(axis) for axis in planned.axes), steps, sensor.period)
+
+
+def _joint_term(plan: Plan, planned: PlannedObservation, is_log: bool) -> HandTerm:
+    """Return an observation of the hand's joints, or of what they were last told."""
+    if planned.type == "joint_effort":
+        raise ObservationError("it reports each drive's current as a raw number, and no torque")
+    if planned.type == "last_action" and is_log:
+        raise ObservationError("a log does not hold what the hand was told")
+    rows = plan.inputs.actuators if planned.type == "last_action" else plan.inputs.joints
+    if planned.constants:
+        rows = tuple(rows[i] for i in plan.arrays[f"observations/{planned.group}/{planned.index}/rows"])
+    if planned.type != "last_action":
+        return HandTerm(planned, joints=tuple(_joint_of(name) for name in rows))
+    model = scene_model(plan.scene)
+    try:
+        actuator_id = JointControls.of_model(model).actuator_id.tolist()
+    except MotionError as error:
+        raise ObservationError(str(error)) from error
+    return HandTerm(planned, joints=tuple(actuator_id.index(model.actuator(name).id) for name in rows))
+
+
+def _joint_of(name: str) -> int:
+    """Return which of the hand's joints one of the robot file is."""
+    found = [i for i, joint in enumerate(JOINTS) if name == joint or name.endswith(f"_hand_{joint}")]
+    if not found:
+        raise ObservationError(f'it has no joint "{name}"')
+    return found[0]
 
 
 def _fingers(plan: Plan, sensor: PlannedSensor) -> tuple[int, ...]:

@@ -4,21 +4,27 @@
 summed depth to that unit. `agg_bool` is whether that force is larger than the calibration's `contact_threshold`, where the
 simulation counts taxels. A sensor's `rate` and `history` are kept as the module keeps them; its noise is not added.
 
-Shapes: `env` one, `finger` and `taxel` as in `payloads`, `feature` numbers of an observation.
+`joint_pos` is what the hand says, `joint_vel` its difference in time (see `velocity`). `last_action` is what the policy last
+gave, whether or not the hand was allowed to follow; before that, the angles at which the joints were.
+
+Shapes: `env` one, `finger`, `joint` and `taxel` as in `payloads`, `feature` numbers of an observation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.fingertips import HandTerm, hand_terms
 from tgdsl.runtime.xhand1.source import HandSample
+from tgdsl.scene import scene_model
 
 
 class HandObserver:
@@ -28,38 +34,59 @@ class HandObserver:
         terms: The observations.
     """
 
-    def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float):
+    def __init__(self, touch: TactileModule, calibration: Calibration, control_step: float, *, is_log: bool = False):
         """Look whether a hand can give what the module observes.
 
         Args:
             touch: The module.
             calibration: The hand's; of it the contact threshold is used.
             control_step: Time from one call of `observe` to the next [s].
+            is_log: Whether the hand is a recorded one.
 
         Raises:
             ObservationError: If a hand cannot give an observation; all of them are named.
         """
-        self.terms = hand_terms(touch.plan, calibration.contact_threshold)
+        self.terms = hand_terms(touch.plan, calibration.contact_threshold, is_log)
         self._like = torch.empty(0, dtype=touch.dtype, device=touch.device)
         self._threshold = calibration.contact_threshold
         self._pasts = [_Past(term, control_step, touch.dtype) for term in self.terms]
+        wants_action = any(term.planned.type == "last_action" for term in self.terms)
+        self._controls = JointControls.of_model(scene_model(touch.plan.scene)) if wants_action else None
+        self._action: Tensor | None = None
+
+    def note(self, control: Tensor | np.ndarray | None) -> None:
+        """Take note of controls that were given, by actuator, (actuator,) or (1, actuator) [rad]; None: the last still hold.
+
+        Raises:
+            MotionError: If there are not as many as the hand has joints.
+        """
+        if control is not None and self._controls is not None:
+            values = control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control)
+            self._action = torch.from_numpy(self._controls.targets(values)).unsqueeze(0)
 
     def observe(self, sample: HandSample) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups. To be called once per control step, as sensors may remember their last samples."""
         groups: dict[str, list[Tensor]] = {}
+        if self._action is None:
+            self._action = sample.joint_pos
         for term, past in zip(self.terms, self._pasts, strict=True):
-            features = _features(term, sample, self._threshold).to(self._like)
+            features = _features(term, sample, self._threshold, self._action).to(self._like)
             groups.setdefault(term.planned.group, []).append(past.push(features))
         return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
     def reset(self) -> None:
-        """Forget the last samples."""
+        """Forget the last samples, and what was last given."""
+        self._action = None
         for past in self._pasts:
             past.reset()
 
 
-def _features(term: HandTerm, sample: HandSample, threshold: float | None) -> Tensor:
-    type_, fingers = term.planned.type, list(term.fingers)
+def _features(term: HandTerm, sample: HandSample, threshold: float | None, action: Float[Tensor, "env joint"]) -> Tensor:
+    type_, fingers, joints = term.planned.type, list(term.fingers), list(term.joints)
+    if type_ in ("joint_pos", "joint_vel"):
+        return (sample.joint_pos if type_ == "joint_pos" else sample.joint_vel)[:, joints]
+    if type_ == "last_action":
+        return action[:, joints]
     if type_ == "agg_force":
         return sample.tip_force[:, fingers][:, :, list(term.axes)].transpose(1, 2).flatten(1)
     if type_ == "agg_bool":

@@ -120,10 +120,11 @@ class SimulatedBody:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread and the simulation."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
+        self._sim.close()
 
     def _run(self) -> None:
         due = time.monotonic()

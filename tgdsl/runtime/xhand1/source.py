@@ -18,7 +18,7 @@ from torch import Tensor
 from tgdsl.env_ids import EnvIds
 from tgdsl.errors import StateError
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.driver import READ_TIMEOUT_S, XHand1
+from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.errors import HandError, MotionError, StaleReadingError
 from tgdsl.runtime.xhand1.pace import Pace, RealTime
 from tgdsl.runtime.xhand1.reader import Reading
@@ -99,7 +99,7 @@ class XHand1Source:
         calibration: Calibration | None = None,
         velocity_time_constant: float = 0.02,
         pace: Pace | None = None,
-        read_timeout_s: float = READ_TIMEOUT_S,
+        read_timeout_s: float | None = None,
     ):
         """Take an open hand.
 
@@ -109,7 +109,7 @@ class XHand1Source:
             calibration: What its counts mean; default: they stay counts.
             velocity_time_constant: Time constant of the filter of joint speeds [s].
             pace: What control steps wait for; default: that their time is over.
-            read_timeout_s: How long to wait for a new reading after a step [s].
+            read_timeout_s: How long to wait for a new reading after a step [s]; default: as `hand.read`.
 
         Raises:
             HandError: If the control step is not positive, or no new reading comes.

@@ -77,7 +77,8 @@ class ElastomerSpec(ContactProbeSpec):
     marker_depth: Radius = 0.0
     """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""
     standoff: Radius = 0.0
-    """s, height of the undeformed skin above the taxels [m]."""
+    """s, height of the undeformed skin above the taxels [m]. Above 0 it is felt before the link itself touches: `gate` is then
+    `geometric`."""
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
     anchors: Literal["taxels", "points"] | None = None
@@ -95,6 +96,11 @@ class ElastomerSpec(ContactProbeSpec):
     """How the fixed operator is applied; `auto` takes the cheapest that is exact, or within `tolerance` if that is given."""
     tolerance: Annotated[Positive, AfterValidator(_is_fraction)] | None = None
     """Relative error that a truncated operator may have [1]; svd: 1e-3 if not given."""
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        return super().is_gated and self.standoff == 0.0
 
     @property
     def has_shear(self) -> bool:
@@ -142,6 +148,10 @@ class ElastomerSpec(ContactProbeSpec):
         if self.kernel == "bonded_layer" and self.thickness is not None and self.marker_depth > self.thickness:
             raise ValueError(
                 f"`marker_depth` {self.marker_depth:g} m is below the layer, its `thickness` is {self.thickness:g} m"
+            )
+        if self.standoff > 0 and "gate" in self.model_fields_set and self.gate == "contact_pair":
+            raise ValueError(
+                "`gate: contact_pair` would hide what `standoff` feels before the link touches, expected `geometric`"
             )
         if self.boundary is not None and self.thickness is None:
             raise ValueError("`thickness` is missing, a clamped `boundary` needs it")

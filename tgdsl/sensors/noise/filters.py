@@ -55,11 +55,11 @@ def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now
         index = torch.zeros_like(now.streams[random.JITTER].first[:1, 0])
         late = late + values["jitter"][:, 0] * random.uniform(random.words(now.streams[random.JITTER], index), late.dtype)
     length = ring.shape[1]
-    ages = now.ages[:length]
-    newer = torch.minimum((ages <= late[..., None]).sum(dim=-1), torch.clamp(now.age, max=length))
+    ages = now.ages[:, :length]
+    newer = torch.minimum((ages[:, None] <= late[..., None]).sum(dim=-1), torch.clamp(now.age, max=length))
     is_oldest = newer >= torch.clamp(now.age, max=length)
-    start = torch.where(newer > 0, ages[(newer - 1).clamp(min=0)], 0.0)
-    rest = (late - start) / (ages[newer.clamp(max=length - 1)] - start)
+    start = torch.where(newer > 0, ages.gather(1, (newer - 1).clamp(min=0)), 0.0)
+    rest = (late - start) / (ages.gather(1, newer.clamp(max=length - 1)) - start)
     rest, newer = stored(torch.where(is_oldest, 0.0, rest)), stored(newer)
     after, before = (_entry(ring, stored((now.step - newer - k) % length)) for k in (0, 1))
     after = torch.where(newer[:, None] == 0, signal, after)

@@ -24,9 +24,9 @@ class Now(NamedTuple):
 
     Attributes:
         dt: Time since the last call [s].
-        step: Number of this call.
+        step: Number of this call of each environment, (env, 1).
         age: Calls since each environment's reset, (env, 1); 0 at the first one.
-        ages: Time since each of the calls before this one, the last one first [s]; None if no sensor wants to know.
+        ages: Time since each of the calls before this one, the last one first (env, call) [s]; None if no sensor wants to know.
         is_sample: Whether each environment's sensor takes a sample now, (env, 1); None: always.
         period: Time between samples [s], a scalar; None: one is taken at every call.
         streams: The sensor's random numbers, by purpose.

@@ -59,7 +59,7 @@ def sensor_key(seed: int, sensor: str) -> tuple[int, int]:
 def streams(
     keys: Int[Tensor, "sensor half"],
     env: Int[Tensor, " env"],
-    step: Int[Tensor, ""],
+    step: Int[Tensor, " env"],
     episode: Int[Tensor, " env"],
 ) -> list[Mapping[int, Stream]]:
     """Return the streams of each sensor, by purpose.
@@ -69,10 +69,10 @@ def streams(
     Args:
         keys: The sensors' keys, int32.
         env: Numbers of the environments, int64, counted over all processes.
-        step: Number of this reading, int64.
+        step: Number of this reading of each environment, int64.
         episode: How often each environment was reset, int64.
     """
-    counter = torch.stack([step.expand_as(env), episode], dim=1)[:, None, :, None]
+    counter = torch.stack([step, episode], dim=1)[:, None, :, None]
     low, high = counter.to(torch.int32), mix((counter >> 32).to(torch.int32))
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
     purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP + FIRST_PURPOSE

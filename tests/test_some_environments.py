@@ -1,0 +1,265 @@
+"""Reading some environments alone, and looking without advancing anything."""
+
+import copy
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from test_noise import CONTACT_NOISE, EVERY_KNOB, RANGES, document, felt_state
+
+import tgdsl
+from tgdsl.errors import StateError
+from tgdsl.testing import only
+
+SENSORS = {
+    "s": {"noise": EVERY_KNOB, "rate": 60, "history": {"length": 3, "reduce": "mean"}, "readout": "both"},
+    "stack": {"noise": RANGES, "history": 4},
+    "c": {"kind": "contact", "noise": CONTACT_NOISE, "rate": 40},
+    "grip": {"kind": "elastomer", "links": "pad", "friction": 0.8},
+    "points": {"kind": "elastomer", "links": "pad", "anchors": "points", "points": 40, "gate": "geometric"},
+    "force": {"kind": "force_taxel"},
+    "near": {"kind": "proximity", "backend": "points", "points": 50},
+}
+"""Everything that remembers: filters, delays, rates, windows, bits, markers that stick, points that are held; and what does not."""
+NUM_ENVS = 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("some")
+
+
+@pytest.fixture(scope="module")
+def original(folder):
+    return tgdsl.compile(document(folder, SENSORS), dtype=torch.float64)
+
+
+@pytest.fixture
+def touch(original):
+    return copy.deepcopy(original)
+
+
+def clones(readings):
+    return {name: reading.clone() for name, reading in readings.items()}
+
+
+def schedule(seed: int, calls: int):
+    """Yield for each call who was reset before it, and who is read: everyone, or some by mask or index."""
+    rng = np.random.default_rng(seed)
+    for call in range(calls):
+        reset = np.flatnonzero(rng.random(NUM_ENVS) < 0.15)
+        read = np.arange(NUM_ENVS) if call == 0 or rng.random() < 0.5 else np.flatnonzero(rng.random(NUM_ENVS) < 0.5)
+        yield reset.tolist(), read.tolist(), bool(rng.random() < 0.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_environment_is_as_if_it_were_alone(touch, seed):
+    """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""
+    alone = [copy.deepcopy(touch).seed(7, first_env=env) for env in range(NUM_ENVS)]
+    touch.seed(7)
+    handed: dict[str, torch.Tensor] = {}
+    for call, (reset, read, by_mask) in enumerate(schedule(seed, 25)):
+        touch.reset(reset)
+        for env in reset:
+            alone[env].reset()
+        state = felt_state(touch, NUM_ENVS, 100 * seed + call)
+        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)
+        chosen = {} if len(read) == NUM_ENVS else {"mask": mask} if by_mask else {"env_ids": read}
+        readings = touch(state, **chosen)
+        for env in range(NUM_ENVS):
+            expected = alone[env](only(state, slice(env, env + 1))) if env in read else None
+            for name, reading in readings.items():
+                if expected is None:
+                    assert torch.equal(reading[env], handed[name][env]), (call, env, name)
+                else:
+                    torch.testing.assert_close(reading[env], expected[name][0], rtol=1e-9, atol=1e-15)
+        handed = clones(readings)
+
+
+def test_what_is_returned_is_a_copy(touch):
+    """Neither a later call nor who writes into readings changes what others hold."""
+    state = felt_state(touch, NUM_ENVS)
+    touch(state)
+    first = touch(state, env_ids=[0])
+    kept = clones(first)
+    for reading in touch(felt_state(touch, NUM_ENVS, 1), env_ids=[1]).values():
+        reading.fill_(7.0)
+    again = touch(felt_state(touch, NUM_ENVS, 2), env_ids=[2])
+    assert all(torch.equal(first[name], kept[name]) for name in first)
+    assert not any((reading == 7.0).all() for reading in again.values())
+    assert all(torch.equal(again[name][0], kept[name][0]) for name in again)
+
+
+def test_a_look_advances_nothing_and_sees_what_the_next_call_reads(touch):
+    for call in range(6):
+        state = felt_state(touch, NUM_ENVS, call)
+        before = clones(touch.state_dict())
+        seen = [clones(touch.peek(state)) for _ in range(2)]
+        after = touch.state_dict()
+        assert before.keys() == after.keys() and all(torch.equal(before[name], after[name]) for name in after)
+        if call == 2:
+            touch.reset([1])
+            seen = [clones(touch.peek(state))] * 2
+        found = touch(state)
+        for look in seen:
+            assert look.keys() == found.keys() and all(torch.equal(look[name], found[name]) for name in found)
+    assert touch.num_envs == NUM_ENVS
+
+
+def test_a_look_before_the_first_call_fixes_nothing(touch):
+    touch.peek(felt_state(touch, 2))
+    assert touch.num_envs is None and not touch.state_dict()
+    touch(felt_state(touch, 5))
+    assert touch.num_envs == 5
+
+
+@pytest.mark.slow
+def test_compiled_equals_eager(touch, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    touch = touch.to(torch.float32)
+    eager, compiled = copy.deepcopy(touch).seed(3), touch.seed(3).compile()
+    for call, (reset, read, _) in enumerate(schedule(5, 8)):
+        state = felt_state(eager, NUM_ENVS, call)
+        mask = torch.zeros(NUM_ENVS, dtype=torch.bool).index_fill_(0, torch.tensor(read, dtype=torch.int64), True)
+        found, looked = [], []
+        for module in (eager, compiled):
+            module.reset(reset)
+            looked.append(clones(module.peek(state)))
+            found.append(clones(module(state) if len(read) == NUM_ENVS else module(state, mask)))
+        for a, b in (found, looked):
+            for name in a:
+                torch.testing.assert_close(b[name], a[name], rtol=1e-4, atol=1e-5 * float(a[name].abs().max()) + 1e-12)
+
+
+def test_a_sensor_without_memory_takes_a_mask_too(folder):
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
+    states = [felt_state(touch, 4, seed) for seed in range(3)]
+    first, new = clones(touch(states[0])), touch.peek(states[1])["d"]
+    found = touch(states[1], env_ids=torch.tensor([1, 3]))["d"]
+    assert torch.equal(found[[1, 3]], new[[1, 3]]) and torch.equal(found[[0, 2]], first["d"][[0, 2]])
+    larger = touch(felt_state(touch, 6, 2))["d"]  # it holds no state, so any batch is fine
+    assert torch.equal(touch(felt_state(touch, 6, 3), env_ids=[])["d"], larger)
+    with pytest.raises(StateError, match="readings of 6 environments were handed out before, the scene has 4"):
+        touch(states[0], env_ids=[1])
+
+
+def test_gradients_are_those_of_the_environments_that_are_read(folder):
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel"}}), dtype=torch.float64)
+    touch(felt_state(touch, 3, 0))
+    state, slopes = felt_state(touch, 3, 1), []
+    assert state.body_pos is not None
+    state.body_pos.requires_grad_()
+    for readings in (touch(state, env_ids=[1]), touch.peek(state)):
+        slopes.append(torch.autograd.grad(readings["d"].square().sum(), state.body_pos)[0])
+    assert torch.equal(slopes[0][1], slopes[1][1]) and slopes[1][1].abs().max() > 0
+    assert not slopes[0][[0, 2]].any()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        (
+            {"mask": torch.ones(4, dtype=torch.bool)},
+            r"mask: found torch.bool \(4,\), expected a boolean tensor \(3,\); indices go to `env_ids`",
+        ),
+        ({"mask": torch.tensor([0, 1, 1])}, r"mask: found torch.int64 \(3,\), expected a boolean tensor"),
+        ({"env_ids": [3]}, r"env_ids: found 3, expected indices from 0 to 2, or a mask of 3"),
+        ({"env_ids": [-1]}, r"env_ids: found -1, expected indices"),
+        ({"env_ids": torch.tensor([0.5])}, r"env_ids: found 0.5, expected indices"),
+        ({"mask": torch.ones(3, dtype=torch.bool), "env_ids": [0]}, "found both `mask` and `env_ids`, expected one of them"),
+    ],
+)
+def test_who_is_not_there_is_named_and_nothing_moves(touch, chosen, message):
+    state = felt_state(touch, NUM_ENVS)
+    touch(state)
+    before = clones(touch.state_dict())
+    with pytest.raises(StateError, match=message):
+        touch(state, **chosen)
+    assert all(torch.equal(before[name], value) for name, value in touch.state_dict().items())
+
+
+def test_some_alone_need_a_call_before(touch):
+    with pytest.raises(StateError, match="nothing was handed out yet for the environments left out"):
+        touch(felt_state(touch, NUM_ENVS), env_ids=[0])
+    assert touch.num_envs is None
+
+
+# the number of environments, and what is loaded
+
+
+def test_free_lets_go_of_the_batch_and_keeps_the_seed(touch):
+    touch.seed(5)
+    first = clones(touch(felt_state(touch, 2)))
+    with pytest.raises(StateError, match=r"holds the state of 2 environments, the scene has 3; `free\(\)` lets go of it"):
+        touch(felt_state(touch, 3))
+    touch.free()
+    assert touch.num_envs is None and not touch.state_dict()
+    assert touch(felt_state(touch, 3))["s"].shape[0] == 3
+    touch.free()
+    assert all(torch.equal(reading, first[name]) for name, reading in touch(felt_state(touch, 2)).items())
+
+
+def test_a_seed_between_calls_leaves_rates_as_they_are(folder):
+    """A sensor with a rate and no delay takes a sample at every fourth call, before and after."""
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth", "rate": 25}}), dtype=torch.float64)
+
+    def sampled(seed):
+        changes, last = [], None
+        for call in range(12):
+            reading = touch(felt_state(touch, 8, call))["d"]
+            changes.append(last is None or not torch.equal(reading, last))
+            last = reading
+        touch.seed(seed)
+        return changes
+
+    assert sampled(1) == sampled(2) == [True, False, False, False] * 3
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_loaded_state_takes_the_modules_dtype(original, dtype):
+    other = torch.float32 if dtype == torch.float64 else torch.float64
+    touch, source = copy.deepcopy(original).to(dtype), copy.deepcopy(original).to(other).seed(3)
+    for call in range(4):
+        source(felt_state(source, NUM_ENVS, call))
+    touch.load_state_dict(source.state_dict())
+    state = felt_state(touch, NUM_ENVS, 4)
+    found, expected = touch(state), source(state)
+    for name, reading in found.items():
+        assert reading.dtype == dtype
+        torch.testing.assert_close(
+            reading.double(), expected[name].double(), rtol=1e-3, atol=1e-4 * float(expected[name].abs().max())
+        )
+
+
+@pytest.mark.parametrize("missing", ["memory.clock.age", "memory.s:noise/lag", "memory.history/stack"])
+@pytest.mark.parametrize("strict", [True, False])
+def test_part_of_a_state_is_no_state(original, missing, strict):
+    source, touch = copy.deepcopy(original), copy.deepcopy(original)
+    source(felt_state(source, NUM_ENVS))
+    state = source.state_dict()
+    del state[missing]
+    with pytest.raises(RuntimeError, match=f'"{missing}" is missing beside other state'):
+        touch.load_state_dict(state, strict=strict)
+    assert touch.num_envs is None
+    touch(felt_state(touch, 2))
+
+
+def test_state_of_another_shape_is_named(original):
+    source, touch = copy.deepcopy(original), copy.deepcopy(original)
+    source(felt_state(source, NUM_ENVS))
+    state = source.state_dict()
+    state["memory.s:noise/lag"] = state["memory.s:noise/lag"][:, :, :-1]
+    state["memory.c:noise/walk"] = state["memory.c:noise/walk"][:-1]
+    with pytest.raises(RuntimeError) as caught:
+        touch.load_state_dict(state)
+    assert '"memory.s:noise/lag" has shape (3, 6, 16), expected (env, …, 6, 17)' in str(caught.value)
+    assert 'the parts of "memory." are of [2, 3] environments' in str(caught.value)
+
+
+def test_a_state_saved_before_the_first_call_does_not_replace_one(touch):
+    empty = touch.state_dict()
+    touch.load_state_dict(empty)
+    touch(felt_state(touch, NUM_ENVS))
+    with pytest.raises(RuntimeError, match="Missing key"):
+        touch.load_state_dict(empty)

@@ -1,0 +1,192 @@
+"""From a document's observations to the plan's: which channels of which readings, and which joints."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tgdsl import observations
+from tgdsl.compiler.joints import RobotJoints, robot_joints
+from tgdsl.compiler.resolve import Resolved
+from tgdsl.errors import did_you_mean
+from tgdsl.layout import Layout
+from tgdsl.observations import OfReading, ReadingObservation, ReadingSpec
+from tgdsl.plan import PlannedObservation, PlannedReading, PlannedSensor
+from tgdsl.proprioception import QUANTITIES, JointObservation, JointSpec
+from tgdsl.schema.load import Loaded
+from tgdsl.schema.select import matching
+from tgdsl.schema.yaml import Path
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a document observes.
+
+    Attributes:
+        terms: The observation terms, in the document's order.
+        proprioception: Readings of joints and actuators that some of them want.
+        joints: Names of the joints that are read.
+        actuators: Names of the actuators that are read.
+    """
+
+    terms: tuple[PlannedObservation, ...]
+    proprioception: tuple[PlannedReading, ...]
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+
+
+def observed(
+    loaded: Loaded,
+    resolved: Resolved,
+    sensors: Sequence[PlannedSensor],
+    layouts: Mapping[str, Layout],
+    arrays: dict[str, np.ndarray],
+) -> Observed:
+    """Return a document's observations; what is wrong with one is noted among the document's problems.
+
+    Args:
+        loaded: The document.
+        resolved: Its meaning on the robot.
+        sensors: The planned sensors.
+        layouts: The taxels of each, by its name.
+        arrays: Takes what is folded for an observation.
+    """
+    specs = [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
+    own = robot_joints(resolved.robot, resolved.scene)
+    chosen: dict[tuple[str, int], tuple[str, ...]] = {}
+    asked: dict[str, set[str]] = {"joint": set(), "actuator": set()}
+    for group, i, spec in specs:
+        if isinstance(spec, JointObservation):
+            chosen[group, i] = _rows(loaded, ("observations", group, i), spec, own)
+            asked[QUANTITIES[spec.type].rows].update(chosen[group, i])
+    joints = tuple(name for name in own.joints if name in asked["joint"])
+    actuators = tuple(actuator.name for actuator in own.actuators if actuator.name in asked["actuator"])
+    found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
+    terms: list[PlannedObservation] = []
+    for group, i, spec in specs:
+        if isinstance(spec, OfReading):
+            terms += _of_reading(loaded, group, i, spec, found, arrays)
+        elif isinstance(spec, JointObservation):
+            rows = joints if QUANTITIES[spec.type].rows == "joint" else actuators
+            terms.append(_of_joints(group, i, spec, chosen[group, i], rows, arrays))
+        else:
+            count = observations.HAND_ONLY.get(spec.type, 0)
+            terms.append(PlannedObservation(group, i, spec.type, None, (), (), count))
+    types = {spec.type for _, _, spec in specs}
+    return Observed(tuple(terms), _proprioception(types, joints, actuators, own), joints, actuators)
+
+
+def _of_reading(
+    loaded: Loaded,
+    group: str,
+    i: int,
+    spec: ReadingSpec,
+    found: Mapping[str, tuple[PlannedReading, Layout]],
+    arrays: dict[str, np.ndarray],
+) -> list[PlannedObservation]:
+    """Return the observation of a sensor's reading, or nothing if it is wrong."""
+    path: Path = ("observations", group, i)
+    if spec.of not in found:
+        hint = did_you_mean(spec.of, found, "readings")
+        loaded.problems.append(loaded.problem((*path, "of"), f'there is no reading "{spec.of}"', hint))
+        return []
+    reading, layout = found[spec.of]
+    if isinstance(spec, ReadingObservation):
+        wanted = _channels(loaded, path, spec, reading)
+    else:
+        wanted, rows = observations.WANTED[spec.type]
+        if reading.rows != rows or not set(wanted) <= set(reading.channels):
+            what = f'"{spec.type}" needs {", ".join(wanted)} of each {rows}, which "{spec.of}" does not read'
+            has = f"it reads {', '.join(reading.channels)} of each {reading.rows}"
+            loaded.problems.append(loaded.problem(path, what, has))
+            return []
+    constants = observations.lower(spec, layout)
+    for name, value in constants.items():
+        arrays[f"observations/{group}/{i}/{name}"] = value
+    channels = tuple(reading.channels.index(channel) for channel in wanted)
+    per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
+    axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
+    count = max(reading.steps, 1) * per_call
+    return [PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count, axes)]
+
+
+def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:
+    """Return the channels that a `reading` takes, each once, in the order in which they are first named."""
+    wanted: dict[str, None] = {}
+    for k, pattern in enumerate(spec.channels or ("*",)):
+        hits = matching(pattern, reading.channels)
+        if not hits:
+            what = f'no channel of "{reading.name}" matches "{pattern}"'
+            hint = did_you_mean(pattern, reading.channels, "channels")
+            loaded.problems.append(loaded.problem((*path, "channels", k), what, hint))
+        wanted |= dict.fromkeys(hits)
+    return tuple(wanted)
+
+
+def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tuple[str, ...]:
+    """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
+    is_of_joints = QUANTITIES[spec.type].rows == "joint"
+    wanted: dict[str, None] = {}
+    if spec.joints is None:
+        names = own.joints[: own.num_actuated] if is_of_joints else tuple(actuator.name for actuator in own.actuators)
+        wanted = dict.fromkeys(names)
+        if not names:
+            hint = 'name them: joints: ["*"]' if is_of_joints and own.joints else ""
+            what = f"the robot has no actuated joints, so there is no {spec.type} of them"
+            loaded.problems.append(loaded.problem(path, what, hint))
+    for k, pattern in enumerate(spec.joints or ()):
+        hits = _matched(loaded, (*path, "joints", k), pattern, own)
+        if not is_of_joints and hits:
+            joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
+            if not hits:
+                what = f"no actuator acts on {', '.join(joints)}"
+                loaded.problems.append(loaded.problem((*path, "joints", k), what, "so there is no last action of it"))
+        wanted |= dict.fromkeys(hits)
+    if "" in wanted:
+        what = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
+        loaded.problems.append(loaded.problem(path, what, "name it in the robot's file"))
+    return tuple(wanted)
+
+
+def _matched(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list[str]:
+    hits = matching(pattern, [name for name in own.joints if name])
+    if not hits:
+        known = [name for name in (*own.joints, *own.others) if name]
+        what, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, known, "joints")
+        if matching(pattern, own.others):
+            what, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
+        loaded.problems.append(loaded.problem(path, what, hint))
+    return hits
+
+
+def _proprioception(
+    types: Collection[str], joints: Sequence[str], actuators: Sequence[str], own: RobotJoints
+) -> tuple[PlannedReading, ...]:
+    """Return the readings of joints and actuators that are observed, in the order of `QUANTITIES`."""
+    num_rows = {"joint": len(joints), "actuator": len(actuators)}
+    is_slide = [name in own.slides for name in joints]
+    readings = []
+    for name, quantity in QUANTITIES.items():
+        if name in types:
+            hinge, slide = quantity.units
+            unit = hinge if hinge == slide or not any(is_slide) else slide if all(is_slide) else f"{hinge} or {slide}"
+            readings.append(PlannedReading(name, quantity.rows, num_rows[quantity.rows], (quantity.channel,), (unit,)))
+    return tuple(readings)
+
+
+def _of_joints(
+    group: str,
+    i: int,
+    spec: JointSpec,
+    chosen: Sequence[str],
+    wanted: Sequence[str],
+    arrays: dict[str, np.ndarray],
+) -> PlannedObservation:
+    """Return the observation of a reading of joints or actuators."""
+    constants: tuple[str, ...] = ()
+    if list(chosen) != list(wanted):
+        constants = ("rows",)
+        arrays[f"observations/{group}/{i}/rows"] = np.array([wanted.index(name) for name in chosen], dtype=np.int64)
+    return PlannedObservation(group, i, spec.type, spec.type, (0,), constants, len(chosen))

@@ -1,0 +1,125 @@
+"""What goes wrong in single environments, and what is done about it: they wait for a reset, or are started anew.
+
+Shapes: `env` environments, `kind` kinds of faults.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean, listed
+
+OnFault = Literal["raise", "reset"]
+"""What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew."""
+DIVERGED, BAD_CONTROL, BAD_VALUES = range(3)
+_ACCOUNTS = (
+    "environments {envs} diverged{diverged}",
+    "control is not finite in environments {envs}",
+    "values given for the state of environments {envs} are not finite, or hold a quaternion of length 0, and were left out",
+)
+_COUNTS = ("{num} diverged", "{num} had controls that are not finite", "{num} were given a state that is not finite")
+
+
+class EnvFaults:
+    """The faults of each environment, on the device, from when they are noted until the environment is started anew.
+
+    Attributes:
+        on_fault: What becomes of environments with a fault.
+        counts: How many times each environment has had a fault.
+    """
+
+    counts: Int[Tensor, " env"]
+    _held: Bool[Tensor, "kind env"]
+    _restarted: Bool[Tensor, " env"]
+    _totals: Int[Tensor, " kind"]
+
+    def __init__(self, num_envs: int, device: torch.device, on_fault: str = "raise"):
+        """Begin without faults.
+
+        Raises:
+            SimulationError: If `on_fault` is none of the two.
+        """
+        if on_fault not in get_args(OnFault):
+            hint = did_you_mean(on_fault, get_args(OnFault), "choices")
+            raise SimulationError(f'on_fault is "{on_fault}"; {hint}')
+        self.on_fault = on_fault
+        self._held = torch.zeros((len(_COUNTS), num_envs), dtype=torch.bool, device=device)
+        self._is_counted = torch.zeros_like(self._held)
+        self._restarted = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self.counts = torch.zeros(num_envs, dtype=torch.int64, device=device)
+        self._totals = torch.zeros(len(_COUNTS), dtype=torch.int64, device=device)
+        self._has_warned = False
+
+    @property
+    def totals(self) -> Int[Tensor, " kind"]:
+        """Number of faults of each kind so far."""
+        return self._totals
+
+    @property
+    def restarted(self) -> Bool[Tensor, " env"]:
+        """Environments that the last step has started anew."""
+        return self._restarted
+
+    @property
+    def mask(self) -> Bool[Tensor, " env"]:
+        """Environments that wait for a reset, or that the last step started anew."""
+        return self._held.any(dim=0) | self._restarted
+
+    def note(self, kind: int, where: Bool[Tensor, " env"] | Bool[Tensor, ""]) -> None:
+        """Note a fault in some environments, or in all."""
+        self._held[kind] |= where
+
+    def begin_step(self) -> None:
+        """Forget which environments the last step has started anew."""
+        if self.on_fault == "reset":
+            self._restarted.zero_()
+
+    def settle(self) -> Bool[Tensor, " env"]:
+        """Count faults that are new; return which environments have any."""
+        is_new = self._held & ~self._is_counted
+        self.counts += is_new.any(dim=0)
+        self._totals += is_new.sum(dim=1)
+        self._is_counted |= is_new
+        return self._held.any(dim=0)
+
+    def clear(self, where: Bool[Tensor, " env"]) -> None:
+        """Forget the faults of environments that are started anew."""
+        self._held &= ~where
+        self._is_counted &= ~where
+        self._restarted &= ~where
+
+    def note_restarted(self, where: Bool[Tensor, " env"]) -> None:
+        """Note environments that a step has started anew."""
+        self._restarted |= where
+
+    def accounts(self, diverged: str = "") -> list[str]:
+        """Return which environments have which fault, in words; it waits for a GPU.
+
+        Args:
+            diverged: What else to say of environments that diverged.
+        """
+        found = []
+        for text, where in zip(_ACCOUNTS, self._held.cpu(), strict=True):
+            if where.any():
+                envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
+                found.append(text.format(envs=envs, diverged=diverged) + "; reset them to go on")
+        return found
+
+    def warn_once(self, totals: list[int] | None = None) -> None:
+        """Warn of the first environments that were started anew.
+
+        Args:
+            totals: Number of faults of each kind; default: those counted, for which a GPU is waited for.
+        """
+        found = self._totals.tolist() if totals is None else totals
+        if self._has_warned or not any(found):
+            return
+        self._has_warned = True
+        kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, found, strict=True) if num)
+        what = f"environments had faults and were started anew: {kinds}"
+        warnings.warn(f"{what}; this is said once, `fault_counts` counts on", stacklevel=4)
