@@ -29,3 +29,11 @@ def here(monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is slow in the suite that kinds inherit, which has no marks: other people's pytest would not know them."""
+    for item in items:
+        if getattr(item, "originalname", "") == "test_compiled_equals_eager":
+            item.add_marker("slow")

@@ -7,7 +7,17 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "tgdsl"
 FLOORS = {
-    5: {"cli", "arguments", "run_commands", "calibrate_commands", "hand_commands", "robot_commands", "rl", "report"},
+    5: {
+        "cli",
+        "arguments",
+        "cache_commands",
+        "run_commands",
+        "calibrate_commands",
+        "hand_commands",
+        "robot_commands",
+        "rl",
+        "report",
+    },
     4: {"compiler", "runtime"},
     3: {
         "schema",
@@ -22,15 +32,15 @@ FLOORS = {
         "felt_objects",
         "taxels",
         "observing",
-        "slot_watch",
         "env_ids",
         "example",
         "state",
         "scene",
+        "slot_watch",
         "artifact",
         "explain",
     },
-    2: {"sensors", "observations", "proprioception", "layout", "plan"},
+    2: {"sensors", "observations", "proprioception", "layout", "plan", "places"},
     1: {"geometry", "devices", "progress", "tables", "units", "fields", "fusion", "graphed", "regions", "errors"},
 }
 FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}

@@ -91,7 +91,7 @@ EXPECTED = {
     "no such dtype": ("TgdslError", "dtype is 'flaot32', expected torch.float32 or torch.float64"),
     "no such device": ("TgdslError", 'there is no device "cuda:99": '),
     "physics on no such device": ("SimulationError", 'there is no device "cuda:99" to run physics on: '),
-    "no kind": ("TgdslError", "kinds[0] is 3, expected a tgdsl.sensors.Kind"),
+    "no kind": ("TgdslError", "`kinds`: found int, expected a tgdsl.sensors.Kind"),
     "a compiled model": ("RobotError", "tgdsl.instrument wants a mujoco.MjSpec, found MjModel: "),
     "no document": ("TgdslError", "a document is a YAML file's name or a mapping, found NoneType"),
     "an override of the wrong type": (

@@ -14,9 +14,11 @@ from safetensors.numpy import save as serialized
 from tgdsl.devices import device_of, dtype_of
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module import TactileModule
+from tgdsl.places import check_scene
 from tgdsl.plan import Plan
 from tgdsl.schema.files import write_whole
-from tgdsl.sensors import Kind, known_kinds
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
 
 METADATA_KEY = "tgdsl"
 
@@ -49,13 +51,13 @@ def load(
 
     Args:
         path: The artefact.
-        kinds: Sensor kinds of your own, if it was compiled with any.
+        kinds: Sensor kinds of your own, if it was compiled with any that no installed package brings.
         dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
         device: Where the module lives.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, or is of another version.
-        TgdslError: If it uses a kind that is not given, or there is no such dtype or device.
+        TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     return TactileModule(load_plan(path), known_kinds(kinds), dtype).to(device)
@@ -69,10 +71,11 @@ def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
 
 
 def load_plan(path: str | PathLike[str]) -> Plan:
-    """Read a plan.
+    """Read a plan. Only the artefact itself is opened: no file that it names.
 
     Raises:
-        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+        ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
+            of an artefact cannot be.
     """
     try:
         with safe_open(str(path), framework="numpy") as file:
@@ -85,6 +88,8 @@ def load_plan(path: str | PathLike[str]) -> Plan:
     for array in arrays.values():
         array.flags.writeable = False
     try:
-        return Plan.from_json(metadata[METADATA_KEY], arrays)
+        plan = Plan.from_json(metadata[METADATA_KEY], arrays)
+        check_scene(plan.scene)
+        return plan
     except ArtifactError as error:
         raise ArtifactError(f"{path}: {error}") from error

@@ -18,6 +18,7 @@ from typing import Annotated
 import tyro
 
 from tgdsl.arguments import Document, Overrides, module_of, parsed_overrides
+from tgdsl.cache_commands import Cache
 from tgdsl.calibrate_commands import Calibrate
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.hand_commands import Hand
@@ -97,6 +98,7 @@ Command = (
     | Annotated[LayoutNew, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
+    | Annotated[Cache, tyro.conf.subcommand("cache")]
     | Annotated[Hand, tyro.conf.subcommand("hand")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
 )

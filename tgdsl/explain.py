@@ -122,6 +122,7 @@ def _sensor(touch: TactileModule, sensor: PlannedSensor) -> list[str]:
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))
         lines.append(f"  {reading.name}: {channels} of each {reading.rows}")
+    lines += [f"  {note}" for note in sensor.notes]
     if others := [name for name in sensor.joined if name != sensor.name]:
         lines.append(f"  computed as one with {', '.join(others)}")
     lines += [f"  noise: {line}" for line in _noise(touch, sensor)]

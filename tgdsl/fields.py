@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -76,6 +77,25 @@ class Quantity:
         return value
 
 
+@dataclass(frozen=True)
+class Usual:
+    """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so.
+
+    Attributes:
+        dimension: A key of `units.UNITS`.
+        low: Least usual magnitude, in SI units; 0 is usual too.
+        high: Largest usual magnitude.
+    """
+
+    dimension: str
+    low: float = 0.0
+    high: float = math.inf
+
+    def doubt(self, value: float) -> tuple[str, str] | None:
+        """Return what is unusual about a value, and a hint; None if nothing is."""
+        return units.doubt(value, self.dimension, self.low, self.high)
+
+
 Text = Annotated[str, Tag("text")]
 TEXT_OR_OTHER = Discriminator(lambda value: "text" if isinstance(value, str) else "other")
 """Tells `Text` from a type tagged "other" by what is found, so that errors speak of one of them only."""
@@ -86,6 +106,7 @@ Radius = Annotated[float, Quantity("length", ge=0.0)]
 Area = Annotated[float, Quantity("area", gt=0.0)]
 Angle = Annotated[float, Quantity("angle", gt=0.0)]
 Frequency = Annotated[float, Quantity("frequency", gt=0.0)]
+Pressure = Annotated[float, Quantity("pressure", gt=0.0)]
 Number = Annotated[float, Quantity("number")]
 NonNegative = Annotated[float, Quantity("number", ge=0.0)]
 Positive = Annotated[float, Quantity("number", gt=0.0)]

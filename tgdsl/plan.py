@@ -291,6 +291,7 @@ class PlannedSensor:
         noise: Its imperfections.
         period: Time between its samples [s]; 0: it takes one at every call.
         history: What is read of the last calls.
+        notes: What an account of it says of its parameters, line by line.
     """
 
     name: str
@@ -308,6 +309,7 @@ class PlannedSensor:
     noise: PlannedNoise | None = None
     period: float = 0.0
     history: PlannedHistory | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def is_timed(self) -> bool:

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import ArtifactError, RobotError
+from tgdsl.places import ROBOTS, located
 from tgdsl.plan import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.schema.files import robots_folder
 
@@ -258,12 +259,13 @@ class SceneModels:
 
 
 def _content(asset: Asset) -> bytes:
-    inside = asset.path.removeprefix("robots:")
-    path = robots_folder() / inside if inside != asset.path else Path(asset.path)
+    path = asset.path
     try:
+        path = located(asset, robots_folder())
         content = path.read_bytes()
     except OSError as error:
-        raise ArtifactError(f"asset {path} of the scene cannot be read: {error.strerror}; compile again") from error
+        place = error.filename or path
+        raise ArtifactError(f"asset {place} of the scene cannot be read: {error.strerror}; compile again") from error
     if hashlib.sha256(content).hexdigest() != asset.sha256:
         raise ArtifactError(f"asset {path} has changed since the scene was compiled; compile again")
     return content
@@ -272,4 +274,4 @@ def _content(asset: Asset) -> bytes:
 def portable(path: Path) -> str:
     """Return a path as an artefact keeps it: `robots:` and the rest for a robot that comes with tgdsl, else absolute."""
     folder, path = robots_folder().resolve(), path.resolve()
-    return f"robots:{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()
+    return f"{ROBOTS}{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()

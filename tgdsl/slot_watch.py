@@ -65,7 +65,7 @@ class SlotWatch:
         warnings.warn(
             f"contacts of {which} are more than `slots: {slots}`: what the others carry acts at the centre of those shown; "
             f"`{enough}` would do",
-            stacklevel=5,
+            stacklevel=6,
         )
 
     def _shown(self) -> Tensor | None:

@@ -47,7 +47,7 @@ class SceneState:
 
     A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
     `contact_found` gates included. A slot is unused where force, torque and normal are all zero; where it is then does not
-    matter. A force whose normal is zero acts like any other, and what needs that normal is read as not-a-number.
+    matter. A contact whose normal is zero acts where it is, and what needs its normal is read as not-a-number.
 
     Attributes:
         body_pos: Position of each body's frame [m].

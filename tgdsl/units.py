@@ -10,6 +10,7 @@ UNITS: dict[str, dict[str, float]] = {
     "area": {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6},
     "density": {"/m2": 1.0, "/cm2": 1e4, "/mm2": 1e6},
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
+    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6},
     "force": {"N": 1.0, "mN": 1e-3},
     "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
@@ -18,7 +19,11 @@ UNITS: dict[str, dict[str, float]] = {
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""
 
-_QUANTITY = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([A-Za-zµ/][\w*/µ]*)?\s*\Z")
+_QUANTITY = re.compile(r"\s*+([-+]?(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?)\s*+([A-Za-zµ/][\w*/µ]*+)?\s*+\Z")
+"""A number and a unit; possessive, so that nothing is read twice and a long text takes no long time."""
+
+_SPELLINGS = str.maketrans({"^": "", "²": "2", "·": "*", "⋅": "*", "×": "*", "μ": "µ"})
+"""How units may be spelled elsewhere, and how they are here."""
 
 
 def parse(value: object, dimension: str) -> float:
@@ -36,6 +41,9 @@ def parse(value: object, dimension: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{value!r} is not a quantity, expected {wanted}")
     if isinstance(value, str):
+        plain = value.translate(_SPELLINGS)
+        if plain != value and (match := _QUANTITY.match(plain)) and match[2] in known:
+            raise ValueError(f'"{value}" is not a quantity; did you mean "{plain.strip()}"?')
         match = _QUANTITY.match(value)
         if not match or (match[2] and not known):
             raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
@@ -49,3 +57,22 @@ def parse(value: object, dimension: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{value} is not finite, expected {wanted}")
     return value
+
+
+def doubt(value: float, dimension: str, low: float, high: float) -> tuple[str, str] | None:
+    """Return why a quantity was most likely meant in another unit, and in which; None if there is no doubt.
+
+    Args:
+        value: The quantity, in SI units.
+        dimension: A key of `UNITS`.
+        low: Least usual magnitude; 0 is usual too.
+        high: Largest usual magnitude.
+    """
+    if value == 0 or low <= abs(value) <= high:
+        return None
+    known = UNITS[dimension]
+    si = f" {next(iter(known))}" if known else ""
+    bound = f"usually at least {low:g}{si}" if abs(value) < low else f"usually at most {high:g}{si}"
+    units = {factor: unit for unit, factor in known.items() if low <= abs(value) * factor <= high}
+    meant = " or ".join(f'"{value:g} {unit}"' for unit in units.values())
+    return f"found {value:g}{si}, {bound}", f"was {meant} meant?" if meant else ""

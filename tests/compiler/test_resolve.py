@@ -208,7 +208,7 @@ def test_layout_keys_that_name_nothing(folder):
 def test_a_group_that_contains_itself(folder):
     """By way of another one, and in what that one leaves out."""
     found = problems(folder, ('tips: ["*_2"]', 'tips: ["*_2", thumb]'))
-    assert [line.split(": ")[1].split("[")[0] for line in found] == ["robot.layout.groups.tips", "robot.layout.groups.thumb"]
+    assert [line.split(": ")[1] for line in found] == ["robot.layout.groups.tips[1]", "robot.layout.groups.thumb.exclude[0]"]
     assert 'group "tips" contains itself' in found[0]
     assert 'group "thumb" contains itself' in found[1]
 
@@ -278,6 +278,70 @@ def test_exclude_leaves_no_link(folder):
     assert problems(folder, ("links: all", 'links: {include: [index], exclude: ["*"]}')) == [
         "d.yaml:21:39: sensors.touch.links: `exclude` leaves no link"
     ]
+
+
+def pointed(text: str, line: str) -> tuple[str, str]:
+    """Return what stands in a document where a message points to, and the message."""
+    _, row, column, message = line.split(":", 3)
+    return text.splitlines()[int(row) - 1][int(column) - 1 :], message.strip()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        (
+            "links: all",
+            'links: {include: [all], exclude: [indx_1, "nobody*"]}',
+            {'indx_1, "': 'sensors.touch.links.exclude[0]: no link matches "indx_1"; did you mean "index_1"?'},
+        ),
+        (
+            "exclude: [tips]",
+            "exclude: [tips, tip]",
+            {"tip]": 'robot.layout.groups.thumb.exclude[1]: no link matches "tip"; did you mean "tips"?'},
+        ),
+        (
+            "links: all",
+            "links: {include: [indx_1], exclude: [palm, indx_1]}",
+            {
+                "indx_1], e": 'sensors.touch.links.include[0]: no link matches "indx_1"; did you mean "index_1"?',
+                "indx_1]}": 'sensors.touch.links.exclude[1]: no link matches "indx_1"; did you mean "index_1"?',
+            },
+        ),
+    ],
+)
+def test_a_plain_name_that_is_excluded_exists(folder, old, new, expected):
+    text = DOCUMENT.replace(old, new)
+    found = [pointed(text, line) for line in problems(folder, text=text)]
+    assert [message for _, message in found] == list(expected.values())
+    assert all(there.startswith(what) for (there, _), what in zip(found, expected, strict=True))
+
+
+def test_what_has_no_taxels_at_this_resolution_may_be_excluded(folder):
+    assert resolved(folder, DOCUMENT.replace("resolution: low", "resolution: tip")).links == {"touch": ("index_2",)}
+    text = DOCUMENT.replace("resolution: low", "resolution: tip").replace(
+        "links: all", "links: {include: [all], exclude: [palm]}"
+    )
+    assert resolved(folder, text).links == {"touch": ("index_2",)}
+
+
+def test_a_geom_that_a_region_excludes_exists(folder):
+    patch = "{method: poisson, count: 3, radius: 1 mm, region: REGION}"
+    for region, where in (
+        ("{geoms: {include: ['*'], exclude: [thumb_pda]}}", "geoms.exclude[0]"),
+        (
+            "[{facing: [0, 0, 1], within: 90 deg}, {geoms: {include: ['*'], exclude: ['zz*', thumb_pda]}}]",
+            "[1].geoms.exclude[1]",
+        ),
+    ):
+        text = DOCUMENT.replace(f"palm: {PLACE}", f"palm: {patch.replace('REGION', region)}")
+        (line,) = problems(folder, text=text)
+        dotted = f"region{where}" if where.startswith("[") else f"region.{where}"
+        there, message = pointed(text, line)
+        what = 'no geom or mesh matches "thumb_pda"; did you mean "thumb_pad"?'
+        assert message == f"robot.layout.resolutions.low.palm.{dotted}: {what}"
+        assert there.startswith("thumb_pda")
+    fine = "{geoms: {include: ['*'], exclude: [thumb_pad]}}"  # on another link, as where one region is for several
+    resolved(folder, DOCUMENT.replace(f"palm: {PLACE}", f"palm: {patch.replace('REGION', fine)}"))
 
 
 # objects and scenes

@@ -186,13 +186,14 @@ def test_on_warp_the_chosen_are_set_and_nothing_of_the_others_changes(tmp_path, 
         one.warp_model.opt.tolerance.fill_(model.opt.tolerance) if one is not cpu else None
         for _ in range(4):
             one.step(np.array([0.2, -0.3]))
+        one.ctrl[...] = 0.7  # of now: the forces are still those of the last step
     before, ids = everything(sim), [1, 3]
     values = {name: value.astype(np.float32).astype(np.float64) for name, value in drawn(model, 2).items()}
     chosen, given = as_given(warp, values, ids, 5)[form]
     sim.reset(chosen, **given)
     cpu.reset(ids, **values)
     after = everything(sim)
-    assert {"geom_xpos", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
+    assert {"geom_xpos", "qfrc_actuator", "qacc_warmstart", "time", "cvel", "sensordata"} <= set(after)
     for name, found in after.items():
         np.testing.assert_array_equal(found[[0, 2, 4]], before[name][[0, 2, 4]], err_msg=name)
     state, other = sim.state(), cpu.state()
@@ -340,7 +341,10 @@ def test_under_inference_mode(tmp_path, simulator):
 
 
 def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypatch):
-    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated."""
+    """What is captured is replayed without the host, which therefore cannot say later what is to be evaluated.
+
+    Nor can it later have a captured reading evaluate anything: from then on everything is evaluated at once.
+    """
     sim, twin = (warp(module(tmp_path), 3, keyframe="home") for _ in range(2))
     for one in (sim, twin):
         one.step()
@@ -356,3 +360,7 @@ def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypat
     twin.state()
     for name, value in found.items():
         assert torch.equal(twin.arrays[name], value), name
+    for one in (sim, twin):
+        one.reset(mask)
+    assert not torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])
+    assert torch.equal(twin.state().body_pos, sim.state().body_pos) and torch.equal(twin.arrays["xpos"], sim.arrays["xpos"])

@@ -61,7 +61,7 @@ def valid() -> dict:
     """Return a document that uses much of the grammar, its layout in line."""
     region = [{"facing": [0, 0, 1], "within": "60 deg"}, {"box": {"min": [0, 0, 0], "max": [1, 1, 1]}}, {"geoms": "a"}]
     grid = {"method": "grid", "rows": 2, "columns": 2, "radius": 0, "direction": [0, 0, 1], "region": region}
-    point = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 1}
+    point = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": 0.001}
     return {
         "tgdsl": 1,
         "robot": {

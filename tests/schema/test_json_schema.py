@@ -13,6 +13,7 @@ from tgdsl.errors import SpecError
 from tgdsl.schema import yaml
 from tgdsl.schema.document import json_schema
 from tgdsl.schema.files import robots_folder
+from tgdsl.schema.load import load
 from tgdsl.sensors import KINDS
 
 SCHEMA = json_schema()
@@ -77,6 +78,34 @@ def holds(key: str, schema: dict[str, Any], value: Any) -> bool:
     raise NotImplementedError(key)
 
 
+def places(schema: dict[str, Any], value: Any, path: yaml.Path = ()) -> set[str]:
+    """Return where an editor shows mistakes: an alternative of `anyOf` or `oneOf` that does not fit says no more than that."""
+    found: set[str] = set()
+    for key in schema:
+        wanted = schema[key]
+        if key in ANNOTATIONS or holds(key, schema, value):
+            continue
+        if key == "$ref":
+            found |= places(SCHEMA["$defs"][wanted.removeprefix("#/$defs/")], value, path)
+        elif key == "if":
+            found |= places(schema["then" if accepts(wanted, value) else "else"], value, path)
+        elif key == "properties":
+            found |= {place for k, v in value.items() if k in wanted for place in places(wanted[k], v, (*path, k))}
+        elif key in ("patternProperties", "additionalProperties") and wanted is not False:
+            known = schema.get("properties", {})
+            part = wanted if key == "additionalProperties" else next(iter(wanted.values()))
+            found |= {place for k, v in value.items() if k not in known for place in places(part, v, (*path, k))}
+        elif key == "additionalProperties":
+            found |= {yaml.spelled((*path, k)) for k in value if k not in schema.get("properties", {})}
+        elif key in ("items", "prefixItems"):
+            parts = [wanted] * len(value) if key == "items" else wanted
+            pairs = zip(parts, value, strict=False)
+            found |= {place for i, (part, v) in enumerate(pairs) for place in places(part, v, (*path, i))}
+        else:
+            found.add(yaml.spelled(path))
+    return found
+
+
 def plain(text: str) -> Any:
     return yaml.parse(text, "f").value
 
@@ -129,6 +158,45 @@ def test_wrong_documents_are_refused_where_a_schema_can(name):
 def test_wrong_layouts_are_refused_where_a_schema_can(name):
     layout = {"tgdsl": 1} | plain(LAYOUT.replace(POISSON, f"{POISSON[:-1]}, {WRONG_LAYOUT[name][0]}}}", 1))
     assert accepts(SCHEMA, layout) == (name in ("unordered box", "two of which one is wanted"))
+
+
+IN_A_SENSOR = {
+    "touch": {"kind": "contact", "links": "tips", "feels": ["ball"], "treshold": 0},
+    "skin": {"kind": "elastomer", "links": {"includ": ["a"]}, "feels": ["ball"], "boundary": {"drag": -1, "pad": {"faing": 1}}},
+    "force": {"kind": "kinematic_taxel", "links": "a", "feels": [3], "noise": {"whte_noise": 1, "read_delay": "4 mm"}},
+    "near": {"kind": "proximity", "links": "a", "feels": ["ball"], "history": {"length": 0}, "rate": "50 m"},
+    "typo": {"kind": "contct", "links": "a", "feels": ["ball"]},
+    "pad": {"kind": "contact", "links": "a", "feels": ["ball"], "noise": {"links": {"a": {"bais": 1}}}},
+}
+
+
+def test_a_mistake_is_shown_where_the_loader_finds_it():
+    """In sensors, in all alternatives of all of them: none is put down to the whole sensor."""
+    document = valid() | {"sensors": IN_A_SENSOR, "observations": {"policy": [{"type": "force", "fo": "x", "of": "touch"}]}}
+    document["objects"] = {"ball": {"geom": {"type": "box", "size": ["4 N"]}}, "cup": {"variants": [{"mesh": "a", "scl": 1}]}}
+    document["robot"]["layout"]["resolutions"]["low"]["a"] |= {"rows": 0, "region": [{"facing": [0, 0, "x"], "within": 1}]}
+    with pytest.raises(SpecError) as caught:
+        load(document).raise_problems()
+    wanted = {problem.path for problem in caught.value.problems}
+    assert places(SCHEMA, document) == wanted
+    assert len(wanted) == 17 and not wanted & {f"sensors.{name}" for name in IN_A_SENSOR}
+
+
+def test_nothing_is_left_to_a_choice_between_mappings():
+    """What `anyOf` still decides, beside alternatives that none of the keys tells apart, is between plain values."""
+
+    def choices(schema: Any, inside: str) -> set[str]:
+        if isinstance(schema, list):
+            return {found for part in schema for found in choices(part, inside)}
+        if not isinstance(schema, dict):
+            return set()
+        own = schema.get("anyOf", []) + schema.get("oneOf", [])
+        mappings = [part for part in own if "$ref" in part or "object" in part.get("type", "")]
+        is_last = inside == "else" and len(mappings) == len(own)  # where no key was found: any of them
+        found = {json.dumps(schema)} if mappings and not is_last else set()
+        return found | {found for key, part in schema.items() for found in choices(part, key)}
+
+    assert choices(SCHEMA, "") == set()
 
 
 QUANTITIES = ["4 mm", "4mm", "-4 mm", ".4e1 µm", "4.", "4", "4 mn", "4 MM", "mm", "4 mm 5", "", "٤ mm", "4 N", "1e-3 m"]

@@ -6,11 +6,15 @@ from tgdsl.schema.select import matching, select
 LINKS = [["palm"], ["index_tip", "index_mesh"], ["index_mid"], ["thumb_tip", "thumb_mesh"]]
 
 
-def chosen(include, exclude=(), groups=None) -> tuple[list[int], list[tuple[str, str, str]]]:
+def chosen(include, exclude=(), groups=None, **more) -> tuple[list[int], list[tuple[str, str, str]]]:
     named = {name: Selection(include=tuple(parts)) for name, parts in (groups or {}).items()}
     said: list[tuple[str, str, str]] = []
     selection = Selection(include=tuple(include), exclude=tuple(exclude))
-    found = select(selection, LINKS, named, lambda pattern, what, hint: said.append((pattern, what, hint)))
+
+    def report(where: tuple[str, int], what: str, hint: str) -> None:
+        said.append((getattr(selection, where[0])[where[1]], what, hint))
+
+    found = select(selection, LINKS, named, report, **more)
     return found, said
 
 
@@ -22,9 +26,24 @@ def test_wildcards_take_names_in_the_order_of_the_links_and_heed_case():
     assert matching("P*", ["palm", "Palm"]) == ["Palm"]
 
 
-def test_exclude_takes_away_and_may_match_nothing():
-    assert chosen(["*"], ["*_tip", "nobody"]) == ([0, 2], [])
+def test_exclude_takes_away_and_its_wildcards_may_match_nothing():
+    assert chosen(["*"], ["*_tip", "nobody*"]) == ([0, 2], [])
     assert chosen(["palm"], ["*"]) == ([], [])
+    assert chosen(["palm"], ["none"], {"none": ["zzz"]}) == ([0], [])
+
+
+def test_a_plain_name_in_exclude_exists():
+    assert chosen(["*"], ["*_tip", "thumb_mseh"]) == (
+        [0, 2],
+        [("thumb_mseh", 'no link matches "thumb_mseh"', 'did you mean "thumb_mesh"?')],
+    )
+    assert chosen(["*"], ["pal"], {"palms": ["palm"]}) == (
+        [0, 1, 2, 3],
+        [("pal", 'no link matches "pal"', 'did you mean "palm"?')],
+    )
+    assert chosen(["*"], ["back"], elsewhere=["back"]) == ([0, 1, 2, 3], [])
+    _, ((_, _, hint),) = chosen(["*"], ["bakc"], elsewhere=["back"])
+    assert hint == 'did you mean "back"?'
 
 
 def test_groups_may_hold_groups():

@@ -442,6 +442,15 @@ def test_what_cannot_be_is_refused_where_it_stands(tmp_path, fields, target, mes
     assert message in str(caught.value) and hint in str(caught.value)
 
 
+@pytest.mark.parametrize("readout", ["measured", "clean", "both"])
+def test_a_mistake_is_named_once_however_a_sensor_is_read(tmp_path, readout):
+    """A sensor that is read both ways with noise of its radii is computed twice, and has one place in the document."""
+    document = on_two_links(tmp_path, readout=readout, noise={"radius_noise": 0.1}, feels=["item", "floor"])
+    with pytest.raises(SpecError) as caught:
+        compile_plan(document)
+    assert [problem.path for problem in caught.value.problems] == ["sensors.s.feels[1]"]
+
+
 def test_the_papers_model_anchors_points(tmp_path):
     document = on_two_links(tmp_path, model="paper")
     del document["sensors"]["s"]["anchors"]

@@ -61,7 +61,8 @@ def bodies_of(counts, is_active, pos, outward):
     inverse_radius[body, rank] = is_active / 0.002
     boxes = np.array([box(pos[(body == b) & is_active]) for b in range(len(counts))])
     places = place(pos, outward, is_active)
-    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first, boxes, places)))
+    padded = np.concatenate([pos.T, -2.0 * outward.T])[:, taxel]
+    return Bodies(*map(torch.tensor, (taxel, inverse_radius, body * counts.max() + rank, first, boxes, places, padded)))
 
 
 def finger(rng, num_envs, num_contacts, steps):
@@ -104,9 +105,9 @@ def cases():
 
 
 def by_torch(case):
-    bodies, pos, depth, *rest = case
+    bodies, _, depth, *rest = case
     planes = [tuple(torch.tensor(value)) for value in rest[:4]]
-    return shared_forces(bodies, tuple(torch.tensor(pos)), torch.tensor(depth), *planes, *map(torch.tensor, rest[4:]))
+    return shared_forces(bodies, torch.tensor(depth), *planes, *map(torch.tensor, rest[4:]))
 
 
 def by_kernel(case):

@@ -1,6 +1,8 @@
 """Force taxels against their reference, and contacts made by hand: no force is lost, made up, or pushed where none can be."""
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import mujoco
@@ -15,6 +17,7 @@ from tgdsl.layout import Layout, Link
 from tgdsl.sensors.force_taxel import FORCE_TAXEL, ForceTaxelSpec, lower, reference_reports
 from tgdsl.state import SceneState
 from tgdsl.testing import KindConformance
+from tgdsl.testing.reference import assert_agrees
 
 G = 9.81
 ROUNDING = 1e-12
@@ -36,6 +39,15 @@ class TestForceTaxel(KindConformance):
                 np.testing.assert_allclose(readings["s/residual"][env], residual, atol=1e-12)
             assert readings["s/missed"].abs().max() > 0.1
             assert readings["s/residual"].abs().max() > 1e-4
+
+    @pytest.mark.filterwarnings("ignore:contacts of")
+    def test_what_slots_lack_is_shared_out_as_in_the_reference(self, scene):
+        """Pairs whose net force is that of more contacts than are shown: the definition adds it up one contact at a time."""
+        module, reference = self.build(self.document(scene), torch.float64)
+        for state in self.states(module):
+            lacking = torch.randn(state.contact_netforce.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+            state = dataclasses.replace(state, contact_netforce=state.contact_netforce + lacking)
+            assert_agrees(module(state)["s"], reference, state, self.float64_tolerance)
 
 
 class TestForceTaxelWithPressure(KindConformance):
@@ -310,6 +322,56 @@ def test_a_taxel_without_area_has_no_pressure():
     with pytest.raises(LowerError, match=r"^a taxel of no area has no pressure; leave pressure out, or give its area$"):
         lower(spec, layout, lambda name, parts: pytest.fail("no surface is needed"))
     assert lower(spec, dataclasses.replace(layout, area=np.ones(1)), lambda name, parts: pytest.fail("none")).slots == 8
+
+
+THREADS = Path("/proc/self/task")
+READ_IN_ONE_ENVIRONMENT = """
+import os, pathlib, time, torch, tgdsl
+
+def of_others():
+    threads = [each for each in pathlib.Path("/proc/self/task").iterdir() if int(each.name) != os.getpid()]
+    return sum(int((each / "schedstat").read_text().split()[0]) for each in threads)
+
+torch.set_num_threads(2)
+touch = tgdsl.compile({document!r})
+assert len(touch.taxels["s"]) == 2256
+state = touch.example_state(1)
+with torch.no_grad():
+    touch(state)
+    time.sleep(0.5)
+    times = [of_others()]
+    for _ in range(3):
+        touch(state)
+    times.append(of_others())
+    torch.exp(torch.ones(1, 8, 2256))
+    times.append(of_others())
+print(times[1] - times[0], times[2] - times[1])
+"""
+
+
+@pytest.mark.skipif(not (THREADS.parent / "schedstat").exists(), reason="how long each thread ran is not known here")
+def test_one_environment_is_read_by_one_thread(tmp_path):
+    """Some of torch's operations hand a few thousand numbers to a second thread and wait for it, which may be long in coming.
+
+    What is looked at is for how long other threads ran, not how long anything took.
+    """
+    (tmp_path / "scene.xml").write_text(
+        "<mujoco><worldbody><body name='pad'><geom type='box' size='.05 .05 .01'/></body>"
+        "<body name='cube' pos='0 0 .03'><freejoint/><geom type='box' size='.02 .02 .02'/></body></worldbody></mujoco>"
+    )
+    grid = {"method": "grid", "rows": 47, "columns": 48, "direction": [0, 0, -1], "radius": 0.004}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": grid}}}},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"s": {"kind": "force_taxel", "links": "pad", "feels": ["cube"]}},
+    }
+    script = READ_IN_ONE_ENVIRONMENT.format(document=document)
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    reads, exponential = map(int, run.stdout.split())
+    assert exponential > 0  # a second thread there is
+    assert reads == 0
 
 
 def test_deeper_taxels_carry_more(tmp_path):

@@ -1,19 +1,35 @@
-"""What takes long to compute, kept as arrays in the user's cache folder under a hash of what it was computed from."""
+"""What takes long to compute, kept as arrays in the user's cache folder under a hash of what it was computed from.
+
+The folder has a bound: what was not used for longest goes first. Several processes may use it at once: files appear whole and
+go whole, whoever has one open reads it to its end, and all forget files in the same order.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import re
 import tempfile
+import time
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from tgdsl.errors import TgdslError
+
 T = TypeVar("T")
+MAX_BYTES = 2 * 2**30
+"""Size that the folder is kept to, if `TGDSL_CACHE_BYTES` gives no other."""
+_ENTRY = re.compile(r"[0-9a-f]{64}\.npz")
+_UNFINISHED = re.compile(r"[0-9a-f]{64}\..*\.tmp")
+_ABANDONED = 3600.0
+"""Age at which an unfinished file is one whose process has ended [s]."""
 
 
 def folder() -> Path:
@@ -22,6 +38,55 @@ def folder() -> Path:
         return Path(own)
     shared = os.environ.get("XDG_CACHE_HOME")
     return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "tgdsl"
+
+
+def max_bytes() -> int:
+    """Return the size that the folder is kept to: `TGDSL_CACHE_BYTES`, or `MAX_BYTES`.
+
+    Raises:
+        TgdslError: If that is no number of bytes.
+    """
+    own = os.environ.get("TGDSL_CACHE_BYTES", "")
+    if own and not own.isdecimal():
+        raise TgdslError(f'TGDSL_CACHE_BYTES is "{own}", expected a number of bytes such as {MAX_BYTES}')
+    return int(own) if own else MAX_BYTES
+
+
+@dataclass(frozen=True, order=True)
+class Entry:
+    """A file of the cache: when it was last used [s since the epoch], where it is, and its size [bytes]."""
+
+    used: float
+    file: Path
+    size: int
+
+
+def entries() -> list[Entry]:
+    """Return the files of the cache, what was not used for longest first; other files in the folder are none of it."""
+    found = []
+    for file in folder().glob("*") if folder().is_dir() else ():
+        with contextlib.suppress(OSError):  # another process has just removed it
+            state = file.stat()
+            is_abandoned = _UNFINISHED.fullmatch(file.name) and time.time() - state.st_mtime > _ABANDONED
+            if _ENTRY.fullmatch(file.name) or is_abandoned:
+                found.append(Entry(state.st_mtime, file, state.st_size))
+    return sorted(found)
+
+
+def forget(limit: int) -> list[Entry]:
+    """Remove what was not used for longest until the cache is no larger than a limit [bytes]; return what was removed."""
+    known = entries()
+    size, removed = sum(entry.size for entry in known), []
+    for entry in known:
+        if size <= limit:
+            break
+        size -= entry.size  # also if another process has removed it: that one counted it too
+        try:
+            entry.file.unlink()
+            removed.append(entry)
+        except OSError:
+            pass
+    return removed
 
 
 def digest(format: bytes, arrays: Sequence[np.ndarray]) -> str:
@@ -45,16 +110,28 @@ def cached(
         make: Computes the value.
         pack: Returns its arrays.
         unpack: Returns the value of its arrays; raises ValueError, KeyError, IndexError or TypeError if they are none.
+
+    Raises:
+        TgdslError: If `TGDSL_CACHE_BYTES` is no number of bytes.
     """
-    file = folder() / f"{key}.npz"
+    file, limit = folder() / f"{key}.npz", max_bytes()
     try:
         with file.open("rb") as raw, np.load(raw, allow_pickle=False) as found:
-            return unpack(found)
+            value = unpack(found)
+        _touch(file)
+        return value
     except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         pass  # there is none, or it is damaged
     value = make()
     _write(file, pack(value))
+    forget(limit)
     return value
+
+
+def _touch(file: Path) -> None:
+    """Note that a file was used: many file systems do not note when one was read."""
+    with contextlib.suppress(OSError):  # it is somebody else's, or was just removed
+        os.utime(file)
 
 
 def _write(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -62,7 +139,7 @@ def _write(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
     temporary = None
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".tmp", delete=False) as out:
+        with tempfile.NamedTemporaryFile(dir=file.parent, prefix=f"{file.stem}.", suffix=".tmp", delete=False) as out:
             temporary = Path(out.name)
             np.savez(out, allow_pickle=False, **arrays)
         temporary.replace(file)

@@ -148,14 +148,15 @@ def _groups(robot: Model, layout: LoadedLayout) -> dict[str, list[str]]:
         SpecError: If a group has a pattern that matches nothing.
     """
     candidates = [[body, *(n for geom in robot.touchable(body) for n in geom.names)] for body in robot.bodies]
+    names = [name for geom in robot.geoms for name in geom.names]
     problems: list[Problem] = []
     found: dict[str, list[str]] = {}
     for group, selection in layout.spec.groups.items():
 
-        def report(pattern: str, what: str, hint: str, group: str = group) -> None:
+        def report(where: tuple[str, int], what: str, hint: str, group: str = group) -> None:
             problems.append(layout.problem(("groups", group), what, hint))
 
-        for i in select(selection, candidates, layout.spec.groups, report, group):
+        for i in select(selection, candidates, layout.spec.groups, report, group, names):
             found.setdefault(robot.bodies[i], []).append(group)
     if problems:
         raise SpecError(problems)

@@ -36,6 +36,7 @@ from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel
+from tgdsl.sensors.known import check_names
 from tgdsl.sensors.noise.lower import LoweredNoise
 
 
@@ -60,6 +61,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Dra
     taxels = resolved.layout.taxels_of(resolved.links[name])
     layout = resolved.layout.take(taxels)
     clean = kind.lower(spec, layout, resolved.surface_of)
+    check_names(kind, clean)
     if spec.readout == "clean":
         return [DraftSensor(name, kind.name, spec, taxels, clean, f"sensors/{name}", (name,), None, kind.is_pointwise)]
     knobs = knobs_of(loaded, resolved, name, layout, kind)
@@ -201,7 +203,7 @@ def _settle_moments(loaded: Loaded, work: Draft, progress: Progress) -> None:
 def _settle_points(loaded: Loaded, resolved: Resolved, work: Draft, progress: Progress) -> None:
     """Sample objects, and decide how distances to the links that they meet are found; what has no surface is a mistake."""
     for sensor in (sensor for sensor in work.sensors if sensor.lowered.points is not None):
-        request, path = sensor.lowered.points, ("sensors", sensor.name)
+        request, path = sensor.lowered.points, ("sensors", sensor.sensor)
         assert request is not None
         for i, name in enumerate(sensor.feels):
             try:
@@ -286,6 +288,7 @@ def _sensor(
         noise=None if part.noise is None else _noise(part.noise),
         period=0.0 if part.spec.rate is None else 1.0 / part.spec.rate,
         history=None if history is None else PlannedHistory(history.length, history.reduce, history.view),
+        notes=lowered.notes,
     )
 
 

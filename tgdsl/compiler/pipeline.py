@@ -25,7 +25,8 @@ from tgdsl.plan import Origin, Plan
 from tgdsl.progress import Progress, silent
 from tgdsl.scene import portable
 from tgdsl.schema.load import Loaded, load
-from tgdsl.sensors import Kind, known_kinds
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
 
 Document = str | PathLike[str] | Mapping[str, Any]
 
@@ -41,7 +42,7 @@ def compile_plan(
     Args:
         document: A YAML file, or the same as a mapping.
         overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         progress: Is told in a line what is being done, each time that something begins.
 
     Raises:
@@ -68,7 +69,7 @@ def layouts(
         document: A YAML file, or the same as a mapping; without sensors, all taxels of its layout count.
         overrides: YAML text, or plain values, by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
 
     Returns:
         The model of the scene, or of the robot if there is no scene, and the layouts by resolution.
@@ -108,7 +109,7 @@ def compile(
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
         resolution: Instead of the document's own.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
             are refused, as their rounding of places is as large as the depths; cast the readings instead,
             `readings["s"].to(torch.bfloat16)`.
@@ -122,8 +123,8 @@ def compile(
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
-        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides
-            are no mapping.
+        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
+            no mapping.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     if not isinstance(overrides, Mapping | None):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,9 @@ _ABOUT = {
 }
 _NO_PALM = "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n"
 
+USUAL_DENSITY = (100.0, math.inf)
+"""Taxels per area below which another unit was most likely meant [1/m²]: one per square decimetre."""
+
 
 def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool) -> list[str]:
     """Propose a layout for a robot and write it; return what to tell the user.
@@ -54,6 +59,8 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         raise TgdslError(f"--density: {error}") from error
     if per_area <= 0:
         raise TgdslError(f"--density: {density} is out of range, expected more than 0")
+    if (what := units.doubt(per_area, "density", *USUAL_DENSITY)) is not None:
+        warnings.warn(f"--density {density}: {'; '.join(what)}", stacklevel=2)
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     writable(out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +14,15 @@ from tgdsl.compiler.robot import Geom, Model, load_model
 from tgdsl.compiler.sample import Samples, sample
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
+from tgdsl.fields import Selection, SpecModel
 from tgdsl.geometry.surface import Surface
 from tgdsl.layout import Layout, Link
 from tgdsl.progress import Progress, silent
-from tgdsl.regions import RegionPart
+from tgdsl.regions import OnGeoms, RegionPart
 from tgdsl.schema.files import is_file, robot_names
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
-from tgdsl.schema.select import Report, matching, select
+from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 
 
@@ -157,17 +158,37 @@ def _check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -
 
 
 def _reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
-    """Return a function that notes a pattern which finds nothing, at the place where the pattern stands."""
+    """Return a function that notes what is wrong with a pattern, at the place where the pattern stands."""
 
-    def report(pattern: str, what: str, hint: str) -> None:
-        for inner in ((*path, "include"), path):
-            raw = owner.raw(inner)
-            if isinstance(raw, list) and pattern in raw:
-                problems.append(owner.problem((*inner, raw.index(pattern)), what, hint))
-                return
-        problems.append(owner.problem(path, what, hint))
+    def report(where: tuple[str, int], what: str, hint: str) -> None:
+        written = owner.raw(path)  # `links: a` and `links: [a]` stand for `links: {include: [a]}`
+        place = where if isinstance(written, dict) else where[1:] if isinstance(written, list) else ()
+        problems.append(owner.problem((*path, *place), what, hint))
 
     return report
+
+
+def _geom_selections(owner: Loaded | LoadedLayout, value: object, path: Path) -> Iterator[tuple[Path, Selection]]:
+    """Yield each selection of geoms in a part of a document, and where it stands."""
+    if isinstance(value, OnGeoms):
+        yield (*path, "geoms"), value.geoms
+    elif isinstance(value, SpecModel):
+        for name in type(value).model_fields:
+            yield from _geom_selections(owner, getattr(value, name), (*path, name))
+    elif isinstance(value, tuple):
+        is_list = isinstance(owner.raw(path), list)  # one region may stand for a list of one
+        for i, part in enumerate(value):
+            yield from _geom_selections(owner, part, (*path, i) if is_list else path)
+
+
+def _check_regions(owner: Loaded | LoadedLayout, value: object, path: Path, robot: Model, problems: list[Problem]) -> None:
+    """Note the plain names that regions exclude and that nothing has; what they include is looked up on each link."""
+    names = sorted({name for geom in robot.geoms for name in geom.names})
+    for place, selection in _geom_selections(owner, value, path):
+        report = _reporter(owner, place, problems)
+        for i, name in enumerate(selection.exclude):
+            if is_plain(name) and name not in names:
+                report(("exclude", i), f'no geom or mesh matches "{name}"', did_you_mean(name, names, "geoms and meshes"))
 
 
 def _patches(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]) -> list[Patch]:
@@ -175,6 +196,7 @@ def _patches(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dic
     found: dict[str, Patch] = {}
     for pattern, placement in placements.items():
         path: Path = ("resolutions", str(loaded.resolution), pattern)
+        _check_regions(layout, placement, path, robot, loaded.problems)
         hits = _matched(robot, pattern)
         if not hits:
             known = [name for names in _names(robot) for name in names]
@@ -215,15 +237,17 @@ def _matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
 def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
     candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
     on_robot = _names(robot)
+    known = [name for names in (*on_robot, *candidates) for name in names]
     links: dict[str, tuple[str, ...]] = {}
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
+        _check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
         missing: list[Problem] = []
-        chosen = select(sensor.links, candidates, layout.spec.groups, _reporter(loaded, path, missing))
+        chosen = select(sensor.links, candidates, layout.spec.groups, _reporter(loaded, path, missing), elsewhere=known)
         if missing:
             # A name that the robot has but the layout does not is another mistake than a name nobody has.
             unknown: list[Problem] = []
-            select(sensor.links, on_robot, layout.spec.groups, _reporter(loaded, path, unknown))
+            select(sensor.links, on_robot, layout.spec.groups, _reporter(loaded, path, unknown), elsewhere=known)
             what = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
             hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
             loaded.problems += unknown or [loaded.problem(path, what, hint)]
@@ -269,7 +293,7 @@ def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, 
     candidates = [[patch.link.name, patch.link.body] for patch in patches]
     groups: dict[str, tuple[str, ...]] = {}
     for group, selection in sorted(layout.spec.groups.items()):
-        chosen = select(selection, candidates, layout.spec.groups, lambda pattern, what, hint: None)
+        chosen = select(selection, candidates, layout.spec.groups, lambda where, what, hint: None)
         if chosen:
             groups[group] = tuple(patches[i].link.name for i in chosen)
     return groups

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import mujoco
-import numpy as np
 
+from tgdsl.compiler.compare import differing
 from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
-from tgdsl.errors import RobotError
+from tgdsl.errors import RobotError, listed
+from tgdsl.places import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
-from tgdsl.scene import compiled, portable
+from tgdsl.scene import compiled, muted_mujoco, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""
@@ -27,42 +28,10 @@ OBJECT_TYPES = {"body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ
 """MuJoCo's types of what an object's part is."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
 """MuJoCo's ways to reduce contacts, in the order of its numbers."""
-COMPARED = (
-    "body_pos",
-    "body_quat",
-    "body_mass",
-    "body_inertia",
-    "body_ipos",
-    "geom_pos",
-    "geom_quat",
-    "geom_size",
-    "geom_friction",
-    "geom_solref",
-    "geom_contype",
-    "geom_conaffinity",
-    "mesh_vert",
-    "jnt_axis",
-    "jnt_range",
-    "jnt_pos",
-    "dof_damping",
-    "dof_armature",
-    "actuator_gainprm",
-    "actuator_biasprm",
-    "actuator_forcerange",
-    "actuator_ctrlrange",
-    "key_qpos",
-    "key_ctrl",
-    "exclude_signature",
-    "eq_data",
-    "tendon_range",
-)
-"""Arrays of the compiled model that a kept scene must reproduce."""
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
 """Elements of an MJCF file's `<asset>` that name a file."""
 FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
 """How they name it: the sides of a cube's texture have one each."""
-FOLDER_ATTRIBUTES = ("assetdir", "meshdir", "texturedir")
-"""Attributes of `<compiler>` that say in which folder assets lie."""
 
 
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
@@ -197,7 +166,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
         again = compiled(scene, kept.contents)
     except ValueError as error:
         raise RobotError(f"{model.file}: MuJoCo cannot read what is kept of this scene: {error}") from error
-    _compare(model, again)
+    _compare(model, inputs, again)
     return scene
 
 
@@ -256,6 +225,8 @@ class _Kept:
         return key
 
     def _asset(self, path: Path) -> str:
+        if path.suffix.lower() not in ENDINGS:
+            raise RobotError(f"{path}: a mesh, texture, height field or skin has one of the endings {listed(ENDINGS)}")
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()
         key = f"{digest[:32]}{path.suffix.lower()}"
@@ -284,13 +255,13 @@ def _found(name: str, subfolders: list[str], folders: list[Path], file: Path) ->
     raise RobotError(f'{file}: the file "{name}" that it names was not found')
 
 
-def _compare(model: Model, again: mujoco.MjModel) -> None:
-    """Refuse a kept scene that is not the loaded one: same elements, same numbers to the digits MuJoCo writes."""
-    for kind, count in {"body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu", "keyframe": "nkey"}.items():
-        names = [[getattr(m, kind)(i).name for i in range(getattr(m, count))] for m in (model.compiled, again)]
-        if names[0] != names[1]:
-            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: names of {kind}s differ")
-    for name in COMPARED:
-        loaded, kept = getattr(model.compiled, name), getattr(again, name)
-        if loaded.shape != kept.shape or not np.allclose(loaded, kept, rtol=1e-4, atol=1e-6):
-            raise RobotError(f"{model.file}: this scene cannot be kept faithfully: {name} differs")
+def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
+    """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted.
+
+    Raises:
+        RobotError: If any field of its compiled model differs: see `compare.differing`.
+    """
+    with muted_mujoco():
+        loaded = instrument(model.spec.copy(), inputs).compile()
+    if names := differing(loaded, again, model.is_urdf):
+        raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")

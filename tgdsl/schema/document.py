@@ -9,10 +9,12 @@ from pydantic import Field, StringConstraints, Tag, create_model
 
 from tgdsl.fields import TEXT_OR_OTHER, SpecModel, Text
 from tgdsl.observations import ObservationSpec
+from tgdsl.schema.branches import decided
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.base import ProbeSpec
+from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise import NoiseSpec
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
@@ -65,15 +67,16 @@ def document_model(kinds: tuple[Kind, ...] = KINDS, needs_sensors: bool = True) 
     return create_model("Document", __base__=Spec, __doc__=Spec.__doc__, sensors=sensors)
 
 
-def json_schema(kinds: tuple[Kind, ...] = KINDS) -> dict[str, Any]:
-    """Return the JSON Schema of documents and of layout files, for editors."""
-    document = document_model(kinds).model_json_schema(ref_template="#/$defs/{model}")
+def json_schema(kinds: tuple[Kind, ...] | None = None) -> dict[str, Any]:
+    """Return the JSON Schema of documents and of layout files, for editors; default: with all kinds of `known_kinds`."""
+    document = document_model(known_kinds() if kinds is None else kinds).model_json_schema(ref_template="#/$defs/{model}")
     layout = LayoutSpec.model_json_schema(ref_template="#/$defs/{model}")
     layout["required"] = sorted({*layout["required"], "tgdsl"})
     definitions = {**layout.pop("$defs", {}), **document.pop("$defs", {})}
     document.pop("title", None)
     layout.pop("title", None)
     definitions |= {"Document": document, "Layout": layout}
+    definitions = {name: decided(definition, definitions) for name, definition in definitions.items()}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "tgdsl document or layout",

@@ -16,6 +16,7 @@ from tgdsl.schema import files, yaml
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.faults import read_as
 from tgdsl.schema.placement import LayoutSpec
+from tgdsl.schema.unusual import warn_of_unusual
 from tgdsl.schema.yaml import Path, Source
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
@@ -113,6 +114,8 @@ def load(
         source, folder = yaml.from_mapping(document, "<mapping>"), FilePath.cwd()
     else:
         source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
+    if source.value is None:
+        raise SpecError(source.problems)
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     model = document_model(kinds, needs_sensors)
@@ -124,6 +127,9 @@ def load(
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
     loaded.layout = _layout(loaded)
     problems += _name_problems(loaded, kinds)
+    warn_of_unusual(source, spec)
+    if loaded.layout is not None and loaded.layout.source is not source:
+        warn_of_unusual(loaded.layout.source, loaded.layout.spec)
     return loaded
 
 
@@ -158,7 +164,11 @@ def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tupl
 
 def _read_file(path: FilePath, name: str) -> Source:
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(yaml.MAX_BYTES + 1)
+        if large := yaml.too_large(content, name):
+            raise SpecError([large])
+        text = content.decode("utf-8")
     except OSError as error:
         raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
     except UnicodeDecodeError as error:

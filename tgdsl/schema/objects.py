@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields import Number, Position, Positive, PositiveLength, SpecModel
+from tgdsl.fields import Number, Position, Positive, PositiveLength, SpecModel, Usual
 
 NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 """How many sizes a primitive has, as MuJoCo defines them: radius; radius and half-length; half-lengths."""
@@ -19,11 +19,11 @@ def _oriented(quat: tuple[float, float, float, float]) -> tuple[float, float, fl
 
 
 class _PlacedGeom(SpecModel):
-    pos: Position = (0.0, 0.0, 0.0)
+    pos: Annotated[Position, Usual("length", high=10.0)] = (0.0, 0.0, 0.0)
     """Origin of its frame in the body's frame [m]."""
     quat: tuple[Number, Number, Number, Number] = (1.0, 0.0, 0.0, 0.0)
     """Orientation of its frame in the body's frame, w, x, y, z."""
-    density: Positive = 1000.0
+    density: Annotated[Positive, Usual("number", low=5.0, high=25000.0)] = 1000.0
     """Its density [kg/m³]; counts unless the body's inertia is given in the scene."""
 
     @model_validator(mode="after")
@@ -37,7 +37,7 @@ class PrimitiveGeom(_PlacedGeom):
 
     type: Literal["sphere", "capsule", "cylinder", "ellipsoid", "box"]
     """Its type, by MuJoCo's name."""
-    size: Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=3)]
+    size: Annotated[tuple[PositiveLength, ...], Field(min_length=1, max_length=3), Usual("length", low=1e-4, high=5.0)]
     """Its size as MuJoCo defines it: radius; radius and half-length; half-lengths along x, y, z [m]."""
 
     @model_validator(mode="after")
@@ -99,7 +99,7 @@ class ObjectSpec(SpecModel):
     """The same, of which each environment takes one: see `SceneState.variant`."""
     size: Literal["fixed", "per_env"] = "fixed"
     """`per_env` if its size is part of the state: see `SceneState.object_size`. It (and each variant) is then one primitive."""
-    pos: Position | None = None
+    pos: Annotated[Position | None, Usual("length", high=10.0)] = None
     """Where a body of its own starts, in the world [m]; default: the origin."""
     quat: tuple[Number, Number, Number, Number] | None = None
     """How it is turned there, w, x, y, z; default: not at all."""
@@ -112,7 +112,7 @@ class ObjectSpec(SpecModel):
     query: Literal["sdf", "raycast"] = "sdf"
     """How distances to its meshes are found: on a grid baked at compile time, or to the nearest triangle at run time (needs
     warp-lang). Primitives are exact either way."""
-    tolerance: PositiveLength = 5e-5
+    tolerance: Annotated[PositiveLength, Usual("length", high=0.005)] = 5e-5
     """Distance error that a grid may have, 99th percentile away from sharp edges [m]."""
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of a grid [bytes]."""

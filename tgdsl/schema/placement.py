@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields import TEXT_OR_OTHER, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, Text
+from tgdsl.fields import TEXT_OR_OTHER, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, Text, Usual
 from tgdsl.regions import Region
 
 MAX_COUNT = 1_000_000
@@ -14,7 +14,7 @@ Count = Annotated[StrictInt, Field(ge=1, le=MAX_COUNT)]
 
 
 class _Sampled(SpecModel):
-    radius: Radius
+    radius: Annotated[Radius, Usual("length", low=1e-5, high=0.1)]
     """Sensing radius of each probe [m]; 0 makes it an inactive filler."""
     region: Region = ()
     """Part of the surface to sample: a region, or a list of regions that means their intersection; default: all of it."""
@@ -55,7 +55,7 @@ class Poisson(_Sampled):
     """Irregular, evenly spread samples."""
     count: Count | None = None
     """Exact number of samples."""
-    spacing: PositiveLength | None = None
+    spacing: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Least distance between samples [m], instead of `count`."""
     seed: Annotated[StrictInt, Field(ge=0)] = 0
     """Seed of the sampling."""
@@ -70,13 +70,13 @@ class Poisson(_Sampled):
 class Point(SpecModel):
     """One probe, given by hand."""
 
-    pos: Position
+    pos: Annotated[Position, Usual("length", high=5.0)]
     """Position in the link frame [m]."""
     normal: Direction
     """Outward normal in the link frame; is made unit."""
-    radius: Radius | None = None
+    radius: Annotated[Radius | None, Usual("length", low=1e-5, high=0.1)] = None
     """Sensing radius [m]; default: the `radius` of the list."""
-    area: Area | None = None
+    area: Annotated[Area | None, Usual("area", high=0.01)] = None
     """Surface that the probe stands for [m²]; default: the disc of its radius."""
 
 
@@ -87,7 +87,7 @@ class Points(SpecModel):
     """Explicit probes."""
     points: Annotated[Text | Annotated[tuple[Point, ...], Field(min_length=1), Tag("other")], TEXT_OR_OTHER]
     """The probes, or the name of a CSV file beside the layout (SI units)."""
-    radius: Radius | None = None
+    radius: Annotated[Radius | None, Usual("length", low=1e-5, high=0.1)] = None
     """Sensing radius of the points that name none [m]."""
 
     @model_validator(mode="after")

@@ -8,13 +8,18 @@ from fnmatch import fnmatchcase
 from tgdsl.errors import did_you_mean
 from tgdsl.fields import Selection
 
-Report = Callable[[str, str, str], None]
-"""Called with the pattern, what is wrong with it, and a hint."""
+Report = Callable[[tuple[str, int], str, str], None]
+"""Called with where a pattern stands in its selection, such as `("exclude", 1)`, what is wrong with it, and a hint."""
 
 
 def matching(pattern: str, names: Sequence[str]) -> list[str]:
     """Return the names that a shell wildcard matches, in order; case counts."""
     return [name for name in names if fnmatchcase(name, pattern)]
+
+
+def is_plain(pattern: str) -> bool:
+    """Return whether a pattern is a name, with no shell wildcards."""
+    return not any(character in pattern for character in "*?[")
 
 
 def select(
@@ -23,6 +28,7 @@ def select(
     groups: Mapping[str, Selection],
     report: Report,
     group: str | None = None,
+    elsewhere: Sequence[str] = (),
 ) -> list[int]:
     """Return the candidates that a selection takes, in the candidates' order.
 
@@ -31,20 +37,27 @@ def select(
         candidates: The names that each candidate answers to.
         groups: Named selections that may stand in place of names, also within one another. In its own definition a group's name
             means the link that is called so.
-        report: Called for each pattern of the selection itself that matches nothing; an `exclude` may match nothing.
+        report: Called for each pattern of the selection itself that matches nothing. Wildcards and groups in `exclude` may, so
+            that one selection serves several robots; a plain name may not.
         group: The selection's own name, if it is a group: that it contains itself is reported too.
+        elsewhere: Names that no candidate has but something else, so that to exclude them is no mistake.
 
     Returns:
         Indices of the chosen candidates, ascending.
     """
     known = [*groups, *(name for names in candidates for name in names)]
-    for pattern in selection.include:
+    for i, pattern in enumerate(selection.include):
         if pattern in groups and not _group(pattern, candidates, groups, ()) and pattern != group:
-            report(pattern, f'group "{pattern}" holds no link', "")
+            report(("include", i), f'group "{pattern}" holds no link', "")
         elif pattern not in groups and not _matched(pattern, candidates):
-            report(pattern, f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
+            report(("include", i), f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
+    for i, name in enumerate(selection.exclude):
+        if is_plain(name) and name not in known and name not in elsewhere:
+            hint = did_you_mean(name, [*known, *elsewhere], "links")
+            report(("exclude", i), f'no link matches "{name}"', hint)
     if group is not None and (circle := _circle(group, group, candidates, groups, ())):
-        report(circle[0], f'group "{group}" contains itself', " → ".join([group, *circle]))
+        patterns = {name: (part, i) for part in ("exclude", "include") for i, name in enumerate(getattr(selection, part))}
+        report(patterns[circle[0]], f'group "{group}" contains itself', " → ".join([group, *circle]))
     return sorted(_chosen(selection, candidates, groups, () if group is None else (group,)))
 
 

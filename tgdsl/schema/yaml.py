@@ -5,11 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 
 from tgdsl.errors import Problem
 
@@ -17,7 +19,15 @@ Path = tuple[str | int, ...]
 
 MAX_DEPTH = 50
 """Values that are nested more deeply are refused, before Python's own limit is reached in some odd place."""
+MAX_BYTES = 2 * 2**20
+"""Size of the largest file that is read, comments included."""
+MAX_NODES = 100_000
+"""Most names and values of a document, each alias counted as what it stands for: some 7,000 points in line."""
+MAX_TEXT = 10_000
+"""Characters of the longest name or value."""
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep"
+_TOO_MANY = f"more than {MAX_NODES} names and values, aliases counted as what they stand for"
+_HINT = "long lists of points go into a CSV file beside the layout"
 
 
 class Unreadable:
@@ -99,47 +109,110 @@ def spelled(path: Path) -> str:
     return text
 
 
+class _TooManyError(Exception):
+    """Ends the reading of a document that has more than `MAX_NODES` names and values.
+
+    Attributes:
+        line: Line of the value that has too many, from 1; 0 where there is none.
+        column: Its column.
+        path: Its path, if that is known.
+    """
+
+    def __init__(self, line: int, column: int, path: Path):
+        self.line, self.column, self.path = line, column, path
+        super().__init__(_TOO_MANY)
+
+
+class _BoundedComposer(Composer):
+    """Composes no value that holds more than a document may, aliases unfolded, and none that is nested much too deep."""
+
+    num_open = 0
+
+    def __init__(self, loader: Any = None):
+        super().__init__(loader=loader)
+        self.num_nodes = 0
+        self.sizes: dict[int, int] = {}  # names and values in each node that is whole; aliases leave out those that are not
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose one node and those in it."""
+        mark = self.parser.peek_event().start_mark
+        self.num_nodes += 1
+        self.num_open += 1
+        if self.num_open > 2 * MAX_DEPTH:
+            raise RecursionError  # a value that is only a little too deep is named by its path when it is read
+        node = super().compose_node(parent, index)
+        self.num_open -= 1
+        inner = [part for pair in node.value for part in pair] if isinstance(node, MappingNode) else node.value
+        parts = inner if isinstance(node, CollectionNode) else ()
+        size = self.sizes.setdefault(id(node), 1 + sum(self.sizes.get(id(part), 1) for part in parts))
+        if max(size, self.num_nodes) > MAX_NODES:
+            raise _TooManyError(mark.line + 1, mark.column + 1, ())
+        return node
+
+
+def too_large(content: bytes, file: str) -> Problem | None:
+    """Return what is wrong with a file's content, or with its first `MAX_BYTES` + 1 bytes; None if nothing is."""
+    if len(content) <= MAX_BYTES:
+        return None
+    line = content.count(b"\n", 0, MAX_BYTES) + 1
+    return Problem(file, line, 1, "", f"more than {MAX_BYTES} bytes, comments included", _HINT)
+
+
 def parse(text: str, file: str) -> Source:
     """Read one YAML document; mistakes are noted in the result, not raised."""
     source = Source(file)
     yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _BoundedComposer
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ReusedAnchorWarning)  # an anchor may be set anew
             node = yaml.compose(text)
+        if node is None:
+            source.problems.append(Problem(file, 1, 1, "", "the document is empty"))
+        else:
+            source.value = _Reader(source, yaml).read(node, (), ())
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
         source.problems.append(Problem(file, line, column, "", f"not YAML: {error.problem or error.context}"))
-        return source
     except YAMLError as error:
         source.problems.append(Problem(file, 1, 1, "", f"not YAML: {' '.join(str(error).split())}"))
-        return source
     except RecursionError:
         source.problems.append(Problem(file, 1, 1, "", _TOO_DEEP))
-        return source
-    if node is None:
-        source.problems.append(Problem(file, 1, 1, "", "the document is empty"))
-        return source
-    source.value = _Reader(source, yaml).read(node, (), ())
+    except _TooManyError as error:
+        _refuse(source, error)
     return source
 
 
 def from_mapping(value: Mapping[str, Any], file: str) -> Source:
     """Return a document that was built in Python; its mistakes have paths but no lines."""
     source = Source(file)
-    source.value = _plain(value, (), source)
+    try:
+        source.value = _plain(value, (), source, count())
+    except _TooManyError as error:
+        _refuse(source, error)
     return source
 
 
-def _plain(value: Any, path: Path, source: Source) -> Any:
+def _refuse(source: Source, error: _TooManyError) -> None:
+    """Leave a document without a value, and only what ended its reading for a mistake."""
+    source.value = None
+    source.problems = [Problem(source.file, error.line, error.column, spelled(error.path), _TOO_MANY, _HINT)]
+
+
+def _plain(value: Any, path: Path, source: Source, counter: count[int]) -> Any:
+    if next(counter) >= MAX_NODES:
+        raise _TooManyError(0, 0, path)
     if len(path) > MAX_DEPTH:
         source.problems.append(Problem(source.file, 0, 0, spelled(path), _TOO_DEEP))
         return Unreadable
     if isinstance(value, Mapping):
-        return {str(key): _plain(part, (*path, str(key)), source) for key, part in value.items()}
+        return {str(key): _plain(part, (*path, str(key)), source, counter) for key, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
-        return [_plain(part, (*path, i), source) for i, part in enumerate(value)]
+        return [_plain(part, (*path, i), source, counter) for i, part in enumerate(value)]
+    if isinstance(value, str) and (wrong := _wrong_text(value)):
+        source.problems.append(Problem(source.file, 0, 0, spelled(path), wrong))
+        return Unreadable
     return value
 
 
@@ -163,8 +236,8 @@ class _Reader:
             return self.mapping(node, path, (*inside, id(node)))
         if isinstance(node, SequenceNode):
             return [self.read(part, (*path, i), (*inside, id(node))) for i, part in enumerate(node.value)]
-        if not _is_text(node.value):
-            self.note(node, path, "half of a surrogate pair is no text")
+        if wrong := _wrong_text(node.value):
+            self.note(node, path, wrong)
             return Unreadable
         try:
             return self.constructor.construct_object(node)
@@ -184,7 +257,7 @@ class _Reader:
         for (key_node, value_node), is_merged in zip(node.value, is_merge, strict=True):
             if is_merged:
                 continue
-            if not isinstance(key_node, ScalarNode) or not _is_text(key_node.value):
+            if not isinstance(key_node, ScalarNode) or _wrong_text(key_node.value):
                 self.note(key_node, path, "a key must be a plain name")
                 continue
             key = str(key_node.value)
@@ -209,5 +282,9 @@ class _Reader:
         return result
 
 
-def _is_text(text: str) -> bool:
-    return not any("\ud800" <= character <= "\udfff" for character in text)
+def _wrong_text(text: str) -> str:
+    """Return what is wrong with a name or a value as text, or nothing."""
+    if len(text) > MAX_TEXT:
+        return f"found a text of {len(text)} characters, expected at most {MAX_TEXT}"
+    has_half = any("\ud800" <= character <= "\udfff" for character in text)
+    return "half of a surrogate pair is no text" if has_half else ""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from tgdsl.errors import TgdslError
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
@@ -28,18 +25,6 @@ KINDS: tuple[Kind, ...] = (
 """The kinds that come with tgdsl."""
 
 
-def known_kinds(own: Sequence[Kind]) -> tuple[Kind, ...]:
-    """Return the kinds that come with tgdsl and a user's own.
-
-    Raises:
-        TgdslError: If one of these is no kind.
-    """
-    for i, kind in enumerate(own):
-        if not isinstance(kind, Kind):
-            raise TgdslError(f"kinds[{i}] is {kind!r}, expected a tgdsl.sensors.Kind")
-    return (*KINDS, *own)
-
-
 __all__ = [
     "CONTACT",
     "CONTACT_DEPTH",
@@ -51,5 +36,4 @@ __all__ = [
     "PROXIMITY",
     "SURFACE_DISTANCE",
     "Kind",
-    "known_kinds",
 ]

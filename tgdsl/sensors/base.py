@@ -17,7 +17,7 @@ from jaxtyping import Float
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
-from tgdsl.fields import Frequency, Selector, SpecModel
+from tgdsl.fields import Frequency, Selector, SpecModel, Usual
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.geometry.surface import Surface
@@ -29,7 +29,7 @@ from tgdsl.sensors.noise import BASE, NoiseField
 class HistorySpec(SpecModel):
     """What is read of the last calls."""
 
-    length: Annotated[StrictInt, Field(ge=1)]
+    length: Annotated[StrictInt, Field(ge=1), Usual("number", high=1000.0)]
     """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
     reduce: Literal["stack", "last", "median", "mean"] = "stack"
     """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
@@ -59,7 +59,7 @@ class SensorSpec(SpecModel):
     """A noise profile's name, or the knobs in line."""
     readout: Literal["clean", "measured", "both"] = "measured"
     """`measured` with the imperfections of `noise`, `clean` without, or `both`: `<name>` and `<name>/clean`."""
-    rate: Frequency | None = None
+    rate: Annotated[Frequency | None, Usual("frequency", low=0.1, high=1e5)] = None
     """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
     history: History | None = None
     """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
@@ -162,6 +162,7 @@ class Lowered:
         slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
         moments: How moments are found, if `needs` has "moments".
         points: Which points, if `needs` has "points".
+        notes: What an account of the sensor says of its parameters, line by line.
         signal: What `forward` returns, if the kind decides: what noise acts on.
     """
 
@@ -176,6 +177,7 @@ class Lowered:
     slots: int = 0
     moments: MomentsRequest | None = None
     points: PointsRequest | None = None
+    notes: tuple[str, ...] = ()
     signal: tuple[Channel, ...] | None = None
 
 

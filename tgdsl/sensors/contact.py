@@ -11,14 +11,14 @@ Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from pydantic import model_validator
 from torch import Tensor
 
-from tgdsl.fields import Radius
+from tgdsl.fields import Radius, Usual
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
 from tgdsl.layout import Layout
@@ -42,9 +42,9 @@ class ContactSpec(ContactProbeSpec):
 
     kind: Literal["contact"]
     """Whether each probe is in contact: 1 or 0."""
-    threshold: Radius = 5e-4
+    threshold: Annotated[Radius, Usual("length", high=0.1)] = 5e-4
     """Depth above which a taxel switches on, η_on [m]."""
-    release_threshold: Radius | None = None
+    release_threshold: Annotated[Radius | None, Usual("length", high=0.1)] = None
     """Depth below which it switches off again, η_off [m]; default: `threshold`."""
 
     @model_validator(mode="after")

@@ -63,6 +63,11 @@ def damping() -> float:
     return 0.1
 
 
+def log2_e() -> float:
+    """Return log₂ e."""
+    return 1.4426950408889634
+
+
 def no_force() -> float:
     """Return the force [N] below which a direction fades to zero."""
     return 1e-12
@@ -138,6 +143,7 @@ class Bodies(NamedTuple):
         box: Least and largest coordinates of its active taxels [m].
         place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none; and
             −2 times its outward normal.
+        padded: Position and −2 times the normal of those of `taxel`.
     """
 
     taxel: Int[Tensor, "body padded"]
@@ -146,6 +152,7 @@ class Bodies(NamedTuple):
     first: Int[Tensor, " bodies_and_one"]
     box: Float[Tensor, "body 6"]
     place: Float[Tensor, "taxel 6"]
+    padded: Float[Tensor, "6 body padded"]
 
 
 def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
@@ -176,7 +183,6 @@ class Shared(NamedTuple):
 
 def shared_forces(
     bodies: Bodies,
-    pos: Vec,
     depth: Float[Tensor, "env taxel"],
     point: Vec,
     force: Vec,
@@ -189,7 +195,6 @@ def shared_forces(
 
     Args:
         bodies: Which taxels each body has.
-        pos: Taxel positions [m], planes (taxel,).
         depth: Depth of each probe [m].
         point: Contact points [m], planes (env, body, contact).
         force: Forces on the body [N].
@@ -207,11 +212,13 @@ def shared_forces(
         args = radius, levenberg, bodies.first, bodies.box
         shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
         return Shared(shared, sums[:, :3], sums[:, 3:])
+    # Of torch's operations on a CPU `index` and `exp` wake other threads for a few thousand numbers, these do not.
+    own = depth.index_select(1, taxel.flatten()).unflatten(1, taxel.shape)
     share, residual = footprint(
-        planes.vec(part[taxel] for part in pos),
+        planes.vec(bodies.padded[:3]),
         inverse_radius > 0,
-        depth[:, taxel] * inverse_radius,
-        planes.split(bodies.place[taxel, 3:]),
+        own * inverse_radius,
+        planes.vec(bodies.padded[3:]),
         point,
         force,
         torque,
@@ -219,14 +226,15 @@ def shared_forces(
         radius,
         levenberg,
     )
-    padded = torch.stack([(share * part[..., None]).sum(dim=2) for part in force], dim=1)
-    return Shared(padded.flatten(2)[:, :, bodies.row], padded.sum(dim=3), torch.stack(residual, dim=1))
+    padded = [(share * part[..., None]).sum(dim=2) for part in force]
+    found = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
+    return Shared(found, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
 
 
 def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:
     """Return shares ∝ weight · exp(β · g), which sum to 1, or are all zero where all weights are."""
     exponent = torch.where(weight > 0, planes.dot(planes.vec(part[..., None, None] for part in tilt), lever), 0.0)
-    weight = weight * torch.exp(exponent - exponent.detach().amax(dim=-1, keepdim=True))
+    weight = weight * torch.exp2(log2_e() * (exponent - exponent.detach().amax(dim=-1, keepdim=True)))
     total = weight.sum(dim=-1, keepdim=True)
     return weight / torch.where(total == 0, 1.0, total)
 

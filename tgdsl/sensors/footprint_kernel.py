@@ -24,6 +24,9 @@ import triton.language as tl
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
+from tgdsl.geometry.planes_kernel import add3, add6, cross, scale3, scale6, solve, times
+from tgdsl.geometry.shapes_kernel import dot
+
 ENVS = 8
 """Environments of a program, which is one warp: a lane for each of their contacts of a group."""
 GROUP = 4
@@ -139,14 +142,14 @@ def footprint_kernel(
                 )
                 load = captured * strength
                 total += tl.sum(load, axis=1)
-                excess = _add3(excess, _unmet(captured, mean, force, torque))
-                spread = _add6(spread, _of_levers(load * inverse * inverse, covariance, way))
+                excess = add3(excess, _unmet(captured, mean, force, torque))
+                spread = add6(spread, _of_levers(load * inverse * inverse, covariance, way))
         least = tl.load(levenberg + step)
-        spread = _scale6(1.0 / total, spread)
-        s = _solve(spread, least, _scale3(inverse / total, excess))
-        s = _solve(spread, least, _times(spread, s))
-        size = _dot(s, _times(spread, s)) + DAMPING * _dot(s, s)
-        tilt = _add3(tilt, _scale3(-tl.rsqrt(1.0 + size), s))
+        spread = scale6(1.0 / total, spread)
+        s = solve(spread, least, scale3(inverse / total, excess))
+        s = solve(spread, least, times(spread, s))
+        size = dot(s, times(spread, s)) + DAMPING * dot(s, s)
+        tilt = add3(tilt, scale3(-tl.rsqrt(1.0 + size), s))
 
     carried, unmet = (zero, zero, zero), (zero, zero, zero)
     for start in range(0, tl.maximum(num_contacts, 1), GROUP):
@@ -157,9 +160,9 @@ def footprint_kernel(
             captured, norm, top, mean, covariance = _moments(
                 pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG
             )
-            unmet = _add3(unmet, _unmet(captured, mean, force, torque))
-            each = _scale3(tl.where(norm == 0, 0.0, captured / norm), force)
-            carried = _add3(carried, _summed(_scale3(norm, each)))
+            unmet = add3(unmet, _unmet(captured, mean, force, torque))
+            each = scale3(tl.where(norm == 0, 0.0, captured / norm), force)
+            carried = add3(carried, _summed(scale3(norm, each)))
             x, y, z = _each3(point)
             nx, ny, nz = _each3(normal)
             u, v, w = _each3(slope)
@@ -227,8 +230,8 @@ def _tile(at, is_there):
 @triton.jit
 def _direction(force):
     """Return the strength of forces, and their direction, which fades to zero with them."""
-    strength = tl.sqrt(_dot(force, force) + NO_FORCE * NO_FORCE)
-    return strength, _scale3(1.0 / strength, force)
+    strength = tl.sqrt(dot(force, force) + NO_FORCE * NO_FORCE)
+    return strength, scale3(1.0 / strength, force)
 
 
 @triton.jit
@@ -236,7 +239,7 @@ def _slope(way, tilt, inverse):
     """Return a of β · g = a · (x_j − x_c) / ln 2, (env, contact) [1/m]: it is f̂ × β / r_f."""
     x, y, z = tilt[0][:, None], tilt[1][:, None], tilt[2][:, None]
     scale = inverse * LOG2_E
-    a = _cross(way, (x, y, z))
+    a = cross(way, (x, y, z))
     return scale * a[0], scale * a[1], scale * a[2]
 
 
@@ -249,10 +252,10 @@ def _arm(place, point):
 @triton.jit
 def _pull(arm, facing, weight, slope, top, inverse):
     """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m."""
-    near = 1.0 - inverse * inverse * _dot(arm, arm)
+    near = 1.0 - inverse * inverse * dot(arm, arm)
     near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # what is negative remains so
     near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
-    exponent = tl.minimum(_dot(slope, arm) - top, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
+    exponent = tl.minimum(dot(slope, arm) - top, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
     return near, weight * near * near * tl.exp2(exponent)
 
 
@@ -290,7 +293,7 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
         at = pos + 6 * taxel
         arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
-        facing = _dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
+        facing = dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, facing, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
@@ -317,7 +320,7 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
 def _pulled(place, inward, weight, point, normal, slope, top, inverse):
     """Return what one contact of each environment pulls at a tile of taxels with, (env, taxel)."""
     arm = _arm(place, (point[0][:, None], point[1][:, None], point[2][:, None]))
-    facing = _dot(inward, (normal[0][:, None], normal[1][:, None], normal[2][:, None]))
+    facing = dot(inward, (normal[0][:, None], normal[1][:, None], normal[2][:, None]))
     slope = (slope[0][:, None], slope[1][:, None], slope[2][:, None])
     _near, part = _pull(arm, facing, weight, slope, top[:, None], inverse)
     return part
@@ -351,9 +354,9 @@ def _highest(pos, num_own, point, normal, slope, inverse):
     for taxel in range(num_own):
         at = pos + 6 * taxel
         arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
-        facing = _dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
-        is_reached = (inverse * inverse * _dot(arm, arm) < 1.0) & (facing > 0.0)
-        top = tl.maximum(top, tl.where(is_reached, _dot(slope, arm), float("-inf")))
+        facing = dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
+        is_reached = (inverse * inverse * dot(arm, arm) < 1.0) & (facing > 0.0)
+        top = tl.maximum(top, tl.where(is_reached, dot(slope, arm), float("-inf")))
     return tl.where(top == float("-inf"), 0.0, top)
 
 
@@ -366,8 +369,8 @@ def _summed(a):
 @triton.jit
 def _unmet(captured, mean, force, torque):
     """Return Σ_c γ_c (Σ_j λ_cj (x_j − x_c) × f_c − τ_c), (env,) [N·m]."""
-    x, y, z = _cross(mean, force)
-    return _summed(_scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
+    x, y, z = cross(mean, force)
+    return _summed(scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
 
 
 @triton.jit
@@ -387,59 +390,6 @@ def _of_levers(load, spread, way):
         tl.sum(load * (az[2] * x - ax[2] * z), axis=1),
         tl.sum(load * (ax[2] * y - ay[2] * x), axis=1),
     )
-
-
-@triton.jit
-def _solve(matrix, least, right):
-    """Return (A + ε)⁻¹ b as `footprint` does."""
-    xx, xy, xz, yy, yz, zz = matrix
-    first = xx + least
-    by_x, bz_x = xy / first, xz / first
-    second = tl.maximum(yy + least - by_x * xy, least / 2)
-    cross = yz - by_x * xz
-    bz_y = cross / second
-    third = tl.maximum(zz + least - bz_x * xz - bz_y * cross, least / 2)
-    y = right[1] - by_x * right[0]
-    z = (right[2] - bz_x * right[0] - bz_y * y) / third
-    y = y / second - bz_y * z
-    return right[0] / first - by_x * y - bz_x * z, y, z
-
-
-@triton.jit
-def _times(matrix, right):
-    """Return A b of a symmetric A, its upper triangle row by row."""
-    xx, xy, xz, yy, yz, zz = matrix
-    return _dot((xx, xy, xz), right), _dot((xy, yy, yz), right), _dot((xz, yz, zz), right)
-
-
-@triton.jit
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@triton.jit
-def _cross(a, b):
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@triton.jit
-def _add3(a, b):
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-@triton.jit
-def _add6(a, b):
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
-
-
-@triton.jit
-def _scale3(factor, a):
-    return factor * a[0], factor * a[1], factor * a[2]
-
-
-@triton.jit
-def _scale6(factor, a):
-    return factor * a[0], factor * a[1], factor * a[2], factor * a[3], factor * a[4], factor * a[5]
 
 
 @triton.jit

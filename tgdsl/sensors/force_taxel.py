@@ -35,7 +35,7 @@ from pydantic import Field, StrictInt
 from torch import Tensor
 
 from tgdsl.errors import LowerError
-from tgdsl.fields import PositiveLength
+from tgdsl.fields import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
@@ -55,7 +55,7 @@ class ForceTaxelSpec(ContactProbeSpec):
     """Force [N] or pressure [Pa] of each taxel, which sum to the solver's contact force."""
     outputs: Annotated[tuple[Literal["force", "pressure"], ...], Field(min_length=1)] = ("force",)
     """What a reading holds, force before pressure."""
-    footprint: PositiveLength | None = None
+    footprint: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Radius r_f around a contact in which taxels carry it [m]; a contact further than r_f/2 from the nearest taxel is partly
     missed. Default: on each body 3 times the taxels' spacing, the root of their mean area."""
     moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
@@ -121,6 +121,7 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "row": layout.body_id * counts.max() + rank,
         "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
         "place": footprint.place(layout.pos, layout.normal, is_active),
+        "padded": np.concatenate([layout.pos.T, -2.0 * layout.normal.T])[:, taxel],
         "footprint": spec.radii(layout),
         "levenberg": np.array(spec.levenberg),
     }
@@ -146,7 +147,6 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
     shared = footprint.shared_forces(
         bodies,
-        probes.pos,
         felt.depth,
         contacts.pos,
         contacts.force,

@@ -16,13 +16,13 @@ a compound of overlapping geoms the magnitude is that of the deepest geom alone,
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.fields import PositiveLength
+from tgdsl.fields import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.query import Felt, Probes
 from tgdsl.geometry.reference import Touch
@@ -36,7 +36,7 @@ class SurfaceDistanceSpec(ProbeSpec):
 
     kind: Literal["surface_distance"]
     """Distance of each probe's centre to each object's surface, negative inside [m]."""
-    max_range: PositiveLength = 0.05
+    max_range: Annotated[PositiveLength, Usual("length", high=5.0)] = 0.05
     """Largest distance that is told apart, r_max [m]."""
     nearest: bool = False
     """Whether to read the vectors from the probe to the nearest points too, in the link's frame [m]."""

@@ -4,7 +4,8 @@
         kind = MY_KIND
         parameters = {"stiffness": 100.0}
 
-gives a kind all the tests below for its float64 `reference`. Its author adds the closed-form cases.
+gives a kind all the tests below for its float64 `reference`. Its author adds the closed-form cases. One of the tests,
+`test_compiled_equals_eager`, compiles kernels and takes long: `pytest -k "not compiled_equals_eager"` leaves it out.
 """
 
 from tgdsl.testing.conformance import (

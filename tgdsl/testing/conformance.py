@@ -314,7 +314,6 @@ class KindConformance:
         resumed.load_state_dict(module.state_dict())
         torch.testing.assert_close(resumed(second)["s"], module(second)["s"], rtol=0, atol=0)
 
-    @pytest.mark.slow
     def test_compiled_equals_eager(self, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """One graph, compiled, gives the eager readings for every batch size, with state."""
         monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks

@@ -76,22 +76,30 @@ class Lane:
             if self._stream is None:
                 yield
                 return
-            # What Warp's own stream did before is in no graph that torch is capturing.
-            after_warp = not self.is_capturing
             self._stream.wait_stream(torch.cuda.current_stream(self.device))
             try:
-                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream, sync_enter=after_warp):
+                with torch.cuda.stream(self._stream), self._warp.ScopedStream(self._warp_stream):
                     yield
             finally:
                 torch.cuda.current_stream(self.device).wait_stream(self._stream)
 
     @contextlib.contextmanager
     def work_in_capture(self) -> Iterator[None]:
-        """Put what Warp and torch are told inside into the graph that torch is capturing, and tell Warp of it."""
+        """Put what Warp and torch are told inside into the graph that torch is capturing, and tell Warp of it.
+
+        It is done on the stream where the capture has begun: only there can Warp put loops into a graph.
+        """
+        stream = self._warp.stream_from_torch(torch.cuda.current_stream(self.device))
         was_enabled = gc.isenabled()
         gc.disable()
         try:
-            with self.work(), self._warp.ScopedCapture(stream=self._warp_stream, external=True):
+            with (
+                self._quiet(),
+                torch.inference_mode(False),
+                torch.no_grad(),
+                self._warp.ScopedStream(stream, sync_enter=False),  # what Warp did before is in no graph
+                self._warp.ScopedCapture(stream=stream, external=True),
+            ):
                 yield
         finally:
             if was_enabled:

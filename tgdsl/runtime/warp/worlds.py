@@ -24,7 +24,7 @@ from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
 from tgdsl.runtime.warp.reading import SOURCES
 
-_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat")
+_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat", *FORCES.values())
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
 """Contacts per environment that there is room for, unless said otherwise."""
@@ -92,17 +92,16 @@ class Worlds:
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
             joints = JointPlaces.of(inputs, model)
-            names = (*INTEGRATED, *_DERIVED, *_WATCHED, *FORCES.values())
+            names = (*INTEGRATED, *_DERIVED, *_WATCHED)
             self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
             self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
             self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
-            self._forces = tuple(array for name, array in joints.fields.items() if name in FORCES)
             self.contacts = PairContacts(inputs, model, num_envs, lane.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
             self._is_reset = torch.zeros_like(self._is_stale)
             self.faults = Faults(self.arrays, on_fault)
-        self._has_stale, self._lane = True, lane
+        self._has_stale, self._is_in_graphs, self._lane = True, False, lane
         self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self.evaluate_stale)
 
     def step(self, num_steps: int) -> None:
@@ -138,8 +137,10 @@ class Worlds:
         Args:
             is_evaluated: Whether those that were started anew have been evaluated; which these are, only the device knows.
         """
-        self._has_stale = self.faults.on_fault == "reset" and not is_evaluated
-        self._evaluate_if_captured()
+        if not self._lane.is_capturing:
+            self._has_stale = False
+        if self.faults.on_fault == "reset" and not is_evaluated:
+            self._note_stale()
 
     def reset(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
         """Start some environments anew, with values. Their poses and contacts are evaluated when they are next asked for."""
@@ -163,20 +164,29 @@ class Worlds:
     def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
         """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
         self._is_stale |= mask
-        self._has_stale = True
-        self._evaluate_if_captured()
+        self._note_stale()
 
     def refresh(self) -> None:
         """Evaluate poses, velocities and contacts of the environments that are elsewhere than at the last evaluation."""
+        self._is_in_graphs |= self._lane.is_capturing
         if not self._has_stale:
             return
         if self._is_stale.is_cuda or self._is_stale.any():
             self._refresh()
-        self._has_stale = False
+        self._has_stale = self._lane.is_capturing
 
-    def _evaluate_if_captured(self) -> None:
-        """Evaluate at once in a graph that is being captured: what the host notes now, it does not when this is replayed."""
+    def _note_stale(self) -> None:
+        """Note, on the host, that environments are to be evaluated.
+
+        A graph of a user's own is replayed without the host. What is captured there is therefore evaluated in it; and once
+        there is one, so is everything else at once, as the graph may read it.
+        """
         if self._lane.is_capturing:
+            self._is_in_graphs = True
+            self._refresh()
+            return
+        self._has_stale = True
+        if self._is_in_graphs:
             self.refresh()
 
     def evaluate_stale(self) -> None:
@@ -184,7 +194,7 @@ class Worlds:
 
         It is work for a `Replay`.
         """
-        arrays = {name: self.arrays[name] for name in (*_DERIVED, *self._forces, "history")} | self.contacts.arrays
+        arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
         earlier = {name: array.clone() for name, array in arrays.items()}
         self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)

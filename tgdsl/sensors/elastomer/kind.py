@@ -66,7 +66,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants |= {"dilation_strength": scalar(spec.dilation_strength), "depth_exponent": scalar(spec.depth_exponent)}
     reach = np.full(layout.num_taxels, spec.standoff)
     if spec.anchored is None:
-        return Lowered(CHANNELS, constants, radius=reach)
+        return Lowered(CHANNELS, constants, radius=reach, notes=spec.notes)
     constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
     if spec.slip is not None:
         constants["slip"] = scalar(spec.slip)
@@ -77,13 +77,17 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     span = spec.standoff + spec.exit
     if spec.anchored == "taxels":
         state = {name: Memory() for name in anchors.PLANES}
-        return Lowered(CHANNELS, constants, state, needs=frozenset({"distance", "frame"}), range=span, radius=reach)
+        return Lowered(
+            CHANNELS, constants, state, needs=frozenset({"distance", "frame"}), range=span, radius=reach, notes=spec.notes
+        )
     constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
     if spec.model != "paper":
         constants["reference_area"] = scalar(spec.reference_area)
     state = {name: Memory(shape="points") for name in point_anchors.PLANES}
     request = PointsRequest(spec.points, span)
-    return Lowered(CHANNELS, constants, state, needs=frozenset({"points"}), range=span, radius=reach, points=request)
+    return Lowered(
+        CHANNELS, constants, state, needs=frozenset({"points"}), range=span, radius=reach, points=request, notes=spec.notes
+    )
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import re
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, StrictInt, model_validator
+from pydantic import AfterValidator, Field, StrictInt, WithJsonSchema, model_validator
 
-from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Radius, SpecModel
+from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
 from tgdsl.regions import Region
 from tgdsl.sensors.base import ContactProbeSpec
+from tgdsl.sensors.elastomer import skins
 
 
 def _at_most_half(value: float) -> float:
@@ -46,6 +48,8 @@ class ElastomerSpec(ContactProbeSpec):
 
     kind: Literal["elastomer"]
     """Displacement of the markers in a soft skin [m]."""
+    like: Annotated[str | None, AfterValidator(skins.known), WithJsonSchema({"enum": [*skins.SKINS]})] = None
+    """Skin whose values hold where none is given here: paper_gel, soft_gel or firm_rubber, see `elastomer.skins`."""
     kernel: Literal["gaussian", "half_space", "bonded_layer"] = "gaussian"
     """How a load spreads: the paper's Gaussian, or an elastic half-space or layer bonded to a rigid base."""
     model: Literal["tgdsl", "paper"] = "tgdsl"
@@ -64,19 +68,19 @@ class ElastomerSpec(ContactProbeSpec):
     """α, power of the depth in the bulge [1] (gaussian)."""
     compressibility: Annotated[NonNegative, AfterValidator(_at_most_one)] = 1.0
     """c, 1 for a local Gaussian spread, 0 for one that falls off as 1/r [1] (gaussian)."""
-    reference_area: Area = 6e-6
+    reference_area: Annotated[Area, Usual("area", high=0.01)] = 6e-6
     """Area of a taxel that counts once [m²] (gaussian)."""
-    thickness: PositiveLength | None = None
+    thickness: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
     """Thickness of the elastomer [m] (gaussian: length ε, default the taxel spacing; bonded_layer)."""
     poissons_ratio: Annotated[NonNegative, AfterValidator(_at_most_half)] = 0.5
     """ν [1]; for the Gaussian it only sets the tangential against the normal stiffness under friction."""
-    youngs_modulus: Positive | None = None
-    """E [Pa] (half_space, bonded_layer)."""
+    youngs_modulus: Annotated[Pressure | None, Usual("pressure", low=1e3, high=1e11)] = None
+    """E [Pa], also as `0.2 MPa` (half_space, bonded_layer)."""
     normal_stiffness: Positive | None = None
     """K_n, pressure per depth [Pa/m] (half_space, bonded_layer)."""
-    marker_depth: Radius = 0.0
+    marker_depth: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """Depth of the markers below the skin's surface [m] (half_space, bonded_layer)."""
-    standoff: Radius = 0.0
+    standoff: Annotated[Radius, Usual("length", high=0.1)] = 0.0
     """s, height of the undeformed skin above the taxels [m]. Above 0 it is felt before the link itself touches: `gate` is then
     `geometric`."""
     friction: NonNegative | None = None
@@ -86,9 +90,9 @@ class ElastomerSpec(ContactProbeSpec):
     (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""
-    enter: Radius = 1e-5
+    enter: Annotated[Radius, Usual("length", high=0.1)] = 1e-5
     """Depth at which a taxel takes hold of an object, or a point of the skin [m]."""
-    exit: Radius = 1e-4
+    exit: Annotated[Radius, Usual("length", high=0.1)] = 1e-4
     """Distance at which it lets go [m]."""
     boundary: BoundarySpec | None = None
     """An edge that is clamped, for the in-plane dilation (gaussian); needs `thickness`."""
@@ -96,6 +100,33 @@ class ElastomerSpec(ContactProbeSpec):
     """How the fixed operator is applied; `auto` takes the cheapest that is exact, or within `tolerance` if that is given."""
     tolerance: Annotated[Positive, AfterValidator(_is_fraction)] | None = None
     """Relative error that a truncated operator may have [1]; svd: 1e-3 if not given."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _upon_skin(cls, value: object, info: Any) -> object:
+        """Fill in the fields of a skin; an error still finds the mapping that the document has."""
+        if not isinstance(value, dict) or not isinstance(value.get("like"), str) or value["like"] not in skins.SKINS:
+            return value
+        if isinstance(info.context, dict):
+            info.context[id(value)] = cls
+        return skins.with_skin(value, UNUSED)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the skin that it is like came to, and which of its values are the sensor's own."""
+        if self.like is None:
+            return ()
+        skin = skins.SKINS[self.like]
+        parts = []
+        shown = {*skin, "normal_stiffness"} & self.model_fields_set
+        for name, field in type(self).model_fields.items():
+            if name in shown:
+                value = getattr(self, name)
+                unit = re.search(r"\[(.+?)\]", field.description or "")
+                text = f"{value:g}" if isinstance(value, float) else str(value)
+                text += f" {unit[1]}" if unit and unit[1] != "1" else ""
+                parts.append(f"{name} {text}{' (own)' if name in skin and value != skin[name] else ''}")
+        return (f"like {self.like}: {', '.join(parts)}",)
 
     @property
     def is_gated(self) -> bool:

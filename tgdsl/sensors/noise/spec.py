@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Tag, model_validator
 
-from tgdsl.fields import TEXT_OR_OTHER, Quantity, SpecModel, Text
+from tgdsl.fields import TEXT_OR_OTHER, Quantity, SpecModel, Text, Usual
 
 Range = tuple[float, float]
 """Lowest and highest value; the same for a plain number."""
@@ -89,7 +89,7 @@ class Hysteresis(SpecModel):
 
     strength: Annotated[Range, RangeOf("number", ge=0.0)]
     """β, overshoot after a step, as a share of the step."""
-    time_constant: Annotated[Range, RangeOf("time", gt=0.0)]
+    time_constant: Annotated[Range, RangeOf("time", gt=0.0), Usual("time", high=3600.0)]
     """τ, time constant of the decay [s]."""
 
 
@@ -98,14 +98,14 @@ class Crosstalk(SpecModel):
 
     strength: Share
     """χ, share of each taxel's signal that goes to its neighbourhood."""
-    sigma: Annotated[Range, RangeOf("length", gt=0.0)]
+    sigma: Annotated[Range, RangeOf("length", gt=0.0), Usual("length", high=0.1)]
     """Standard deviation of the Gaussian neighbourhood [m]."""
 
 
 class Knobs(SpecModel):
     """All knobs; the defaults are neutral."""
 
-    radius_noise: Annotated[Range, RangeOf("length", ge=0.0)] = ZERO
+    radius_noise: Annotated[Range, RangeOf("length", ge=0.0), Usual("length", high=0.1)] = ZERO
     """ρ, half-width of the uniform disturbance of each probe's radius, drawn at each reading [m]."""
     gain: tuple[Annotated[Range, RangeOf("number", gt=0.0)], Annotated[Range, RangeOf("number", gt=0.0)]] = (
         (1.0, 1.0),
@@ -116,9 +116,9 @@ class Knobs(SpecModel):
     """Viscoelastic memory."""
     crosstalk: Crosstalk | None = None
     """Mixing of neighbouring taxels."""
-    read_delay: TimeRange = ZERO
+    read_delay: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
     """Age of what is read [s]; between two calls the signal counts as linear."""
-    jitter: TimeRange = ZERO
+    jitter: Annotated[TimeRange, Usual("time", high=1.0)] = ZERO
     """Largest additional age, drawn uniformly at each reading for all taxels together [s]."""
     bias: AnyAmplitude = NO_AMPLITUDE
     """Constant offset [unit of the reading]."""
@@ -132,7 +132,7 @@ class Knobs(SpecModel):
     """Chance that a taxel is dead for an episode."""
     dead_range: tuple[AnyAmplitude, AnyAmplitude] = (NO_AMPLITUDE, NO_AMPLITUDE)
     """Lowest and highest stuck reading of a dead taxel, drawn at reset [unit of the reading]."""
-    release_threshold: Annotated[Range, RangeOf("length", ge=0.0)] | None = None
+    release_threshold: Annotated[Annotated[Range, RangeOf("length", ge=0.0)] | None, Usual("length", high=0.1)] = None
     """Depth below which a `contact` taxel switches off again [m]; default: the sensor's own."""
 
     @model_validator(mode="after")

@@ -1,0 +1,54 @@
+"""Values that are possible but were most likely meant in another unit: a warning says where they stand."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+
+from pydantic import BaseModel
+
+from tgdsl.fields import Usual
+from tgdsl.schema.yaml import Path, Source
+
+
+def warn_of_unusual(source: Source, spec: BaseModel) -> None:
+    """Warn of each unusual value, at its place.
+
+    Args:
+        source: A document, or a file of its own, as found.
+        spec: What it was read as.
+    """
+    found = {}
+    for path, usual, value in _marked(spec, ()):
+        if (what := usual.doubt(value)) is not None:
+            while path and source.get(path) is None:
+                path = path[:-1]  # a number may stand for a range, and a region for a list of one
+            found[path, what] = str(source.problem(path, *what))
+    for message in found.values():
+        warnings.warn(message, stacklevel=4)
+
+
+def _marked(value: object, path: Path) -> Iterator[tuple[Path, Usual, float]]:
+    """Yield the numbers of all fields that are marked, their places and marks."""
+    if isinstance(value, BaseModel):
+        for name, field in type(value).model_fields.items():
+            inner = getattr(value, name)
+            usual = next((part for part in field.metadata if isinstance(part, Usual)), None)
+            if usual is None:
+                yield from _marked(inner, (*path, name))
+            else:
+                yield from ((place, usual, number) for place, number in _numbers(inner, (*path, name)))
+    elif isinstance(value, (tuple, list)):
+        for i, part in enumerate(value):
+            yield from _marked(part, (*path, i))
+    elif isinstance(value, Mapping):
+        for name, part in value.items():
+            yield from _marked(part, (*path, name))
+
+
+def _numbers(value: object, path: Path) -> Iterator[tuple[Path, float]]:
+    if isinstance(value, (int, float)):
+        yield path, float(value)
+    elif isinstance(value, (tuple, list)):
+        for i, part in enumerate(value):
+            yield from _numbers(part, (*path, i))
