@@ -54,7 +54,7 @@ CASES = {
     "a state of another type": lambda: touch({"body_pos": 1}),
     "no such dtype": lambda: tgdsl.compile(document(), dtype="flaot32"),
     "no such device": lambda: tgdsl.compile(document(), device="cuda:99"),
-    "physics on no such device": lambda: tgdsl.simulate(touch, 2, device="cuda:99"),
+    "physics on no such device": lambda: tgdsl.simulate(tgdsl.compile(document()), 2, device="cuda:99"),
     "no kind": lambda: tgdsl.compile(document(), kinds=[3]),
     "a compiled model": lambda: tgdsl.instrument(mujoco.MjModel.from_xml_string(SCENE), touch.inputs),
     "no document": lambda: tgdsl.compile(None),
@@ -66,7 +66,7 @@ CASES = {
     "a seed that is no integer": lambda: touch.seed(1.5),
     "an environment that is none": lambda: touch.seed(1, first_env=2**63),
     "bodies that sleep": lambda: tgdsl.simulate(tgdsl.compile(document("sleepy.xml")), 2),
-    "environments beyond all memory": lambda: tgdsl.simulate(touch, 10**13),
+    "environments beyond all memory": lambda: tgdsl.simulate(tgdsl.compile(document()), 10**13),
     "a grid beyond all memory": lambda: tgdsl.compile(document(rows=100000, columns=100000)),
 }
 found = {}
