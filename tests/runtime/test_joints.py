@@ -3,11 +3,13 @@
 The oracle is `mj_forward` on one `MjData` that has the state's own joints: poses, velocities and actuator forces must follow.
 """
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
 import torch
-from joint_scenes import ACTUATED, ACTUATORS, ALL, SCENE_XML, joint_module
+from joint_scenes import ACTUATED, ACTUATORS, ALL, OBJECT, SCENE_XML, joint_document, joint_module
 
 import tgdsl
 from tgdsl.errors import SimulationError
@@ -195,3 +197,22 @@ def test_tables_and_pictures_are_of_links_alone(touch, tmp_path):
     with np.load(tmp_path / "readings.npz") as archive:
         assert (archive["joint_vel"][1, 0, :, 0] == readings["joint_vel"][0, :, 0].numpy()).all()
         assert archive["last_action:units"].tolist() == ["control"]
+
+
+@pytest.mark.parametrize("kind", [BatchSimulation, WarpSimulation])
+def test_where_objects_differ_the_robots_joints_are_the_same(tmp_path, kind):
+    """Environments with another object start anew, at the keyframe's joints; the others stay where they were."""
+    document = joint_document(tmp_path, TERMS)
+    still = (tmp_path / "robot.xml").read_text().replace("</worldbody>", f"{OBJECT}</worldbody>")
+    (tmp_path / "scene.xml").write_text(re.sub('<joint name="spin"[^>]*>', "", still))
+    size = {"type": "box", "size": [0.02, 0.02, 0.02]}
+    document["objects"]["item"]["variants"] = [size, {"type": "sphere", "size": [0.02]}]
+    sim = simulation(kind, touch := tgdsl.compile(document), 3, substeps=2)
+    for control in CONTROLS:
+        sim.step(np.delete(control, 1))  # that of the object, which moves nothing of the robot
+    sim.set_objects(variants={"item": 1}, env_ids=[2])
+    state = sim.state()
+    assert state.variant is not None and state.variant[:, 0].tolist() == [0, 1, 1]
+    for env, wanted in enumerate([expected(*stepped(CONTROLS, 2))] * 2 + [expected(*stepped([], 2))]):
+        assert_is(state, env, wanted, TOLERANCE[kind])
+    assert touch.observe(touch(state))["policy"].shape == (3, 4 * 3 + 1)
