@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench soak clean
+.PHONY: demo test test-fast lint bench soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
@@ -20,6 +20,10 @@ demo: $(READY)
 # One process per core, each with one thread of its own: most of the time goes into compiling kernels.
 test: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+
+# Without what compiles kernels, or takes long for another reason.
+test-fast: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "not slow"
 
 lint: $(READY)
 	@$(BIN)/ruff check .
