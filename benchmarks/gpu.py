@@ -42,7 +42,8 @@ from torch import Tensor
 
 from tgdsl.artifact import load_plan
 from tgdsl.graphed import Graphed
-from tgdsl.module import Output, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.outputs import Output
 from tgdsl.plan import Plan
 from tgdsl.state import SceneState
 
@@ -74,14 +75,14 @@ class Bench:
         if options.eager:
             return cls(case, plan, touch.advance, touch.device)
         turn.compile(touch)
-        assert touch._compiled, "this machine cannot compile"
-        return cls(case, plan, touch._compiled["advance"], touch.device)
+        assert touch.calls.compiled, "this machine cannot compile"
+        return cls(case, plan, touch.calls.compiled["advance"], touch.device)
 
     def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""
         touch = TactileModule(self.plan).to(self.device)
-        touch._compiled = {"advance": self.core}
-        touch._graphed = {"advance": Graphed(self.core)} if graph and self.device.type == "cuda" else {}
+        touch.calls.compiled = {"advance": self.core}
+        touch.calls.graphed = {"advance": Graphed(self.core)} if graph and self.device.type == "cuda" else {}
         return touch
 
 

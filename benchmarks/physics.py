@@ -250,7 +250,7 @@ def measure(name: str, module: str, compiled: TactileModule, num_envs: int, opti
     nothing, touch = (tgdsl.load(artefact(options.folder, scene, own), device=options.device) for own in (PLAIN, module))
     plain = simulation(nothing, scene, num_envs, options)
     instants = Instants(plain, scene, options.instants)
-    touch._compiled = compiled._compiled  # code for one number of environments serves for all
+    touch.calls.compiled = compiled.calls.compiled  # code for one number of environments serves for all
     sim = simulation(touch, scene, num_envs, options)
     before, step = paired(plain, sim, instants, options.repeats)
     fault = fault_of(sim)

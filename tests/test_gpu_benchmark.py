@@ -17,7 +17,7 @@ from gpu_plots import TARGETS, Row, judged, unmet
 from gpu_scenes import CASES, EVERY_KNOB, bytes_of, document, make_artefacts, noise_of, state_of
 
 import tgdsl
-from tgdsl.module import Output
+from tgdsl.outputs import Output
 
 ROW = Row(
     case="kinematic",

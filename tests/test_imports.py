@@ -32,6 +32,8 @@ FLOORS = {
         "felt_objects",
         "taxels",
         "observing",
+        "outputs",
+        "calls",
         "env_ids",
         "example",
         "state",

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.module import Output
+from tgdsl.outputs import Output
 from tgdsl.tables import MAX_ROWS, TaxelTable, text_table, with_units
 
 REPOSITORY = Path(__file__).parents[1]

@@ -7,7 +7,7 @@ numbers per row.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -39,6 +39,7 @@ class Memory(nn.Module):
                 shape = (s.history.length, len(reading.channels), reading.num_rows)
                 self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
+        self._last: dict[str, Tensor] = {}
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
 
@@ -85,19 +86,37 @@ class Memory(nn.Module):
         """Number of environments whose last readings are kept; None if none are."""
         return next((len(buffer) for name, buffer in self.named_buffers(recurse=False) if name.startswith(KEPT)), None)
 
-    def keep(self, readings: Mapping[str, Tensor]) -> None:
+    def note_last(self, readings: Mapping[str, Tensor]) -> None:
+        """Note what is handed out, (env, row, channel), where it lies; nothing to do once it is kept."""
+        self._last = {} if self.num_kept else {name: reading.detach() for name, reading in readings.items()}
+
+    def keep_last(self, num_envs: int, stacks: Collection[str]) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.
 
         Args:
-            readings: What was handed out last, (env, row, channel).
-        """
-        with torch.inference_mode(False), torch.no_grad():
-            for name, reading in readings.items():
-                copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
-                self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+            num_envs: Number of environments.
+            stacks: Readings whose windows hold them already.
 
-    def forget_kept(self) -> None:
-        """Keep readings no longer."""
+        Raises:
+            StateError: If nothing was handed out yet, or of another number of environments.
+        """
+        if self.num_kept is None:
+            if not self._last:
+                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+            with torch.inference_mode(False), torch.no_grad():
+                for name, reading in self._last.items():
+                    if name not in stacks:
+                        copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
+                        self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+        if self.num_kept not in (None, num_envs):
+            raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")
+
+    def keep_no_other(self, num_envs: int) -> None:
+        """Keep readings no longer if they are of another number of environments, which a module without state may change."""
+        if self.num_kept not in (None, num_envs):
+            self._forget_kept()
+
+    def _forget_kept(self) -> None:
         for name in [name for name, _ in self.named_buffers(recurse=False) if name.startswith(KEPT)]:
             delattr(self, name)
 
@@ -105,6 +124,7 @@ class Memory(nn.Module):
         """Hold nothing again, as before the first call."""
         for name in [name for name, _ in self.named_buffers(recurse=False)]:
             delattr(self, name)
+        self._last = {}
         self.clock.free()
 
     def reset(self, chosen: Tensor) -> None:
@@ -135,7 +155,7 @@ class Memory(nn.Module):
         for path, value in found.items():
             room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
             self.register_buffer(path, room)
-        self.forget_kept()  # what is replaced has handed them out
+        self._forget_kept()  # what is replaced has handed them out
         own = local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         super()._load_from_state_dict(state_dict, prefix, *own)
 

@@ -7,11 +7,8 @@ felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` 
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -19,17 +16,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from tgdsl.buffers import Constants
+from tgdsl.calls import Calls, has_cpp_compiler, inductor_options
 from tgdsl.devices import check_dtype
 from tgdsl.env_ids import EnvIds, env_mask
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.example import example_state
-from tgdsl.fusion import of_its_own
 from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.shapes import SHAPES
-from tgdsl.graphed import Graphed
-from tgdsl.history import last_step, pushed, reduced
+from tgdsl.history import pushed, reduced
 from tgdsl.memory import KEPT, WINDOW, Memory, chosen_only, store
 from tgdsl.observing import ObservationTerm, observation_terms, observe
+from tgdsl.outputs import Output, outputs_of
 from tgdsl.plan import Inputs, Plan
 from tgdsl.queries import Queries
 from tgdsl.reading import joined_signal, read
@@ -38,27 +34,8 @@ from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.slot_watch import SlotWatch
 from tgdsl.state import SceneState
-from tgdsl.tables import Outputs, TaxelTable, TaxelTables
-from tgdsl.taxels import image_indices, taxel_table
-
-
-@dataclass(frozen=True)
-class Output:
-    """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
-
-    The shape is (row, channel), or (step, row, channel) where calls are stacked. Rows are the sensor's taxels (`rows` is
-    "taxel"), or the bodies that carry it ("body"), which `bodies` lists. A reading that no sensor makes has its own name for
-    sensor and kind; its rows are those of `inputs.joints` ("joint") or `inputs.actuators` ("actuator").
-    """
-
-    name: str
-    sensor: str
-    kind: str
-    shape: tuple[int, ...]
-    rows: str
-    bodies: tuple[str, ...]
-    channels: tuple[str, ...]
-    units: tuple[str, ...]
+from tgdsl.tables import TaxelTable, TaxelTables
+from tgdsl.taxels import images_of, taxel_table
 
 
 class TactileModule(nn.Module):
@@ -102,9 +79,7 @@ class TactileModule(nn.Module):
             for name in sensor.state
             if "/" not in name
         ]
-        self._last: dict[str, Tensor] = {}
-        self._compiled: dict[str, Callable[..., Any]] = {}
-        self._graphed: dict[str, Graphed] = {}
+        self.calls = Calls()
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
         self.slot_watch = SlotWatch(plan.inputs)
@@ -122,25 +97,7 @@ class TactileModule(nn.Module):
     @property
     def outputs(self) -> tuple[Output, ...]:
         """Name, shape, channels and units of each reading; a tuple that prints as a table."""
-        sensed = tuple(
-            Output(
-                reading.name,
-                sensor.sensor,
-                sensor.kind,
-                (*([reading.steps] if reading.steps else []), reading.num_rows, len(reading.channels)),
-                reading.rows,
-                self.plan.layout_of(sensor).bodies,
-                reading.channels,
-                reading.units,
-            )
-            for sensor in self.plan.sensors
-            for reading in sensor.readings
-        )
-        joints = tuple(
-            Output(r.name, r.name, r.name, (r.num_rows, len(r.channels)), r.rows, (), r.channels, r.units)
-            for r in self.plan.proprioception
-        )
-        return Outputs(sensed + joints)
+        return outputs_of(self.plan)
 
     @property
     def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
@@ -198,8 +155,8 @@ class TactileModule(nn.Module):
         step = "advance"
         if mask is not None or env_ids is not None:
             step, tensors["mask"] = "advance_some", self._chosen(mask, env_ids, num_envs)
-        elif self.memory.num_kept not in (None, num_envs):  # only a module without state may change its batch
-            self.memory.forget_kept()
+        else:
+            self.memory.keep_no_other(num_envs)
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
         readings = self._run(step, tensors, memory)
         self.hand_out(readings)
@@ -207,7 +164,7 @@ class TactileModule(nn.Module):
 
     def hand_out(self, readings: Mapping[str, Tensor]) -> None:
         """Note what a call has handed out; for who replays a captured graph of calls in their place."""
-        self._last = {} if self.memory.num_kept else {name: reading.detach() for name, reading in readings.items()}
+        self.memory.note_last(readings)
 
     def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
         """Return what a call would read, and advance nothing: the next call draws the same random numbers.
@@ -234,7 +191,6 @@ class TactileModule(nn.Module):
         The next call may have any number of environments, and begins an episode in each.
         """
         self.memory.free()
-        self._last = {}
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
         """Return the fields of a state that are wanted, and the number of environments."""
@@ -260,22 +216,12 @@ class TactileModule(nn.Module):
         if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
             found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
             raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
-        if self.memory.num_kept is None:
-            if not self._last:
-                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
-            stacks = {reading.name for sensor in self.plan.sensors for reading in sensor.windows if reading.steps}
-            self.memory.keep({name: reading for name, reading in self._last.items() if name not in stacks})
-        kept = self.memory.num_kept
-        if kept not in (None, num_envs):
-            raise StateError(f"readings of {kept} environments were handed out before, the scene has {num_envs}")
+        self.memory.keep_last(num_envs, {r.name for sensor in self.plan.sensors for r in sensor.windows if r.steps})
         return env_mask(mask if mask is not None else env_ids, num_envs, self.device, StateError, waits=False)
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
-        call = self._compiled.get(name) or getattr(self, name)
-        if self._graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
-            call = self._graphed[name]
-        found = call(tensors, memory)
+        found = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: found[name] for name in self.plan.readings()}
 
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -368,16 +314,7 @@ class TactileModule(nn.Module):
         Raises:
             TgdslError: If there is no such reading, if it is not one of taxels, or none of its links has a grid.
         """
-        owner = {r.name: sensor for sensor in self.plan.sensors for r in sensor.readings if r.rows == "taxel"}
-        if name not in owner:
-            raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
-        by_channel = last_step(readings[name]).transpose(1, 2)
-        images, masks = {}, {}
-        for link, index in image_indices(self.plan.layout_of(owner[name])).items():
-            place = torch.from_numpy(index).to(by_channel.device)
-            masks[link] = place >= 0
-            images[link] = torch.where(masks[link], by_channel[:, :, place.clamp(min=0)], 0.0)
-        return images, masks
+        return images_of(self.plan, name, readings)
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Begin a new episode in some environments (default: all); the others are left untouched.
@@ -434,33 +371,18 @@ class TactileModule(nn.Module):
         """
         if graph and self.device.type != "cuda":
             raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
-        if self.device.type == "cpu" and not _has_cpp_compiler():
+        if self.device.type == "cpu" and not has_cpp_compiler():
             warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
             return self
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
         if not {"mode", "options", "backend"} & options.keys():
             defaults["options"] = self.inductor_options()
-        steps = {step.__name__: step for step in (self.advance, self.advance_some, self.look)}
-        self._compiled = {name: torch.compile(of_its_own(step), **{**defaults, **options}) for name, step in steps.items()}
-        self._graphed = {name: Graphed(step) for name, step in self._compiled.items()} if graph else {}
+        self.calls.compile((self.advance, self.advance_some, self.look), graph, **{**defaults, **options})
         return self
 
     def inductor_options(self) -> dict[str, bool]:
-        """Return what `compile` asks of Inductor.
-
-        Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
-        taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels:
-        what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to
-        find a tile takes too many registers.
-        """
-        answers = [answer for query in self.plan.queries for answer in query.answers]
-        is_slight = (
-            all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
-            and not any(answer.moments or answer.points for answer in answers)
-            and not any(sensor.noise for sensor in self.plan.sensors)
-            and all(target.num_pairs == 1 and set(target.shapes) <= SHAPES.keys() for target in self.plan.objects)
-        )
-        return {"assert_indirect_indexing": "variant" in self.inputs.fields, "triton.prefer_nd_tiling": is_slight}
+        """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
+        return inductor_options(self.plan)
 
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
@@ -535,8 +457,7 @@ class TactileModule(nn.Module):
         """
         check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
         super()._apply(fn, recurse)
-        for graphed in self._graphed.values():
-            graphed.forget()
+        self.calls.forget_graphs()
         return self
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
@@ -549,7 +470,3 @@ class TactileModule(nn.Module):
 def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return what is kept of readings that are handed out, if anything is."""
     return {f"{KEPT}{name}": made.transpose(1, 2) for name, made in readings.items() if f"{KEPT}{name}" in memory}
-
-
-def _has_cpp_compiler() -> bool:
-    return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)

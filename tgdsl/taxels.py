@@ -1,6 +1,6 @@
 """Where a sensor's taxels are, for users: as a table, and as images of those on grids.
 
-Shapes: `taxel` taxels of one sensor, `row`, `column` cells of a link's grid.
+Shapes: `env` environments, `taxel` taxels of one sensor, `channel` numbers per taxel, `row`, `column` cells of a link's grid.
 """
 
 from __future__ import annotations
@@ -9,10 +9,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from tgdsl.errors import TgdslError
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.history import last_step
 from tgdsl.layout import Layout
+from tgdsl.plan import Plan
 from tgdsl.tables import TaxelTable
 
 
@@ -39,6 +43,22 @@ def taxel_table(layout: Layout) -> TaxelTable:
     for name, column in columns:
         table[name] = column
     return table.view(TaxelTable)
+
+
+def images_of(
+    plan: Plan, name: str, readings: Mapping[str, Tensor]
+) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:
+    """Return a reading of taxels as one image per link, and where its pixels are taxels: see `TactileModule.images`."""
+    owner = {r.name: sensor for sensor in plan.sensors for r in sensor.readings if r.rows == "taxel"}
+    if name not in owner:
+        raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
+    by_channel = last_step(readings[name]).transpose(1, 2)
+    images, masks = {}, {}
+    for link, index in image_indices(plan.layout_of(owner[name])).items():
+        place = torch.from_numpy(index).to(by_channel.device)
+        masks[link] = place >= 0
+        images[link] = torch.where(masks[link], by_channel[:, :, place.clamp(min=0)], 0.0)
+    return images, masks
 
 
 def image_indices(layout: Layout) -> Mapping[str, Int[np.ndarray, "row column"]]:

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from tgdsl.history import last_step
 from tgdsl.memory import Memory
-from tgdsl.module import Output, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.outputs import Output
 from tgdsl.runtime.source import Simulator
 
 Array = np.ndarray

@@ -11,7 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from tgdsl.history import last_step
-from tgdsl.module import Output, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.outputs import Output
 from tgdsl.tables import TaxelTable
 
 

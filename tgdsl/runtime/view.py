@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from tgdsl.errors import did_you_mean
-from tgdsl.module import Output, TactileModule
+from tgdsl.module import TactileModule
+from tgdsl.outputs import Output
 from tgdsl.runtime.cameras import ViewError as ViewError
 from tgdsl.runtime.cameras import best_camera, camera_of
 from tgdsl.runtime.dots import Dots, Pose, dots_of, touched

@@ -235,7 +235,7 @@ class WarpSimulation(Simulation):
 
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
-        held = (self._touch._compiled, self._touch._dt, *self._touch.buffers())
+        held = (self._touch.calls.compiled, self._touch._dt, *self._touch.buffers())
         if len(held) != len(self._held) or any(now is not then for now, then in zip(held, self._held, strict=True)):
             self._step_and_read.forget()
             self._held = held

@@ -1,0 +1,78 @@
+"""How the steps of a module are called: eager, compiled by torch, or replayed as CUDA graphs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from tgdsl.fusion import of_its_own
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.graphed import Graphed
+from tgdsl.plan import Plan
+
+Step = Callable[..., Any]
+"""A bound method of a module that takes tensors and memory by name, and returns tensors by name."""
+
+
+class Calls:
+    """The steps of a module as they were compiled.
+
+    Attributes:
+        compiled: Compiled steps, by their names; none of a module that is eager. Another dictionary each time.
+        graphed: The same as CUDA graphs, if those are wanted.
+    """
+
+    def __init__(self) -> None:
+        """Have all steps eager."""
+        self.compiled: dict[str, Step] = {}
+        self.graphed: dict[str, Graphed] = {}
+
+    def compile(self, steps: Sequence[Step], graph: bool, **options: Any) -> None:
+        """Have steps compiled at their first call, and replayed as CUDA graphs if wanted.
+
+        Args:
+            steps: Methods of the module.
+            graph: Whether calls without derivatives replay a CUDA graph.
+            **options: Handed to `torch.compile`.
+        """
+        self.compiled = {step.__name__: torch.compile(of_its_own(step), **options) for step in steps}
+        self.graphed = {name: Graphed(step) for name, step in self.compiled.items()} if graph else {}
+
+    def of(self, step: Step) -> Step:
+        """Return what to call for a step: inside a capture of the caller's own, what a graph of ours would capture."""
+        name = step.__name__
+        if name in self.graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
+            return self.graphed[name]
+        return self.compiled.get(name, step)
+
+    def forget_graphs(self) -> None:
+        """Capture anew at the next calls: constants lie elsewhere."""
+        for graphed in self.graphed.values():
+            graphed.forget()
+
+
+def inductor_options(plan: Plan) -> dict[str, bool]:
+    """Return what is asked of Inductor for a plan.
+
+    Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
+    taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what
+    there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find a
+    tile takes too many registers.
+    """
+    answers = [answer for query in plan.queries for answer in query.answers]
+    is_slight = (
+        all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
+        and not any(answer.moments or answer.points for answer in answers)
+        and not any(sensor.noise for sensor in plan.sensors)
+        and all(target.num_pairs == 1 and set(target.shapes) <= SHAPES.keys() for target in plan.objects)
+    )
+    return {"assert_indirect_indexing": "variant" in plan.inputs.fields, "triton.prefer_nd_tiling": is_slight}
+
+
+def has_cpp_compiler() -> bool:
+    """Return whether there is a C++ compiler, which Inductor needs for a CPU."""
+    return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
