@@ -7,7 +7,7 @@ from sensors.scenes import module, state
 from tgdsl.errors import SpecError
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.state import SceneState
-from tgdsl.testing import KindConformance
+from tgdsl.testing import KindConformance, ReferenceModule, assert_agrees
 
 
 @pytest.fixture(autouse=True)
@@ -22,6 +22,12 @@ COARSE = 0.04
 class TestProximity(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": COARSE}
+    gates = ()
+
+
+class TestProximityWithSmoothGradients(KindConformance):
+    kind = PROXIMITY
+    parameters = {"tolerance": 0.1, "gradient_tolerance": 0.3}
     gates = ()
 
 
@@ -225,3 +231,46 @@ def test_only_moments_are_found(tmp_path):
     assert "fields of moments" in text and "item, radius 10 mm: " in text
     force = tgdsl.compile(document(tmp_path, [POINT], feels=["item", "floor"]))
     assert force.inputs.fields == ("body_pos", "body_quat", "body_linvel", "body_angvel")
+
+
+SOLIDS = {
+    "sphere": ('<geom type="sphere" size=".025"/>', 4 * np.pi * 0.025**2),
+    "capsule": ('<geom type="capsule" size=".01 .02"/>', 4 * np.pi * 0.01**2 + 2 * np.pi * 0.01 * 0.04),
+    "cylinder": ('<geom type="cylinder" size=".01 .02"/>', 2 * np.pi * 0.01**2 + 2 * np.pi * 0.01 * 0.04),
+}
+
+
+@pytest.mark.parametrize("shape", SOLIDS)
+def test_density_is_shared_out_over_the_points(tmp_path, shape):
+    """A ball that holds the whole object weighs every point: ρ S0 = density times the mean of R − |p − q|, whatever the area."""
+    geom, area = SOLIDS[shape]
+    sensor = {"backend": "points", "points": 300, "outputs": ["force"], "reference_area": None, "normal_stiffness": 1.0}
+    touch = module(tmp_path, [(0, 0, 0)], geom, radius=0.06, gate=None, kind="proximity", **sensor)
+    arrays = touch.plan.arrays
+    assert float(arrays["objects/item/moments/0/area"][0]) == pytest.approx(area, rel=1e-12)
+    points = arrays["objects/item/moments/0/points"].T[:300]
+    place = np.array([0.001, -0.002, 0.003])
+    mean = np.mean(0.06 - np.linalg.norm(points + place, axis=1))
+    found = touch(state(touch, pos=place.tolist()))["s"][0, 0, 2]
+    assert float(found) == pytest.approx(-100 * mean, rel=1e-12)
+
+
+@pytest.mark.parametrize("geom", ['<geom type="ellipsoid" size=".03 .02 .01"/>', *(geom for geom, _ in SOLIDS.values())])
+def test_points_equal_the_reference_that_has_areas_of_its_own(tmp_path, geom):
+    sensor = {"backend": "points", "points": 300, "reference_area": None}
+    touch = module(tmp_path, [(0, 0, 0), (0.01, 0.02, 0)], geom, radius=0.02, gate=None, kind="proximity", **sensor)
+    fields = {"kind": "proximity", "links": "pad", "feels": ("item",), **sensor}
+    reference = ReferenceModule(touch.plan, PROXIMITY, PROXIMITY.spec(**fields))
+    given = touch.example_state(8, seed=0, spread=0.01)
+    readings = touch(given)["s"]
+    assert (readings != 0).any(dim=0).all()
+    assert_agrees(readings, reference, given, 1e-12)
+
+
+def test_explain_counts_the_bytes_of_all_channels(tmp_path):
+    """With noise of the radius a field holds derivatives too: 8 numbers of 4 bytes at each node."""
+    for noise, channels in (None, 4), ({"radius_noise": 1e-3}, 8):
+        touch = module(tmp_path, [(0, 0, 0)], CUBE, gate=None, kind="proximity", tolerance=0.1, noise=noise)
+        x, y, z = touch.plan.arrays["objects/item/moments/0/num"][0]
+        assert f"{x} × {y} × {z} nodes every" in touch.explain()
+        assert f" mm, {4 * channels * x * y * z} bytes\n" in touch.explain()

@@ -6,11 +6,14 @@ Shapes: `env` environments, `taxel` taxels, `row` taxels or bodies, `channel` nu
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
+from scipy.special import ellipeinc, ellipkinc
 from torch import Tensor
 
 from tgdsl.geometry.reference import (
@@ -23,7 +26,7 @@ from tgdsl.geometry.reference import (
     distance_to,
     touch,
 )
-from tgdsl.plan import SLOT_FIELDS, Plan, PlannedObject
+from tgdsl.plan import SLOT_FIELDS, Plan, PlannedMoments, PlannedObject
 from tgdsl.sensors.base import Kind, ProbeSpec
 from tgdsl.state import SceneState
 
@@ -119,7 +122,7 @@ class ReferenceModule:
         for k, target in enumerate(self.plan.objects[o] for o in planned.objects):
             variant = self._variant(target, state, env)
             table = self.tables.setdefault(
-                (k, variant), MomentTable(self.plan, target.name, planned.request, variant, planned.radii[k])
+                (k, variant), MomentTable(self.plan, target.name, planned, variant, planned.radii[k])
             )
             area[k], body = table.area, self._body(state, env, target.body, shift)
             for t, link_id in enumerate(layout.link_id):
@@ -177,16 +180,43 @@ class ReferenceModule:
         return [ReferenceGeom(shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
+def _ellipsoid_area(a: float, b: float, c: float) -> float:
+    """Return the area of an ellipsoid by Legendre's integrals (DLMF 19.33.1)."""
+    c, b, a = sorted((a, b, c))
+    if a - c < 1e-9 * a:
+        return float(4 * np.pi * a * a)
+    phi = np.arccos(c / a)
+    m = min(1.0, a * a * (b * b - c * c) / (b * b * (a * a - c * c)))
+    integrals = ellipeinc(phi, m) * np.sin(phi) ** 2 + ellipkinc(phi, m) * np.cos(phi) ** 2
+    return float(2 * np.pi * (c * c + a * b * integrals / np.sin(phi)))
+
+
+AREAS: dict[str, Callable[[float, float, float], float]] = {
+    "box": lambda a, b, c: float(2 * (2 * a * 2 * b + 2 * b * 2 * c + 2 * c * 2 * a)),
+    "sphere": lambda r, *_: float(np.pi * (2 * r) ** 2),
+    "capsule": lambda r, half, _: float(np.pi * (2 * r) ** 2 + 2 * np.pi * r * 2 * half),
+    "cylinder": lambda r, half, _: float(2 * np.pi * r * r + 2 * np.pi * r * 2 * half),
+    "ellipsoid": _ellipsoid_area,
+}
+"""Areas of primitives by their sizes [m²]."""
+
+
+def _splines(factors: np.ndarray, place: np.ndarray) -> float:
+    """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
+    place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
+    return float(map_coordinates(factors, place[:, None], order=2, prefilter=False, mode="nearest")[0])
+
+
 class MomentTable:
     """One object's moments by other means than the module's: SciPy's interpolation, a sum over all points, closed form."""
 
-    def __init__(self, plan: Plan, name: str, request: int, variant: int, radii: tuple[float, ...]):
+    def __init__(self, plan: Plan, name: str, planned: PlannedMoments, variant: int, radii: tuple[float, ...]):
         """Find the tables of a variant of an object."""
-        prefix = f"objects/{name}/moments/{request}/"
+        prefix, self.is_smooth = f"objects/{name}/moments/{planned.request}/", planned.is_smooth
         self.arrays = {path.removeprefix(prefix): value for path, value in plan.arrays.items() if path.startswith(prefix)}
         self.variant, self.radii = variant, radii
-        self.area = float(self.arrays["area"][variant])
-        self.fields: dict[float, RegularGridInterpolator] = {}
+        self.area = self._closed_area(plan, name)
+        self.fields: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
 
     def at(self, point: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
         """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]."""
@@ -205,9 +235,21 @@ class MomentTable:
             total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
         return float(total[0]), total[1:]
 
-    def _field(self, i: int) -> RegularGridInterpolator:
+    def _closed_area(self, plan: Plan, name: str) -> float:
+        """Return the area by a closed form of its own for a single primitive; of meshes and unions, the plan's."""
+        (target,) = (target for target in plan.objects if target.name == name)
+        size = plan.arrays[f"objects/{name}/size"][self.variant]
+        absent = plan.arrays.get(f"objects/{name}/is_absent", np.zeros((self.variant + 1, len(size))))[self.variant]
+        solid = [g for g in range(len(size)) if not absent[g] and target.shapes[g] != "plane"]
+        if len(solid) == 1 and target.shapes[solid[0]] in AREAS:
+            return AREAS[target.shapes[solid[0]]](*size[solid[0]])
+        return float(self.arrays["area"][self.variant])
+
+    def _field(self, i: int) -> Callable[[np.ndarray], np.ndarray]:
         first, num, origin, cell = (self.arrays[name][i] for name in ("first", "num", "origin", "cell"))
         values = self.arrays["values"][first : first + num.prod()].reshape(*num, 4).astype(np.float64)
+        if self.is_smooth:
+            return lambda point: np.array([_splines(part, (point - origin) / cell) for part in np.moveaxis(values, 3, 0)])[None]
         axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
         return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
 
@@ -215,11 +257,12 @@ class MomentTable:
     def _points(self) -> np.ndarray:
         lists, first = self.arrays["lists"], self.arrays["first"]
         end = first[self.variant + 1] if self.variant + 1 < len(first) else len(lists)
-        return self.arrays["points"].T[np.unique(lists[first[self.variant] : end])]
+        rows, filler = np.unique(lists[first[self.variant] : end]), self.arrays["points"].shape[1] - 1
+        return self.arrays["points"].T[rows[rows != filler]]
 
     def _summed(self, point: np.ndarray, radius: float) -> np.ndarray:
         way = self._points - point
-        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.arrays["weight"][self.variant]
+        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.area / len(way)
         return np.array([weight.sum(), *(weight @ way)])
 
 
