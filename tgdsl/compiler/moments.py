@@ -33,11 +33,9 @@ FORMAT = b"tgdsl moments 2"
 CHOICE_POINTS, REPORT_POINTS = 1024, 2048
 HEADROOM = 0.95
 """The choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too."""
-GRADIENT_HEADROOM = 0.85
-"""Likewise, of a percentile so high that few points tell."""
 FINER = 2.0
 """How many times finer than the field's the quadrature is that it is measured against."""
-GRADIENT_FINENESS = 16
+GRADIENT_FINENESS = 24
 """Pieces along a radius, at least, where gradients have a tolerance."""
 BRICK = 6
 """Nodes along the side of a brick that is computed at once."""
@@ -198,7 +196,7 @@ def _bake(geoms: Sequence[FeltGeom], radius: float, limits: Limits, with_slope: 
         values = (_fitted if gradient_tolerance is None else _splines)(nodes).astype(np.float32)
         errors = _errors(values, origin, cell, choice)
         worst = max(errors.mass_rms, errors.first_rms) / (HEADROOM * tolerance)
-        steep = 0.0 if gradient_tolerance is None else (errors.gradient_p999 or 0.0) / (GRADIENT_HEADROOM * gradient_tolerance)
+        steep = 0.0 if gradient_tolerance is None else (errors.gradient_p999 or 0.0) / (HEADROOM * gradient_tolerance)
         if max(worst, steep) <= 1:
             return BakedField(values, origin, cell, _errors(values, origin, cell, report))
         cell /= float(np.clip(max(np.sqrt(worst), steep), 1.05, 2.5))

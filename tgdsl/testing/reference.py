@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
-from scipy.special import ellipeinc, ellipkinc
 from torch import Tensor
 
 from tgdsl.geometry.reference import (
@@ -180,27 +179,6 @@ class ReferenceModule:
         return [ReferenceGeom(shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
-def _ellipsoid_area(a: float, b: float, c: float) -> float:
-    """Return the area of an ellipsoid by Legendre's integrals (DLMF 19.33.1)."""
-    c, b, a = sorted((a, b, c))
-    if a - c < 1e-9 * a:
-        return float(4 * np.pi * a * a)
-    phi = np.arccos(c / a)
-    m = min(1.0, a * a * (b * b - c * c) / (b * b * (a * a - c * c)))
-    integrals = ellipeinc(phi, m) * np.sin(phi) ** 2 + ellipkinc(phi, m) * np.cos(phi) ** 2
-    return float(2 * np.pi * (c * c + a * b * integrals / np.sin(phi)))
-
-
-AREAS: dict[str, Callable[[float, float, float], float]] = {
-    "box": lambda a, b, c: float(2 * (2 * a * 2 * b + 2 * b * 2 * c + 2 * c * 2 * a)),
-    "sphere": lambda r, *_: float(np.pi * (2 * r) ** 2),
-    "capsule": lambda r, half, _: float(np.pi * (2 * r) ** 2 + 2 * np.pi * r * 2 * half),
-    "cylinder": lambda r, half, _: float(2 * np.pi * r * r + 2 * np.pi * r * 2 * half),
-    "ellipsoid": _ellipsoid_area,
-}
-"""Areas of primitives by their sizes [m²]."""
-
-
 def _splines(factors: np.ndarray, place: np.ndarray) -> float:
     """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
     place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
@@ -215,7 +193,7 @@ class MomentTable:
         prefix, self.is_smooth = f"objects/{name}/moments/{planned.request}/", planned.is_smooth
         self.arrays = {path.removeprefix(prefix): value for path, value in plan.arrays.items() if path.startswith(prefix)}
         self.variant, self.radii = variant, radii
-        self.area = self._closed_area(plan, name)
+        self.area = float(self.arrays["area"][variant])
         self.fields: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
 
     def at(self, point: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
@@ -234,16 +212,6 @@ class MomentTable:
             s0 = 2 * np.pi * (radius**3 / 6 - radius * d**2 / 2 + d**3 / 3)
             total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
         return float(total[0]), total[1:]
-
-    def _closed_area(self, plan: Plan, name: str) -> float:
-        """Return the area by a closed form of its own for a single primitive; of meshes and unions, the plan's."""
-        (target,) = (target for target in plan.objects if target.name == name)
-        size = plan.arrays[f"objects/{name}/size"][self.variant]
-        absent = plan.arrays.get(f"objects/{name}/is_absent", np.zeros((self.variant + 1, len(size))))[self.variant]
-        solid = [g for g in range(len(size)) if not absent[g] and target.shapes[g] != "plane"]
-        if len(solid) == 1 and target.shapes[solid[0]] in AREAS:
-            return AREAS[target.shapes[solid[0]]](*size[solid[0]])
-        return float(self.arrays["area"][self.variant])
 
     def _field(self, i: int) -> Callable[[np.ndarray], np.ndarray]:
         first, num, origin, cell = (self.arrays[name][i] for name in ("first", "num", "origin", "cell"))
