@@ -36,7 +36,7 @@ HEADROOM = 0.95
 FINER = 2.0
 """How many times finer than the field's the quadrature is that it is measured against."""
 GRADIENT_FINENESS = 24
-"""Pieces along a radius, at least, where gradients have a tolerance."""
+"""Pieces along a radius where gradients have a tolerance; fewer where it is more than one over this."""
 BRICK = 6
 """Nodes along the side of a brick that is computed at once."""
 AREA_RADIUS = 1e-3
@@ -174,8 +174,9 @@ class Truth(NamedTuple):
 
 def _bake(geoms: Sequence[FeltGeom], radius: float, limits: Limits, with_slope: bool) -> BakedField:
     tolerance, gradient_tolerance, budget = limits
+    least = 4.0 if gradient_tolerance is None else float(np.clip(1 / gradient_tolerance, 4, GRADIENT_FINENESS))
     # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.
-    spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), GRADIENT_FINENESS if gradient_tolerance else 4, 24))
+    spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), least, 24))
     pieces, fine = outer_surface(geoms, spacing), outer_surface(geoms, spacing / FINER)
     if not len(pieces.area):
         raise BakeError("there is no surface to bake moments of: planes are exact")
