@@ -253,18 +253,29 @@ def _fields(touch: TactileModule) -> list[str]:
         for o, radii, row in zip(moments.objects, moments.radii, moments.accuracy, strict=True):
             target = touch.plan.objects[o]
             for i, accuracy in enumerate(row):
-                num = touch.plan.arrays[f"objects/{target.name}/moments/{moments.request}/num"][i]
+                path = f"objects/{target.name}/moments/{moments.request}"
+                num = touch.plan.arrays[f"{path}/num"][i]
+                size = touch.plan.arrays[f"{path}/values"][0].nbytes * int(num.prod())
                 which = f"variant {i // len(radii)}, " if target.num_variants > 1 else ""
-                nodes = f"{' × '.join(map(str, num))} nodes every {1e3 * accuracy['cell']:.3g} mm, {16 * int(num.prod())} bytes"
+                nodes = f"{' × '.join(map(str, num))} nodes every {1e3 * accuracy['cell']:.3g} mm, {size} bytes"
                 s0, s0_max, s1, s1_max = (
                     f"{100 * accuracy[key]:.2g} %" for key in ("mass_rms", "mass_max", "first_rms", "first_max")
                 )
                 what = (
                     f"  {target.name}, {which}radius {1e3 * accuracy['radius']:.3g} mm: {nodes}\n"
                     f"    RMS error of S0 {s0} of full scale (largest {s0_max}), of S1 {s1} (largest {s1_max})"
+                    + _gradients(accuracy)
                 )
                 lines[what] = None
     return ["", "fields of moments", *lines] if lines else []
+
+
+def _gradients(accuracy: Mapping[str, float]) -> str:
+    """Return what was measured of a field's gradients by place, if it was."""
+    if "gradient_p999" not in accuracy:
+        return ""
+    p999, largest, first = (f"{100 * accuracy[key]:.2g} %" for key in ("gradient_p999", "gradient_max", "first_gradient_p999"))
+    return f"\n    gradients: 99.9 % of S0's within {p999} of the largest (largest error {largest}), of S1's within {first}"
 
 
 def _observations(touch: TactileModule) -> list[str]:

@@ -51,7 +51,7 @@ def moment_sources(
                 pair=pair,
                 radius=reach if shift is None else torch.where(reach > 0, torch.clamp(reach + shift, min=0), 0.0),
                 shift=None if shift is None else torch.maximum(shift, -reach),
-                surface=_surface(constants, table, planned.backend, variant, radius_id, len(radii)),
+                surface=_surface(constants, table, planned, variant, radius_id, len(radii)),
                 planes=tuple(Plane(rot(own.unbind()), vec(at.unbind())) for own, at in zip(rotations, places, strict=True)),
                 area=(area if variant is None else area[variant])[:, None],
             )
@@ -60,13 +60,13 @@ def moment_sources(
 
 
 def _surface(
-    constants: Constants, table: str, backend: str, variant: Tensor | None, radius_id: Tensor, num_radii: int
+    constants: Constants, table: str, planned: PlannedMoments, variant: Tensor | None, radius_id: Tensor, num_radii: int
 ) -> MomentField | PointCloud | None:
     """Return the table that each probe asks: one for all, or by variant (env, 1), by radius (taxel,), or by both."""
     if f"{table}/first" not in constants:
         return None
     which = None if variant is None else variant[:, None]
-    if backend == "field" and num_radii > 1:
+    if planned.backend == "field" and num_radii > 1:
         which = radius_id if which is None else num_radii * which + radius_id
     first, num, origin, cell = (constants[f"{table}/{name}"] for name in ("first", "num", "origin", "cell"))
     start: Count = 0
@@ -75,8 +75,8 @@ def _surface(
         place, side = split(origin[0]), cell[0]
     else:
         start, counts, place, side = first[which], split(num[which]), split(origin[which]), cell[which]
-    if backend == "field":
-        return MomentField(constants[f"{table}/values"], start, counts, place, side)
+    if planned.backend == "field":
+        return MomentField(constants[f"{table}/values"], start, counts, place, side, planned.is_smooth)
     weight, lists = constants[f"{table}/weight"], constants[f"{table}/lists"]
     points = vec(constants[f"{table}/points"].unbind())
     return PointCloud(points, weight[0] if which is None else weight[which], lists, start, counts, place, side)

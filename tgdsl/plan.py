@@ -151,6 +151,7 @@ class PlannedMoments:
         objects: Indices of the objects.
         radii: For each object the radii that it has fields of [m].
         accuracy: For each object what was measured of each field, variant after variant: see `compiler.moments.FieldErrors`.
+        is_smooth: Whether fields are sums of quadratic B-splines: see `geometry.moments.MomentField`.
     """
 
     request: int
@@ -158,6 +159,7 @@ class PlannedMoments:
     objects: tuple[int, ...]
     radii: tuple[tuple[float, ...], ...]
     accuracy: tuple[tuple[Mapping[str, float], ...], ...]
+    is_smooth: bool = False
 
 
 @dataclass(frozen=True)

@@ -134,3 +134,20 @@ def test_a_point_on_a_sampled_point_has_finite_derivatives():
     assert torch.autograd.gradcheck(
         lambda p: cloud_moments(split(p), cloud, torch.tensor([0.003], dtype=torch.float64)).mass, away, eps=1e-8, atol=1e-6
     )
+
+
+def test_splines_are_those_of_scipy_and_have_no_jumps():
+    """The same factors summed by SciPy; constant from half a cell within the border on."""
+    from scipy.ndimage import map_coordinates
+
+    values, num, cell, origin = linear_field()
+    field = module_field(values[0], num, cell, origin)._replace(is_smooth=True)
+    points = np.random.default_rng(1).uniform(-0.06, 0.06, (500, 3))
+    place = np.clip(((points - origin) / cell), 0.5, np.array(num) - 1.5)
+    expected = [map_coordinates(values[0][..., c], place.T, order=2, prefilter=False, mode="nearest") for c in range(4)]
+    mass, first = field_moments(planes_of(points), field)
+    np.testing.assert_allclose(torch.stack([mass, *first]).numpy(), expected, atol=1e-13)
+    leaf = torch.tensor(np.linspace([-0.02, 0.001, 0.002], [0.02, 0.011, -0.003], 4001), requires_grad=True)
+    slope = torch.autograd.grad(field_moments(split(leaf), field).mass.sum(), leaf)[0].numpy()
+    assert np.abs(np.diff(slope, axis=0)).max() < 0.01 * np.abs(slope).max()
+    assert field_moments(planes_of([[0, np.nan, 0]]), field).mass.isnan().all()

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -22,6 +24,12 @@ COARSE = 0.04
 class TestProximity(KindConformance):
     kind = PROXIMITY
     parameters = {"tolerance": COARSE}
+    gates = ()
+
+
+class TestProximityWithSmoothGradients(KindConformance):
+    kind = PROXIMITY
+    parameters = {"tolerance": 0.1, "gradient_tolerance": 0.3}
     gates = ()
 
 
@@ -225,3 +233,35 @@ def test_only_moments_are_found(tmp_path):
     assert "fields of moments" in text and "item, radius 10 mm: " in text
     force = tgdsl.compile(document(tmp_path, [POINT], feels=["item", "floor"]))
     assert force.inputs.fields == ("body_pos", "body_quat", "body_linvel", "body_angvel")
+
+
+SOLIDS = {
+    "sphere": ('<geom type="sphere" size=".025"/>', 4 * np.pi * 0.025**2),
+    "capsule": ('<geom type="capsule" size=".01 .02"/>', 4 * np.pi * 0.01**2 + 2 * np.pi * 0.01 * 0.04),
+    "cylinder": ('<geom type="cylinder" size=".01 .02"/>', 2 * np.pi * 0.01**2 + 2 * np.pi * 0.01 * 0.04),
+}
+
+
+@pytest.mark.parametrize("shape", SOLIDS)
+def test_density_is_shared_out_over_the_points(tmp_path, shape):
+    """A ball that holds the whole object weighs every point: ρ S0 = density times the mean of R − |p − q|, whatever the area."""
+    geom, area = SOLIDS[shape]
+    sensor = {"backend": "points", "points": 300, "outputs": ["force"], "reference_area": None, "normal_stiffness": 1.0}
+    touch = module(tmp_path, [(0, 0, 0)], geom, radius=0.06, gate=None, kind="proximity", **sensor)
+    arrays = touch.plan.arrays
+    assert float(arrays["objects/item/moments/0/area"][0]) == pytest.approx(area, rel=1e-12)
+    points = arrays["objects/item/moments/0/points"].T[:300]
+    place = np.array([0.001, -0.002, 0.003])
+    mean = np.mean(0.06 - np.linalg.norm(points + place, axis=1))
+    found = touch(state(touch, pos=place.tolist()))["s"][0, 0, 2]
+    assert float(found) == pytest.approx(-100 * mean, rel=1e-12)
+
+
+def test_explain_counts_the_bytes_of_all_channels(tmp_path):
+    """With noise of the radius a field holds derivatives too: 8 numbers of 4 bytes at each node."""
+    cases: list[tuple[dict[str, Any], int]] = [({}, 4), ({"noise": {"radius_noise": 1e-3}}, 8)]
+    for noise, channels in cases:
+        touch = module(tmp_path, [(0, 0, 0)], CUBE, gate=None, kind="proximity", tolerance=0.1, **noise)
+        x, y, z = touch.plan.arrays["objects/item/moments/0/num"][0]
+        assert f"{x} × {y} × {z} nodes every" in touch.explain()
+        assert f" mm, {4 * channels * x * y * z} bytes\n" in touch.explain()

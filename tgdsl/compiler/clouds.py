@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from tgdsl.compiler import cache
 from tgdsl.compiler.felt import FeltGeom
-from tgdsl.compiler.moments import AREA_RADIUS, moments_key
+from tgdsl.compiler.moments import AREA_RADIUS, moments_key, surface_area
 from tgdsl.compiler.quadrature import outer_surface
 from tgdsl.errors import BakeError
 
@@ -63,7 +63,7 @@ def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarr
 
     def make() -> tuple[np.ndarray, float]:
         pieces = outer_surface(geoms, max(AREA_RADIUS, max(map(_extent, geoms)) / FINENESS))
-        return pieces.random_by_side(count, seed=0).pos, float(pieces.area.sum())
+        return pieces.random_by_side(count, seed=0).pos, surface_area(geoms)
 
     return cache.cached(
         moments_key(geoms, b"points side by side", AREA_RADIUS, FINENESS, count),
@@ -116,15 +116,15 @@ def _sample(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int, r
     pieces = outer_surface(geoms, radius / 4)
     if not len(pieces.area):
         raise BakeError("there is no surface to sample: planes are exact")
-    points = pieces.random(count, seed=0)
+    points, weight = pieces.random(count, seed=0).pos, surface_area(geoms) / count
     needed, reach = 0, radius + radius_noise
     for share in (0.5, 1.0, 2.0):
         cell = share * radius
-        low, high = points.pos.min(axis=0) - reach, points.pos.max(axis=0) + reach
+        low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
         x, y, z = (int(num) for num in np.ceil((high - low) / cell))
-        lists = _lists(points.pos, low, (x, y, z), cell, reach + SLACK, budget)
+        lists = _lists(points, low, (x, y, z), cell, reach + SLACK, budget)
         if isinstance(lists, np.ndarray):
-            return Cloud(points.pos, float(points.area[0]), lists, (x, y, z), low, cell)
+            return Cloud(points, weight, lists, (x, y, z), low, cell)
         needed = lists
     raise BakeError(
         f"lists of {count} points within {1e3 * reach:g} mm need {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is"

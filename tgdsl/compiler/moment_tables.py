@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from tgdsl.compiler.clouds import sample_cloud
 from tgdsl.compiler.felt import FeltBody, FeltGeom
-from tgdsl.compiler.moments import bake_field, surface_area
+from tgdsl.compiler.moments import FieldErrors, bake_field, surface_area
 from tgdsl.errors import BakeError, LowerError
 from tgdsl.plan import Pair, PlannedMoments
 from tgdsl.sensors.base import MomentsRequest
@@ -80,7 +80,8 @@ def _fields(
     for geoms in variants:
         for radius in radii:
             with_slope = request.radius_noise > 0
-            baked.append(bake_field(geoms, radius, request.tolerance, request.max_bytes, with_slope))
+            limits = (request.tolerance, request.gradient_tolerance)
+            baked.append(bake_field(geoms, radius, *limits, request.max_bytes, with_slope))
             left -= baked[-1].values.nbytes
     if left < 0:
         needed = request.max_bytes - left
@@ -98,7 +99,12 @@ def _fields(
         "cell": np.array([field.cell for field in baked]),
     }
     pairs = zip(baked, [*radii] * len(variants), strict=True)
-    return tables, [{**dataclasses.asdict(field.errors), "radius": radius, "cell": field.cell} for field, radius in pairs]
+    return tables, [{**_measured(field.errors), "radius": radius, "cell": field.cell} for field, radius in pairs]
+
+
+def _measured(errors: FieldErrors) -> dict[str, float]:
+    """Return the errors that were measured, by name."""
+    return {name: value for name, value in dataclasses.asdict(errors).items() if value is not None}
 
 
 def _clouds(variants: Sequence[tuple[FeltGeom, ...]], request: MomentsRequest, radius: float) -> dict[str, np.ndarray]:
@@ -168,4 +174,5 @@ def pack_moments(
         objects=tuple(names.index(name) for name in chosen),
         radii=tuple(tables[request, name].radii for name in chosen),
         accuracy=tuple(tables[request, name].accuracy for name in chosen),
+        is_smooth=request.gradient_tolerance is not None,
     )

@@ -3,7 +3,9 @@
 See `geometry.moments` for what they are, `quadrature` for what the integrals are summed from. A field's nodes hold
 f − h²/12 ∇²f rather than f, with second differences over the cell h: linear interpolation lies above what curves upwards by
 h²/12 f'' on the mean, so that this takes the mean error away and leaves its spread (√(1/720) against √(1/120) of h² f''): a
-cell may be half as large again. Planes are exact and take no part.
+cell may be half as large again. Where the gradient by place has a tolerance, nodes hold the factors of quadratic B-splines that
+equal f there: the gradient then has no jumps, and its error is largest a radius away from faces, where f's second derivative
+has one. Planes are exact and take no part.
 
 Shapes: `n` points, `x`, `y`, `z` nodes along the axes.
 """
@@ -13,10 +15,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import spline_filter
 
 from tgdsl.compiler import cache
 from tgdsl.compiler.felt import FeltGeom
@@ -25,16 +29,18 @@ from tgdsl.errors import BakeError
 from tgdsl.geometry.moments import MomentField, field_moments
 from tgdsl.geometry.planes import split
 
-FORMAT = b"tgdsl moments 1"
+FORMAT = b"tgdsl moments 2"
 CHOICE_POINTS, REPORT_POINTS = 1024, 2048
 HEADROOM = 0.95
 """The choice holds the tolerance with something to spare, so that as a rule the held-back points hold it too."""
 FINER = 2.0
 """How many times finer than the field's the quadrature is that it is measured against."""
+GRADIENT_FINENESS = 24
+"""Pieces along a radius where gradients have a tolerance; fewer where it is more than one over this."""
 BRICK = 6
 """Nodes along the side of a brick that is computed at once."""
 AREA_RADIUS = 1e-3
-"""Longest side of the pieces that an object's area is summed from, where no radius asks for less [m]."""
+"""Longest side of the pieces that an object's area is summed from [m]."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +54,19 @@ class FieldErrors:
         mass_max: Its largest.
         first_rms: Root mean square of the length of the error of S1.
         first_max: Its largest.
+        gradient_p999: 99.9th percentile of the error of S0's gradient by place, over the largest gradient; None: not measured,
+            as the next two.
+        gradient_max: Its largest.
+        first_gradient_p999: The same of S1, by Frobenius' norm.
     """
 
     mass_rms: float
     mass_max: float
     first_rms: float
     first_max: float
+    gradient_p999: float | None = None
+    gradient_max: float | None = None
+    first_gradient_p999: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +74,7 @@ class BakedField:
     """Moments at the nodes of a lattice in the body's frame.
 
     Attributes:
-        values: S0 [m³], S1 [m⁴], and their derivatives with respect to R if asked for; float32.
+        values: S0 [m³], S1 [m⁴], and their derivatives with respect to R if asked for, or their splines' factors; float32.
         origin: Place of node (0, 0, 0) [m].
         cell: Spacing of the nodes [m].
         errors: What the lattice costs in accuracy.
@@ -84,7 +97,12 @@ def surface_area(geoms: Sequence[FeltGeom]) -> float:
 
 
 def bake_field(
-    geoms: Sequence[FeltGeom], radius: float, tolerance: float = 5e-3, budget: int = 64 * 2**20, with_slope: bool = False
+    geoms: Sequence[FeltGeom],
+    radius: float,
+    tolerance: float = 5e-3,
+    gradient_tolerance: float | None = None,
+    budget: int = 64 * 2**20,
+    with_slope: bool = False,
 ) -> BakedField:
     """Return the coarsest lattice found that holds the moments of an object's outer surface to a tolerance.
 
@@ -95,6 +113,8 @@ def bake_field(
         geoms: The geoms of one variant of an object.
         radius: Sensing radius [m].
         tolerance: Largest error, in the sense above, as a fraction of full scale.
+        gradient_tolerance: Largest error of 99.9 % of S0's gradients by place, as a fraction of the largest gradient; the field
+            is of quadratic B-splines then. None: a trilinear field, whose gradients are as good as they come out.
         budget: Largest size of the values [bytes].
         with_slope: Whether to add the derivatives with respect to the radius; no tolerance holds for them.
 
@@ -106,8 +126,8 @@ def bake_field(
             f"a field of moments needs a radius above 0 and a tolerance between 0 and 1, found {radius}, {tolerance}"
         )
     return cache.cached(
-        moments_key(geoms, b"field", radius, tolerance, budget, float(with_slope)),
-        lambda: _bake(geoms, radius, tolerance, budget, with_slope),
+        moments_key(geoms, b"field", radius, tolerance, gradient_tolerance or 0.0, budget, float(with_slope)),
+        lambda: _bake(geoms, radius, Limits(tolerance, gradient_tolerance, budget), with_slope),
         _packed,
         _unpacked,
     )
@@ -131,36 +151,87 @@ def _unpacked(found: Mapping[str, np.ndarray]) -> BakedField:
     values = found["values"]
     if values.dtype != np.float32 or values.ndim != 4 or not np.isfinite(values).all():
         raise ValueError("a damaged field")
-    return BakedField(values, found["origin"], float(found["cell"]), FieldErrors(*found["errors"].tolist()))
+    always, measured = np.split(found["errors"], [4])
+    errors = FieldErrors(*always.tolist(), *(None if np.isnan(error) else error for error in measured.tolist()))
+    return BakedField(values, found["origin"], float(found["cell"]), errors)
 
 
-def _bake(geoms: Sequence[FeltGeom], radius: float, tolerance: float, budget: int, with_slope: bool) -> BakedField:
+class Limits(NamedTuple):
+    """What a field is to hold: see `bake_field`."""
+
+    tolerance: float
+    gradient_tolerance: float | None
+    budget: int
+
+
+class Truth(NamedTuple):
+    """Points [m], the moments there, and their derivatives by place if they matter."""
+
+    pos: Float[np.ndarray, "n 3"]
+    moments: Float[np.ndarray, "n 4"]
+    gradients: Float[np.ndarray, "n 4 3"] | None
+
+
+def _bake(geoms: Sequence[FeltGeom], radius: float, limits: Limits, with_slope: bool) -> BakedField:
+    tolerance, gradient_tolerance, budget = limits
+    least = 4.0 if gradient_tolerance is None else float(np.clip(1 / gradient_tolerance, 4, GRADIENT_FINENESS))
     # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.
-    spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), 4, 24))
+    spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), least, 24))
     pieces, fine = outer_surface(geoms, spacing), outer_surface(geoms, spacing / FINER)
     if not len(pieces.area):
         raise BakeError("there is no surface to bake moments of: planes are exact")
     coarse, exact = pieces.quadrature(spacing), fine.quadrature(spacing / FINER)
     held_back = _around(fine, radius, REPORT_POINTS, seed=2), _around(fine, radius, CHOICE_POINTS, seed=1)
-    report, choice = ((pos, moment_sums(exact, pos, radius, 4, block=1)) for pos in held_back)
+    report, choice = (_truth(exact, pos, radius, gradient_tolerance is not None) for pos in held_back)
     channels = 8 if with_slope else 4
-    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be.
+    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be. That of
+    # S0's gradients falls as the cell: some 0.17 h/R.
     cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
+    cell = cell if gradient_tolerance is None else min(cell, radius * gradient_tolerance / 0.17)
     while True:
         origin, num = _lattice(coarse.pos, radius, cell)
         needed = 4 * channels * int(np.prod(num))
         if needed > budget:
-            raise BakeError(
-                f"a field of moments of a tolerance of {tolerance:g} at a radius of {1e3 * radius:g} mm needs about"
-                f" {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is {budget / 2**20:.3g} MiB ({budget} bytes);"
-                " raise the tolerance or the budget, or sum over points"
-            )
-        values = _fitted(_node_sums(coarse, origin, num, cell, radius, channels)).astype(np.float32)
-        errors = _errors(values, origin, cell, *choice)
+            raise BakeError(_too_large(radius, limits, needed))
+        nodes = _node_sums(coarse, origin, num, cell, radius, channels)
+        values = (_fitted if gradient_tolerance is None else _splines)(nodes).astype(np.float32)
+        errors = _errors(values, origin, cell, choice)
         worst = max(errors.mass_rms, errors.first_rms) / (HEADROOM * tolerance)
-        if worst <= 1:
-            return BakedField(values, origin, cell, _errors(values, origin, cell, *report))
-        cell /= float(np.clip(np.sqrt(worst), 1.05, 2.5))
+        steep = 0.0 if gradient_tolerance is None else (errors.gradient_p999 or 0.0) / (HEADROOM * gradient_tolerance)
+        if max(worst, steep) <= 1:
+            return BakedField(values, origin, cell, _errors(values, origin, cell, report))
+        cell /= float(np.clip(max(np.sqrt(worst), steep), 1.05, 2.5))
+
+
+def _too_large(radius: float, limits: Limits, needed: int) -> str:
+    """Return what is wrong with limits that need so many bytes."""
+    gradients = "" if limits.gradient_tolerance is None else f", and of {limits.gradient_tolerance:g} of its gradients,"
+    return (
+        f"a field of moments of a tolerance of {limits.tolerance:g}{gradients} at a radius of {1e3 * radius:g} mm needs about"
+        f" {needed / 2**20:.3g} MiB ({needed} bytes), and the budget is {limits.budget / 2**20:.3g} MiB"
+        f" ({limits.budget} bytes); raise the tolerance or the budget, or sum over points"
+    )
+
+
+def _truth(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float, with_gradients: bool) -> Truth:
+    """Return what a field is measured against at points."""
+    gradients = gradient_sums(surface, pos, radius) if with_gradients else None
+    return Truth(pos, moment_sums(surface, pos, radius, 4, block=1), gradients)
+
+
+def gradient_sums(surface: Quadrature, pos: Float[np.ndarray, "n 3"], radius: float) -> Float[np.ndarray, "n 4 3"]:
+    """Return the derivatives of S0 and S1 by place at points, summed over points of a surface.
+
+    With u the unit vector from q to p and r = |p − q| < R: ∇S0 = ∫ u dA [m²], ∇S1 = ∫ (r u uᵀ − (R − r) 1) dA [m³].
+    """
+    found = np.zeros((len(pos), 4, 3))
+    for own, near, q in zip(found, surface.tree.query_ball_point(pos, radius), pos, strict=True):
+        way, area = surface.pos[near] - q, surface.area[near]
+        r = np.linalg.norm(way, axis=1)
+        unit = way / np.maximum(r, 1e-12)[:, None]
+        own[0] = area @ unit
+        own[1:] = (area[:, None] * way).T @ unit - (area @ (radius - r)) * np.eye(3)
+    return found
 
 
 def _around(pieces: Pieces, radius: float, count: int, seed: int) -> Float[np.ndarray, "n 3"]:
@@ -235,21 +306,41 @@ def _fitted(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x 
     return fitted
 
 
-def _errors(
-    values: Float[np.ndarray, "x y z channel"],
-    origin: Float[np.ndarray, 3],
-    cell: float,
-    pos: Float[np.ndarray, "n 3"],
-    true: Float[np.ndarray, "n 4"],
-) -> FieldErrors:
+def _splines(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x y z channel"]:
+    """Return the factors of the quadratic B-splines whose sum equals the values at the nodes; zero in the two outer layers."""
+    found = np.zeros_like(values)
+    within = (slice(2, -2),) * 3
+    for channel in range(values.shape[3]):
+        found[within + (channel,)] = spline_filter(values[..., channel], order=2)[within]
+    return found
+
+
+def _errors(values: Float[np.ndarray, "x y z channel"], origin: Float[np.ndarray, 3], cell: float, true: Truth) -> FieldErrors:
     x, y, z, channels = values.shape
-    place = split(torch.from_numpy(origin))
-    field = MomentField(
-        torch.from_numpy(values.reshape(-1, channels)), 0, (x, y, z), place, torch.tensor(cell, dtype=torch.float64)
+    place, side = split(torch.from_numpy(origin)), torch.tensor(cell, dtype=torch.float64)
+    flat = torch.from_numpy(values.reshape(-1, channels))
+    field = MomentField(flat, 0, (x, y, z), place, side, is_smooth=true.gradients is not None)
+    pos = torch.from_numpy(true.pos).requires_grad_()
+    mass, first = field_moments(split(pos), field)
+    found = torch.stack([mass, *first], dim=1)
+    mass_error, first_error = (
+        np.linalg.norm(error, axis=1) / np.linalg.norm(own, axis=1).max()
+        for error, own in _halves(found.detach().numpy() - true.moments, true.moments)
     )
-    mass, first = field_moments(split(torch.from_numpy(pos)), field)
-    mass_error = np.abs(mass.numpy() - true[:, 0]) / np.abs(true[:, 0]).max()
-    first_error = np.linalg.norm(torch.stack(first, dim=1).numpy() - true[:, 1:4], axis=1)
-    first_error /= np.linalg.norm(true[:, 1:4], axis=1).max()
     rms = [float(np.sqrt(np.mean(error**2))) for error in (mass_error, first_error)]
-    return FieldErrors(rms[0], float(mass_error.max()), rms[1], float(first_error.max()))
+    errors = FieldErrors(rms[0], float(mass_error.max()), rms[1], float(first_error.max()))
+    if true.gradients is None:
+        return errors
+    slopes = [torch.autograd.grad(found[:, c].sum(), pos, retain_graph=True)[0].numpy() for c in range(4)]
+    error = np.stack(slopes, axis=1) - true.gradients
+    of_mass, of_first = (
+        np.linalg.norm(own, axis=(1, 2)) / np.linalg.norm(all_of, axis=(1, 2)).max()
+        for own, all_of in _halves(error, true.gradients)
+    )
+    p999, first_p999 = (float(np.quantile(part, 0.999)) for part in (of_mass, of_first))
+    return dataclasses.replace(errors, gradient_p999=p999, gradient_max=float(of_mass.max()), first_gradient_p999=first_p999)
+
+
+def _halves(*both: np.ndarray) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Return the parts that belong to S0, and those that belong to S1."""
+    return tuple(part[:, :1] for part in both), tuple(part[:, 1:4] for part in both)

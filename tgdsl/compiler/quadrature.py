@@ -1,8 +1,9 @@
 """The outer surface of an object as triangles and as points with area weights: what integrals over it are summed from.
 
-Geoms become triangles, which are halved to a spacing. What lies inside another geom of the object is no surface, nor is a face
-that two geoms share from opposite sides; of one that they share from the same side the first geom's counts. Triangles that
-another geom's surface crosses are halved further. Nothing depends on a seed, but for points that are asked to be random.
+Geoms become triangles, which are halved to a spacing; those of a primitive add up to its area in closed form. What lies inside
+another geom of the object is no surface, nor is a face that two geoms share from opposite sides; of one that they share from
+the same side the first counts. Triangles that another geom's surface crosses are halved further. Nothing depends on a seed,
+but for points that are asked to be random.
 
 Shapes: `n` points, `f` triangles.
 """
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
+from scipy.special import elliprg
 
 from tgdsl.compiler.felt import FeltGeom
 from tgdsl.compiler.solid import Solid, halved
@@ -123,6 +125,8 @@ class _Geom:
     corners: Float[np.ndarray, "f 3 3"]
     distance: Distance
     is_mesh: bool
+    stretch: float
+    """Area of the true surface over that of the triangles."""
 
     @staticmethod
     def of(felt: FeltGeom, spacing: float) -> _Geom:
@@ -140,7 +144,8 @@ class _Geom:
                 value, gradient = planes[0].numpy(), torch.stack(planes[1], dim=1).numpy()
             return value, gradient @ geom.rotation.T
 
-        return _Geom(corners @ geom.rotation.T + geom.pos, distance, solid is not None)
+        stretch = 1.0 if solid is not None else primitive_area(felt.shape, geom.size) / _areas(corners).sum()
+        return _Geom(corners @ geom.rotation.T + geom.pos, distance, solid is not None, stretch)
 
     def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         return self.distance(pos)[0] < 0
@@ -175,7 +180,7 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
         is_split = is_out & ((side > spacing) | is_cut)
         is_done = is_out & ~is_split
         done = corners[is_done]
-        kept.append((done, pos[is_done], normal[is_done], 0.5 * np.linalg.norm(_cross(done), axis=1)))
+        kept.append((done, pos[is_done], normal[is_done], own.stretch * _areas(done)))
         corners = halved(corners[is_split])
     return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
 
@@ -203,6 +208,31 @@ def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
 
 def _cross(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _areas(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, " f"]:
+    return 0.5 * np.linalg.norm(_cross(corners), axis=1)
+
+
+def primitive_area(shape: str, size: Float[np.ndarray, 3]) -> float:
+    """Return the area of a primitive [m²]; of an ellipsoid by Carlson's integral (DLMF 19.33.2).
+
+    Args:
+        shape: Its type.
+        size: As in MuJoCo: half sizes, semi-axes, or radius and half length [m].
+    """
+    a, b, c = map(float, size)
+    match shape:
+        case "box":
+            return 8.0 * (a * b + b * c + c * a)
+        case "sphere":
+            return 4.0 * np.pi * a**2
+        case "capsule":
+            return 4.0 * np.pi * a * (a + b)
+        case "cylinder":
+            return 2.0 * np.pi * a * (a + 2.0 * b)
+        case _:
+            return float(4.0 * np.pi * elliprg((a * b) ** 2, (b * c) ** 2, (c * a) ** 2))
 
 
 def _triangles(shape: str, size: Float[np.ndarray, 3], spacing: float) -> Float[np.ndarray, "f 3 3"]:

@@ -14,6 +14,7 @@ of all clouds; `bin` cubes of all lattices; `slot` places of a list; `*point` br
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -24,6 +25,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Count, within
 from tgdsl.geometry.planes import Vec, vec
 
+Pair = tuple[Tensor, Tensor]
 BLOCK = 16
 """Candidates of each point that are summed at once where nothing fuses the sum, so that memory stays bounded."""
 
@@ -52,6 +54,8 @@ class MomentField(NamedTuple):
         num: Number of its nodes along each axis.
         origin: Place of its node (0, 0, 0) in the object's frame [m].
         cell: Spacing of its nodes [m], alike along all axes.
+        is_smooth: Whether the values are factors of quadratic B-splines about the nodes rather than the moments there: the
+            gradient then has no jumps.
     """
 
     values: Float[Tensor, "node channel"]
@@ -59,6 +63,7 @@ class MomentField(NamedTuple):
     num: tuple[Count, Count, Count]
     origin: Vec
     cell: Float[Tensor, "*point"]
+    is_smooth: bool = False
 
 
 class PointCloud(NamedTuple):
@@ -86,25 +91,52 @@ class PointCloud(NamedTuple):
 
 
 def field_moments(point: Vec, field: MomentField, radius_shift: Tensor | None = None) -> Moments:
-    """Return moments by trilinear interpolation; zero outside the lattice, not-a-number for a point that is none.
+    """Return moments by trilinear interpolation or splines; zero outside the lattice, not-a-number for a point that is none.
 
     Args:
         point: Points in the object's frame [m].
         field: The field.
         radius_shift: By how much the radius is larger than the field's [m], to first order; the field then has 8 channels.
     """
-    base, rest = _cell_of(point, field.origin, field.cell, field.num, last=2)
+    base, weights = _spline_weights(point, field) if field.is_smooth else _linear_weights(point, field)
     _, num_y, num_z = field.num
-    total = [torch.zeros_like(rest[0])] * (4 if radius_shift is None else 8)
-    for corner in range(8):
-        up = (corner >> 2 & 1, corner >> 1 & 1, corner & 1)
-        wx, wy, wz = (t if k else 1 - t for t, k in zip(rest, up, strict=True))
-        index = field.first + base + (up[0] * num_y + up[1]) * num_z + up[2]
+    total = [torch.zeros_like(weights[0][0])] * (4 if radius_shift is None else 8)
+    for (i, wx), (j, wy), (k, wz) in product(*(list(enumerate(along)) for along in weights)):
+        index = field.first + base + (i * num_y + j) * num_z + k
         weight = wx * wy * wz
         total = [part + weight * field.values[index, c] for c, part in enumerate(total)]
     if radius_shift is not None:
         total = [part + radius_shift * slope for part, slope in zip(total[:4], total[4:], strict=True)]
     return Moments(total[0], (total[1], total[2], total[3]))
+
+
+def _linear_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Pair, Pair, Pair]]:
+    """Return the index of the lowest of the nodes around points, and the weights of both along each axis."""
+    base, (x, y, z) = _cell_of(point, field.origin, field.cell, field.num, last=2)
+    return base, ((1 - x, x), (1 - y, y), (1 - z, z))
+
+
+def _spline_weights(point: Vec, field: MomentField) -> tuple[Tensor, tuple[Vec, Vec, Vec]]:
+    """Return the index of the lowest of the nodes around points, and the weights of three along each axis.
+
+    A quadratic B-spline reaches over the nodes next to the nearest one, so the lattice ends half a cell before its last node.
+    """
+    nodes = [within((part - start) / field.cell - 0.5, count - 2) for part, start, count in _axes(point, field)]
+    lower = [within(part.floor().long(), count - 3) for part, count in zip(nodes, field.num, strict=True)]
+    base = (lower[0] * field.num[1] + lower[1]) * field.num[2] + lower[2]
+    x, y, z = (_quadratic(part - corner) for part, corner in zip(nodes, lower, strict=True))
+    return base, (x, y, z)
+
+
+def _quadratic(t: Tensor) -> Vec:
+    """Return the weights of the three nodes of a quadratic B-spline's piece, 0 ≤ t ≤ 1 through it."""
+    rest = 1 - t
+    return 0.5 * rest * rest, 0.5 + t * rest, 0.5 * t * t
+
+
+def _axes(point: Vec, field: MomentField) -> zip[tuple[Tensor, Tensor, Count]]:
+    """Return for each axis where points are, where the lattice begins, and how many nodes it has."""
+    return zip(point, field.origin, field.num, strict=True)
 
 
 def plane_moments(point: Vec, radius: Tensor) -> Moments:

@@ -69,10 +69,11 @@ def with_moments(felt: Felt, pairs: Pairs, probes: Probes, sources: Sequence[Mom
 def _felt_moments(pairs: Pairs, own: slice, probes: Probes, source: MomentSource) -> Moments:
     """Return the moments of an object at the probes, in their links' frames."""
     tensors = [source.radius, *probes.pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
-    if isinstance(source.surface, MomentField) and not source.planes and takes_kernel(*tensors):
+    field = source.surface
+    if isinstance(field, MomentField) and not field.is_smooth and not source.planes and takes_kernel(*tensors):
         from tgdsl.geometry.nearby_kernel import felt_moments
 
-        return felt_moments(pairs, own, probes.pos, source.pair, source.radius, source.shift, source.surface)
+        return felt_moments(pairs, own, probes.pos, source.pair, source.radius, source.shift, field)
     rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
     point = planes.add(planes.rotate(rotation, probes.pos), gathered(pairs.offset, own, source.pair))
     moments = _moments(point, source)

@@ -119,6 +119,7 @@ class MomentsRequest:
         backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
         num_points: Points of each object.
         tolerance: Root mean square error of a field as a fraction of full scale.
+        gradient_tolerance: Error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any.
         max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
         with_area: Whether the area of the felt objects is wanted, so that there must be one.
         radius_noise: By how much radii may differ from the probes' own [m]; set by the compiler.
@@ -127,6 +128,7 @@ class MomentsRequest:
     backend: Literal["field", "points"]
     num_points: int
     tolerance: float
+    gradient_tolerance: float | None
     max_bytes: int
     with_area: bool
     radius_noise: float = 0.0

@@ -61,6 +61,9 @@ class ProximitySpec(ProbeSpec):
     """Points of each object, for `backend: points`."""
     tolerance: Annotated[float, Quantity("number", gt=0.0), Field(lt=1.0)] = 0.005
     """Root mean square error that a field may have, as a fraction of full scale [1]."""
+    gradient_tolerance: Annotated[float | None, Quantity("number", gt=0.0), Field(lt=1.0)] = None
+    """Error that 99.9 % of the gradients of S0 by place may have, as a fraction of the largest one [1]: fields are then sums of
+    quadratic B-splines, whose gradients have no jumps. Default: gradients are as good as they come out."""
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of an object's fields, or of its lists of points [bytes]."""
     outputs: Annotated[tuple[Literal["force", "torque"], ...], Field(min_length=1)] = ("force", "torque")
@@ -125,7 +128,8 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     needs = {"moments"}
     if spec.shear_damping and ("force" in spec.outputs or "about_link" in constants):
         needs.add("motion")
-    request = MomentsRequest(spec.backend, spec.points, spec.tolerance, spec.max_bytes, spec.reference_area is None)
+    limits = (spec.tolerance, spec.gradient_tolerance, spec.max_bytes)
+    request = MomentsRequest(spec.backend, spec.points, *limits, with_area=spec.reference_area is None)
     return Lowered(tuple(channels), constants, needs=frozenset(needs), moments=request)
 
 

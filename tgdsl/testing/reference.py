@@ -6,11 +6,13 @@ Shapes: `env` environments, `taxel` taxels, `row` taxels or bodies, `channel` nu
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from tgdsl.geometry.reference import (
@@ -23,7 +25,7 @@ from tgdsl.geometry.reference import (
     distance_to,
     touch,
 )
-from tgdsl.plan import SLOT_FIELDS, Plan, PlannedObject
+from tgdsl.plan import SLOT_FIELDS, Plan, PlannedMoments, PlannedObject
 from tgdsl.sensors.base import Kind, ProbeSpec
 from tgdsl.state import SceneState
 
@@ -119,7 +121,7 @@ class ReferenceModule:
         for k, target in enumerate(self.plan.objects[o] for o in planned.objects):
             variant = self._variant(target, state, env)
             table = self.tables.setdefault(
-                (k, variant), MomentTable(self.plan, target.name, planned.request, variant, planned.radii[k])
+                (k, variant), MomentTable(self.plan, target.name, planned, variant, planned.radii[k])
             )
             area[k], body = table.area, self._body(state, env, target.body, shift)
             for t, link_id in enumerate(layout.link_id):
@@ -178,16 +180,22 @@ class ReferenceModule:
         return [ReferenceGeom(shapes[g], size[g], pos[g], rotation[g].reshape(3, 3)) for g in present]
 
 
+def _splines(factors: np.ndarray, place: np.ndarray) -> float:
+    """Return a sum of quadratic B-splines about nodes at a place in cells, clamped to half a cell within the border."""
+    place = np.clip(place, 0.5, np.array(factors.shape) - 1.5)
+    return float(map_coordinates(factors, place[:, None], order=2, prefilter=False, mode="nearest")[0])
+
+
 class MomentTable:
     """One object's moments by other means than the module's: SciPy's interpolation, a sum over all points, closed form."""
 
-    def __init__(self, plan: Plan, name: str, request: int, variant: int, radii: tuple[float, ...]):
+    def __init__(self, plan: Plan, name: str, planned: PlannedMoments, variant: int, radii: tuple[float, ...]):
         """Find the tables of a variant of an object."""
-        prefix = f"objects/{name}/moments/{request}/"
+        prefix, self.is_smooth = f"objects/{name}/moments/{planned.request}/", planned.is_smooth
         self.arrays = {path.removeprefix(prefix): value for path, value in plan.arrays.items() if path.startswith(prefix)}
         self.variant, self.radii = variant, radii
         self.area = float(self.arrays["area"][variant])
-        self.fields: dict[float, RegularGridInterpolator] = {}
+        self.fields: dict[float, Callable[[np.ndarray], np.ndarray]] = {}
 
     def at(self, point: np.ndarray, radius: float) -> tuple[float, np.ndarray]:
         """Return S0 [m³] and S1 [m⁴] at a point in the object's frame [m]."""
@@ -206,9 +214,11 @@ class MomentTable:
             total += [s0, *(-height * normal * s0)] if d < radius else np.zeros(4)
         return float(total[0]), total[1:]
 
-    def _field(self, i: int) -> RegularGridInterpolator:
+    def _field(self, i: int) -> Callable[[np.ndarray], np.ndarray]:
         first, num, origin, cell = (self.arrays[name][i] for name in ("first", "num", "origin", "cell"))
         values = self.arrays["values"][first : first + num.prod()].reshape(*num, 4).astype(np.float64)
+        if self.is_smooth:
+            return lambda point: np.array([_splines(part, (point - origin) / cell) for part in np.moveaxis(values, 3, 0)])[None]
         axes = [start + cell * np.arange(count) for start, count in zip(origin, num, strict=True)]
         return RegularGridInterpolator(axes, values, bounds_error=False, fill_value=0.0)
 
@@ -216,11 +226,12 @@ class MomentTable:
     def _points(self) -> np.ndarray:
         lists, first = self.arrays["lists"], self.arrays["first"]
         end = first[self.variant + 1] if self.variant + 1 < len(first) else len(lists)
-        return self.arrays["points"].T[np.unique(lists[first[self.variant] : end])]
+        rows, filler = np.unique(lists[first[self.variant] : end]), self.arrays["points"].shape[1] - 1
+        return self.arrays["points"].T[rows[rows != filler]]
 
     def _summed(self, point: np.ndarray, radius: float) -> np.ndarray:
         way = self._points - point
-        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.arrays["weight"][self.variant]
+        weight = np.maximum(radius - np.linalg.norm(way, axis=1), 0.0) * self.area / len(way)
         return np.array([weight.sum(), *(weight @ way)])
 
 
