@@ -32,7 +32,15 @@ class ObservationError(TgdslError):
 
 
 class FileError(TgdslError, OSError):
-    """A file that cannot be written; also caught as the system's own error."""
+    """A file that cannot be written; also caught as the system's own error.
+
+    Attributes:
+        reason: What the system says.
+    """
+
+    def __init__(self, file: object, reason: str):
+        super().__init__(f"{file}: {reason}")
+        self.reason = reason
 
 
 class HandError(TgdslError):

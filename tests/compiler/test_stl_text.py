@@ -17,7 +17,7 @@ BODY = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="block" file="bl
 URDF = """<robot name="r"><link name="base"><collision><origin xyz="0 0 .2"/><geometry><sphere radius=".02"/></geometry></collision></link><link name="hand">
   <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
   <collision><geometry><mesh filename="meshes/block.stl"/></geometry></collision></link>
-  <joint name="j" type="fixed"><parent link="base"/><child link="hand"/></joint></robot>"""
+  <joint name="j" type="continuous"><parent link="base"/><child link="hand"/></joint></robot>"""
 BLOCK, BALL = trimesh.creation.box((0.1, 0.06, 0.04)), trimesh.creation.icosphere(1)
 
 

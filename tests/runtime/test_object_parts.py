@@ -343,7 +343,7 @@ def test_a_link_that_is_welded_to_an_object_does_not_feel_itself(tmp_path):
         "objects": {"table": {"body": "table"}},
         "sensors": {"s": {"kind": "contact_depth", "links": "pad", "feels": ["table"], "gate": "geometric"}},
     }
-    with pytest.raises(SpecError, match='"table" can never be in contact with a link of this sensor'):
+    with pytest.raises(SpecError, match='"table" and the links of this sensor are one rigid body; put a joint between them'):
         tgdsl.compile(document)
 
 

@@ -103,8 +103,12 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     for name, target in passes.prune(work):
         sensor = name.removesuffix("/clean")
         path: Path = ("sensors", sensor, "feels", list(loaded.spec.sensors[sensor].feels).index(target))
-        what = f'"{target}" can never be in contact with a link of this sensor: the simulator does not collide them'
-        loaded.problems.append(loaded.problem(path, what, "let them collide, or use `gate: geometric`"))
+        if loaded.spec.sensors[sensor].is_gated:
+            what, hint = "the simulator does not collide them", "let them collide, or use `gate: geometric`"
+            what = f'"{target}" can never be in contact with a link of this sensor: {what}'
+        else:
+            what, hint = f'"{target}" and the links of this sensor are one rigid body', "put a joint between them"
+        loaded.problems.append(loaded.problem(path, what, hint))
     _settle_contacts(loaded, work)
     _settle(loaded, work, progress)
     _settle_moments(loaded, work, progress)

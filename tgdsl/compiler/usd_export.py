@@ -26,7 +26,7 @@ from tgdsl.compiler.usd_export_draft import Draft, note, place, put, usd
 from tgdsl.compiler.usd_export_geoms import add_geoms, add_sites
 from tgdsl.compiler.usd_export_joints import BALL, FREE, add_drives, add_joint, joint_of
 from tgdsl.compiler.usd_notes import OPTION, flags, notable, plain
-from tgdsl.errors import RobotError, listed
+from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.schema.files import whole_file
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
@@ -210,5 +210,5 @@ def _write(draft: Draft, out: Path) -> None:
         with whole_file(out) as temporary:
             if not draft.stage.GetRootLayer().Export(str(temporary)):
                 raise OSError(0, "USD did not say why")
-    except OSError as error:
-        raise RobotError(f"{out}: cannot be written: {error.strerror}") from error
+    except FileError as error:
+        raise RobotError(f"{out}: cannot be written: {error.reason}") from error

@@ -64,7 +64,7 @@ def writable(target: Path) -> Path:
     """
     there = next(part for part in target.absolute().parents if part.exists())
     if not there.is_dir():
-        raise FileError(f"{target}: {there} is a file, expected a folder")
+        raise FileError(target, f"{there} is a file, expected a folder")
     with naming(target):
         _refuse_folder(target)
         with tempfile.TemporaryFile(dir=there):
@@ -136,9 +136,9 @@ def naming(target: Path) -> Iterator[None]:
     except FileError:
         raise
     except OSError as error:
-        raise FileError(f"{target}: {error.strerror or error}") from error
+        raise FileError(target, error.strerror or str(error)) from error
 
 
 def _refuse_folder(target: Path) -> None:
     if target.is_dir():
-        raise FileError(f"{target}: this is a folder, expected a file's name")
+        raise FileError(target, "this is a folder, expected a file's name")
