@@ -75,8 +75,7 @@ class Bench:
         if options.eager:
             return cls(case, plan, touch.advance, touch.device)
         turn.compile(touch)
-        assert touch.calls.compiled, "this machine cannot compile"
-        return cls(case, plan, touch.calls.compiled["advance"], touch.device)
+        return cls(case, plan, touch.calls.of(touch.advance), touch.device)
 
     def module(self, graph: bool = False) -> TactileModule:
         """Return a module that remembers nothing yet, with the case's code."""

@@ -22,10 +22,11 @@ class Constants(nn.Module):
         """
         check_dtype(dtype)
         super().__init__()
-        self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
         self._counts = {name: tuple(array[0].tolist()) for name, array in arrays.items() if name.endswith("/num")}
-        for name, exact in self._exact.items():
-            self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
+        with torch.inference_mode(False):  # whoever builds a module there may want derivatives later
+            self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
+            for name, exact in self._exact.items():
+                self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
 
     @property
     def dtype(self) -> torch.dtype:

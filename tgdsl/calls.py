@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -19,32 +19,36 @@ Step = Callable[..., Any]
 
 
 class Calls:
-    """The steps of a module as they were compiled.
+    """How a module's steps are to be called. A copy of a module compiles its own.
 
     Attributes:
-        compiled: Compiled steps, by their names; none of a module that is eager. Another dictionary each time.
+        compiled: Compiled steps, by their names; none of a module that is eager. Another dictionary after each `compile`.
         graphed: The same as CUDA graphs, if those are wanted.
     """
 
     def __init__(self) -> None:
         """Have all steps eager."""
+        self._wanted: tuple[bool, dict[str, Any]] | None = None
         self.compiled: dict[str, Step] = {}
         self.graphed: dict[str, Graphed] = {}
 
-    def compile(self, steps: Sequence[Step], graph: bool, **options: Any) -> None:
-        """Have steps compiled at their first call, and replayed as CUDA graphs if wanted.
+    def compile(self, graph: bool, **options: Any) -> None:
+        """Have steps compiled when they are first called, and replayed as CUDA graphs if wanted.
 
         Args:
-            steps: Methods of the module.
             graph: Whether calls without derivatives replay a CUDA graph.
             **options: Handed to `torch.compile`.
         """
-        self.compiled = {step.__name__: torch.compile(of_its_own(step), **options) for step in steps}
-        self.graphed = {name: Graphed(step) for name, step in self.compiled.items()} if graph else {}
+        self._wanted, self.compiled, self.graphed = (graph, options), {}, {}
 
     def of(self, step: Step) -> Step:
         """Return what to call for a step: inside a capture of the caller's own, what a graph of ours would capture."""
         name = step.__name__
+        if self._wanted is not None and name not in self.compiled:
+            graph, options = self._wanted
+            self.compiled[name] = torch.compile(of_its_own(step), **options)
+            if graph:
+                self.graphed[name] = Graphed(self.compiled[name])
         if name in self.graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
             return self.graphed[name]
         return self.compiled.get(name, step)
@@ -53,6 +57,10 @@ class Calls:
         """Capture anew at the next calls: constants lie elsewhere."""
         for graphed in self.graphed.values():
             graphed.forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is compiled: it is bound to the module that this is of."""
+        return {"_wanted": self._wanted, "compiled": {}, "graphed": {}}
 
 
 def inductor_options(plan: Plan) -> dict[str, bool]:

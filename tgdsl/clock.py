@@ -162,7 +162,8 @@ class Clock(nn.Module):
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
             ages = state_dict.get(f"{prefix}ages")
-            self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
+            with torch.inference_mode(False):
+                self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
         super()._load_from_state_dict(state_dict, prefix, *args)
         if self.num_envs is not None:
             self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))

@@ -28,10 +28,17 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     """
     if env_ids is None:
         return np.arange(num_envs)
-    found = np.asarray(torch.as_tensor(env_ids).cpu())
+    try:
+        found = np.asarray(torch.as_tensor(env_ids).cpu())
+    except (TypeError, ValueError, RuntimeError) as wrong:
+        what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
+        raise error(f"env_ids: found {env_ids!r}, expected {what}") from wrong
     if found.dtype == bool and found.shape == (num_envs,):
         return np.flatnonzero(found)
-    is_index = found.dtype.kind in "iu" and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
+    # Numbers of 8 bits are a mask that is not boolean rather than indices.
+    is_index = (
+        found.dtype.kind in "iu" and found.dtype.itemsize > 1 and found.ndim == 1 and ((found >= 0) & (found < num_envs)).all()
+    )
     if found.size and not is_index:
         what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
         raise error(f"env_ids: found {listed([str(value) for value in found.ravel()])}, expected {what}")

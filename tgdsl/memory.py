@@ -7,14 +7,14 @@ numbers per row.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tgdsl.clock import Clock
-from tgdsl.errors import StateError
+from tgdsl.errors import StateError, listed
 from tgdsl.fusion import stored
 from tgdsl.plan import PlannedMemory, PlannedSensor
 
@@ -39,7 +39,7 @@ class Memory(nn.Module):
                 shape = (s.history.length, len(reading.channels), reading.num_rows)
                 self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
-        self._last: dict[str, Tensor] = {}
+        self._last: dict[str, tuple[Tensor, int]] = {}
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
 
@@ -88,7 +88,10 @@ class Memory(nn.Module):
 
     def note_last(self, readings: Mapping[str, Tensor]) -> None:
         """Note what is handed out, (env, row, channel), where it lies; nothing to do once it is kept."""
-        self._last = {} if self.num_kept else {name: reading.detach() for name, reading in readings.items()}
+        if self.num_kept:
+            self._last = {}
+        else:
+            self._last = {name: (reading.detach(), _version(reading)) for name, reading in readings.items()}
 
     def keep_last(self, num_envs: int, stacks: Collection[str]) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.
@@ -103,8 +106,11 @@ class Memory(nn.Module):
         if self.num_kept is None:
             if not self._last:
                 raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+            if changed := [name for name, (reading, version) in self._last.items() if _version(reading) != version]:
+                what = f"the readings {listed(changed)} that were handed out last have been written into since"
+                raise StateError(f"{what}, and the environments left out are to have them: write into clones")
             with torch.inference_mode(False), torch.no_grad():
-                for name, reading in self._last.items():
+                for name, (reading, _) in self._last.items():
                     if name not in stacks:
                         copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
                         self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
@@ -135,6 +141,12 @@ class Memory(nn.Module):
                 buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
         self.clock.reset(chosen)
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Memory:
+        """Move or cast all buffers; what was handed out last lies elsewhere."""
+        self._last = {}
+        super()._apply(fn, recurse)
+        return self
+
     def _load_from_state_dict(
         self,
         state_dict: dict[str, Any],
@@ -152,9 +164,11 @@ class Memory(nn.Module):
             error_msgs.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
         if error_msgs:
             return  # nothing is loaded, nor by the clock
-        for path, value in found.items():
-            room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
-            self.register_buffer(path, room)
+        with torch.inference_mode(False):
+            for path, value in found.items():
+                room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
+                self.register_buffer(path, room)
+        self._last = {}
         self._forget_kept()  # what is replaced has handed them out
         own = local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         super()._load_from_state_dict(state_dict, prefix, *own)
@@ -174,6 +188,11 @@ class Memory(nn.Module):
                     f'"{prefix}{path}" has shape {tuple(value.shape)}, expected (env, …, {", ".join(map(str, expected))})'
                 )
         return wrong
+
+
+def _version(tensor: Tensor) -> int:
+    """Return how often a tensor was written into, as autograd counts it; inference tensors do not count."""
+    return -1 if tensor.is_inference() else tensor._version
 
 
 def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:

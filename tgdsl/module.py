@@ -338,7 +338,8 @@ class TactileModule(nn.Module):
         """Choose the random numbers of noise; steps and episodes are counted from 0 again.
 
         They depend on the seed, the sensor's name, the environment's number and the step, and on nothing else: not on other
-        sensors or environments, the batch size, the device or the process.
+        sensors or environments, the batch size, the device or the process. A reset begins the next episode, whose numbers are
+        others: reset first, then seed.
 
         Args:
             seed: Any integer; those that differ by a multiple of 2⁶⁴ are the same.
@@ -377,7 +378,7 @@ class TactileModule(nn.Module):
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
         if not {"mode", "options", "backend"} & options.keys():
             defaults["options"] = self.inductor_options()
-        self.calls.compile((self.advance, self.advance_some, self.look), graph, **{**defaults, **options})
+        self.calls.compile(graph, **{**defaults, **options})
         return self
 
     def inductor_options(self) -> dict[str, bool]:

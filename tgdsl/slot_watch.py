@@ -1,4 +1,7 @@
-"""Notices contacts that found no slot and carry force, and warns of them without making the host wait for a GPU.
+"""Notices contacts that found no slot and may carry force, and warns of them without making the host wait for a GPU.
+
+A pair is noted if its slots lack part of its net force, or if it counts more contacts than slots while those shown carry force:
+what is not shown may press from the other side, so that the net force tells nothing of it.
 
 Shapes: `env` environments, `pair` pairs of a module's inputs.
 """
@@ -55,7 +58,8 @@ class SlotWatch:
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
             size = whole.abs().amax(dim=-1) + force.abs().amax(dim=(2, 3))
             wanted = found.to(torch.float32).clamp(min=self._inputs.slots + 0.5)  # a state may not count its contacts
-            wanted = torch.where(lacking > TOLERANCE * size, wanted, 0.0)
+            is_crowded = (found > self._inputs.slots) & (force.abs().amax(dim=(2, 3)) > 0)
+            wanted = torch.where((lacking > TOLERANCE * size) | is_crowded, wanted, 0.0)
             self._wanted.copy_(torch.cat([self._wanted[None], wanted]).amax(dim=0))
 
     def warn(self) -> None:

@@ -42,8 +42,11 @@ class ContactSensors:
             inputs: What the module wants.
 
         Raises:
-            SimulationError: If the model lacks a sensor, or one does not show what is wanted.
+            SimulationError: If the model lacks a sensor, one does not show what is wanted, or sensors are disabled.
         """
+        if inputs.pairs and model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+            what = "the scene has sensors disabled, and contacts are read of sensors: they would read 0"
+            raise SimulationError(f'{what}; take <flag sensor="disable"/> out of its <option>')
         self._fields = [name for name in CONTACT_FIELDS if name in inputs.fields]
         self._shapes = {name: shape_of(name, inputs) for name in self._fields}
         self._num_slots = inputs.slots

@@ -34,7 +34,8 @@ class HistorySpec(SpecModel):
     reduce: Literal["stack", "last", "median", "mean"] = "stack"
     """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
     view: StrictBool = False
-    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites; default: a copy."""
+    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites and which
+    carries no gradient; default: a copy."""
 
     @model_validator(mode="after")
     def _is_used(self) -> HistorySpec:

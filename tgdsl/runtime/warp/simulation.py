@@ -243,7 +243,7 @@ class WarpSimulation(Simulation):
     def _physics_and_touch(self) -> dict[str, Tensor]:
         self._worlds.step(self.substeps)
         if self._faults.on_fault == "reset":
-            self._touch.reset(self._faults.restarted)
+            self._touch.reset(self._worlds.restarted)
             self._worlds.evaluate_stale()
         return self._touch(self._read(self.control_step))
 
@@ -267,9 +267,10 @@ class WarpSimulation(Simulation):
         self._worlds.put(env_mask(env_ids, self.num_envs, self._lane.device), rows)
 
     def _advance(self, num_steps: int) -> None:
+        self._worlds.prepare()
         (self._step if num_steps == self.substeps else self._substep)()
         if self._faults.on_fault == "reset":
-            self._touch.reset(self._faults.restarted.to(self._touch.device))
+            self._touch.reset(self._worlds.restarted.to(self._touch.device))
         self._finish_step()
 
     def _finish_step(self, is_evaluated: bool = False) -> None:

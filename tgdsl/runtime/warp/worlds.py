@@ -24,7 +24,9 @@ from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
 from tgdsl.runtime.warp.reading import SOURCES
 
-_DERIVED = (*SOURCES, "geom_xpos", "geom_xmat", *FORCES.values())
+_VELOCITIES = ("cvel", "cdof_dot")
+"""What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
+_DERIVED = tuple(dict.fromkeys((*SOURCES, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
 """Contacts per environment that there is room for, unless said otherwise."""
@@ -41,6 +43,7 @@ class Worlds:
         kept: Those of `qpos`, `qvel` and `ctrl` that the module wants, at the instant of poses and contacts.
         contacts: The contacts that the module wants.
         faults: What has gone wrong.
+        restarted: Environments that the last `step` has started anew.
     """
 
     def __init__(
@@ -100,8 +103,10 @@ class Worlds:
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
             self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
             self._is_reset = torch.zeros_like(self._is_stale)
+            self.restarted = torch.zeros_like(self._is_stale)
             self.faults = Faults(self.arrays, on_fault)
         self._has_stale, self._is_in_graphs, self._lane = True, False, lane
+        self._has_loops = model.neq > 0
         self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self.evaluate_stale)
 
     def step(self, num_steps: int) -> None:
@@ -127,9 +132,15 @@ class Worlds:
         self._is_stale.zero_()
         is_faulty = self.faults.settle()
         if self.faults.on_fault == "reset":
+            self.restarted.copy_(is_faulty)
             self._is_reset.copy_(is_faulty)
             self._restart()
             self.faults.note_restarted(is_faulty)
+
+    def prepare(self) -> None:
+        """Evaluate environments that were put elsewhere before they are stepped, if the model has loops: see `_VELOCITIES`."""
+        if self._has_loops:
+            self.refresh()
 
     def stepped(self, is_evaluated: bool = False) -> None:
         """Take note, on the host, that all environments have been stepped.
@@ -196,7 +207,8 @@ class Worlds:
         """
         arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
         earlier = {name: array.clone() for name, array in arrays.items()}
-        self._mjw.forward(self.model, self.data)
+        for _ in range(2 if self._has_loops else 1):
+            self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)
         for name, before in earlier.items():
             array = arrays[name]
@@ -238,6 +250,10 @@ class Worlds:
             array = self.arrays[name]
             if array.numel():
                 array.copy_(torch.where(_like(self._is_reset, array), start, array))
+        for name in _VELOCITIES:
+            array = self.arrays[name]
+            if array.numel():  # what is not a number there would come back in the next evaluation
+                array.masked_fill_(_like(self._is_reset, array), 0.0)
         self.faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
 

@@ -9,10 +9,11 @@ the tangential displacement of the object's material since the taxel took hold o
 
 with ε [m] the thickness or else the taxels' spacing √mean(A). The elastic kernels give
 
-    u_j = Σ_i G(r_ij) [τ_i, p_i] A_i,    p_i = K_n h_i,    τ_i = K_t t_i where h_i > 0,    K_t = K_n 2 (1 − ν)/(2 − ν)
+    u_j = Σ_i G(r_ij) [τ_i, p_i] A_i,    p_i = K_n h_i,    τ_i = K_t t_i where h_i > 0
 
-with G the displacement [m/N] at the markers' depth in a half-space (`half_space`) or in a layer bonded to a rigid base
-(`bonded_layer`), tractions in [Pa]. With friction |τ_i| ≤ μ p_i, and the same cap |t_i| ≤ μ h_i K_n/K_t holds for the Gaussian.
+with G the displacement [m/N] at the markers' depth in a half-space (`half_space`, K_t = K_n 2 (1 − ν)/(2 − ν)) or in a layer
+of thickness t bonded to a rigid base (`bonded_layer`, K_t = E/(2 (1 + ν) t): dragged all over, its surface moves by the drag),
+tractions in [Pa]. With friction |τ_i| ≤ μ p_i, and the same cap |t_i| ≤ μ h_i K_n/K_t holds for the Gaussian.
 All vectors are in the frame of the taxel's link. Inactive taxels neither press nor move.
 
 With `anchors: points` (Gaussian) the shear's sources are N points on each object, for each link that they may meet
@@ -20,7 +21,8 @@ With `anchors: points` (Gaussian) the shear's sources are N points on each objec
 
     Σ_p w s_s Π_nj(z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²),    h_p = max(0, s − φ(z_p)),    w = A/(N A_ref)      [m]
 
-Source: Chung et al., *Tactile Genesis*, appendix, "ElastomerTaxel"; K_t/K_n by Mindlin (Johnson, *Contact Mechanics*, 7.4).
+Source: Chung et al., *Tactile Genesis*, appendix, "ElastomerTaxel"; K_t/K_n of a half-space by Mindlin (Johnson, *Contact
+Mechanics*, 7.4), K_t of a layer by simple shear.
 
 Departures: the paper anchors points that are sampled on the object (`anchors: points`, the default under `model: paper`); by
 default anchors are the taxels' own: four numbers per taxel instead of four per point and link, planes and objects of any size

@@ -146,7 +146,10 @@ class ElastomerSpec(ContactProbeSpec):
 
     @property
     def stiffness_ratio(self) -> float:
-        """Mindlin's tangential over normal stiffness of a contact, 2 (1 − ν)/(2 − ν)."""
+        """Tangential over normal stiffness K_t/K_n: of a layer by K_t = G/t, else Mindlin's of a contact, 2 (1 − ν)/(2 − ν)."""
+        if self.kernel == "bonded_layer":
+            assert self.youngs_modulus is not None and self.thickness is not None and self.normal_stiffness is not None
+            return self.youngs_modulus / (2.0 * (1.0 + self.poissons_ratio) * self.thickness * self.normal_stiffness)
         return 2.0 * (1.0 - self.poissons_ratio) / (2.0 - self.poissons_ratio)
 
     @property
