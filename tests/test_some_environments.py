@@ -1,6 +1,7 @@
 """Reading some environments alone, and looking without advancing anything."""
 
 import copy
+import pickle
 
 import jaxtyping
 import numpy as np
@@ -144,6 +145,56 @@ def test_a_sensor_without_memory_takes_a_mask_too(folder):
         touch(states[0], env_ids=[1])
 
 
+def test_readings_that_were_written_into_are_not_handed_out_again(folder):
+    """Before the first masked call they are kept where they lie: who writes into them is told, and not given them back."""
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
+    touch(felt_state(touch, 3, 0))["d"].mul_(100.0)
+    with pytest.raises(StateError, match="the readings d that were handed out last have been written into since"):
+        touch(felt_state(touch, 3, 1), env_ids=[1])
+    first = touch(felt_state(touch, 3, 2))["d"].clone()
+    found = touch(felt_state(touch, 3, 3), env_ids=[1])["d"]
+    assert torch.equal(found[[0, 2]], first[[0, 2]])
+    found.mul_(100.0)  # from now on they have a place of their own
+    assert torch.equal(touch(felt_state(touch, 3, 4), env_ids=[1])["d"][[0, 2]], first[[0, 2]])
+
+
+@pytest.mark.parametrize("change", ["load", "cast"])
+def test_what_was_handed_out_by_another_state_is_forgotten(touch, change):
+    touch(felt_state(touch, NUM_ENVS))
+    if change == "load":
+        touch.load_state_dict(touch.state_dict())
+    else:
+        touch.float()
+    with pytest.raises(StateError, match="nothing was handed out yet"):
+        touch(felt_state(touch, NUM_ENVS), env_ids=[0])
+
+
+def test_a_copy_of_a_compiled_module_computes_by_itself(folder, monkeypatch):
+    """Its own constants, dtype and memory; the original goes on with its own."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel", "noise": {"white_noise": 0.1}}}))
+    touch.compile(backend="eager", fullgraph=False)
+    state = felt_state(touch, 3)
+    first = touch(state)["d"].clone()
+    for other in (copy.deepcopy(touch), pickle.loads(pickle.dumps(touch))):
+        exact = other.double().seed(0)
+        found = exact(state)["d"]
+        assert found.dtype == torch.float64 and other.calls.compiled.keys() == {"advance"}
+        torch.testing.assert_close(found.float(), first, rtol=1e-4, atol=1e-4)
+    assert touch(state)["d"].dtype == torch.float32 and touch.memory.clock.get_buffer("step").tolist() == [2, 2, 2]
+
+
+def test_state_loaded_under_inference_mode_serves_outside(original):
+    source, touch = copy.deepcopy(original), copy.deepcopy(original)
+    for call in range(3):
+        source(felt_state(source, NUM_ENVS, call))
+    with torch.inference_mode():
+        touch.load_state_dict(source.state_dict())
+    state = felt_state(touch, NUM_ENVS, 3)
+    expected = source(state)
+    assert all(torch.equal(reading, expected[name]) for name, reading in touch(state).items())
+
+
 def test_gradients_are_those_of_the_environments_that_are_read(folder):
     touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel"}}), dtype=torch.float64)
     touch(felt_state(touch, 3, 0))
@@ -167,6 +218,10 @@ def test_gradients_are_those_of_the_environments_that_are_read(folder):
         ({"env_ids": [3]}, r"env_ids: found 3, expected indices from 0 to 2, or a mask of 3"),
         ({"env_ids": [-1]}, r"env_ids: found -1, expected indices"),
         ({"env_ids": torch.tensor([0.5])}, r"env_ids: found 0.5, expected indices"),
+        (
+            {"env_ids": torch.tensor([0, 1, 1], dtype=torch.uint8)},
+            r"env_ids: found 0, 1, 1, expected indices from 0 to 2, or a mask",
+        ),
         ({"mask": torch.ones(3, dtype=torch.bool), "env_ids": [0]}, "found both `mask` and `env_ids`, expected one of them"),
     ],
 )

@@ -50,6 +50,8 @@ CASES = {
     "reset of one from the end": lambda: touch.reset(torch.tensor([-1])),
     "reset by no index": lambda: touch.reset([0.5]),
     "reset by a mask of another length": lambda: touch.reset([True, False, True]),
+    "reset by a slice": lambda: touch.reset(slice(0, 1)),
+    "reset by a text": lambda: touch.reset("0"),
     "no state": lambda: touch(None),
     "a state of another type": lambda: touch({"body_pos": 1}),
     "no such dtype": lambda: tgdsl.compile(document(), dtype="flaot32"),
@@ -83,6 +85,8 @@ EXPECTED = {
     "reset of one from the end": ("StateError", "env_ids: found -1, expected indices from 0 to 1, or a mask of 2"),
     "reset by no index": ("StateError", "env_ids: found 0.5, expected indices from 0 to 1, or a mask of 2"),
     "reset by a mask of another length": ("StateError", "env_ids: found True, False, True, expected "),
+    "reset by a slice": ("StateError", "env_ids: found slice(0, 1, None), expected indices from 0 to 1, or a mask of 2"),
+    "reset by a text": ("StateError", "env_ids: found '0', expected indices from 0 to 1, or a mask of 2"),
     "no state": (
         "StateError",
         "a module reads a tgdsl.SceneState, found NoneType; expected sim.state(), or one that holds body_pos, ",

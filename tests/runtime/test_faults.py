@@ -132,6 +132,24 @@ def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
 
 
 @BOTH
+def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator):
+    """Not another one at each physics step that follows: gains would be drawn anew, and delays never fill."""
+    touch = module(tmp_path, noise={"gain": [0.5, 2.0], "read_delay": "4 ms"})
+    sim = simulator(touch, 3, keyframe="home", substeps=4, on_fault="reset")
+    control = torch.zeros(3, 2, dtype=torch.float64)
+    for state in sim.substates(control):
+        touch(state)
+    control[1] = torch.nan
+    states = sim.substates(control)
+    with pytest.warns(UserWarning, match="were started anew"):
+        touch(next(states))
+    for state in states:
+        touch(state)
+    assert touch.memory.clock.get_buffer("episode").tolist() == [0, 1, 0]
+    assert touch.memory.clock.get_buffer("age").tolist() == [8, 4, 8]
+
+
+@BOTH
 def test_in_substates_an_environment_starts_anew_where_its_fault_is(tmp_path, simulator):
     touch = module(tmp_path)
     sim = simulator(touch, 3, keyframe="home", substeps=5, on_fault="reset")

@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,8 @@ from test_object_parts import LOAD, MODELS, RESTING, compiled, of_kinds, simulat
 from warp_cases import warp
 
 import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch import BatchSimulation
 
 TEN = '<body name="item" pos="0 0 .02"><freejoint/>{}</body>'.format(
     "".join(
@@ -28,6 +31,30 @@ def settled(touch, which="mujoco", **options):
     sim = simulated(touch, which, substeps=250, **options)
     sim.step()
     return sim, sim.state()
+
+
+def test_disabled_sensors_are_refused(tmp_path):
+    """MuJoCo then fills no sensor: contacts would silently be none."""
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
+    model = tgdsl.instrument(spec, touch.inputs).compile()
+    BatchSimulation(touch, 1, model=model).close()
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    with pytest.raises(SimulationError, match="the scene has sensors disabled, and contacts are read of sensors"):
+        BatchSimulation(touch, 1, model=model)
+
+
+def test_contacts_that_press_from_both_sides_are_warned_of_too(tmp_path):
+    """Their net force is nothing: what is not shown leaves no trace in it."""
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    _, state = settled(touch)
+    squeezed = dataclasses.replace(
+        state,
+        contact_found=torch.full_like(state.contact_found, touch.inputs.slots + 3.0),
+        contact_netforce=state.contact_force.sum(dim=2),
+    )
+    with pytest.warns(UserWarning, match=r"are more than `slots: 8`.*`slots: 11` would do"):
+        touch(squeezed)
 
 
 @pytest.mark.parametrize("which", MODELS)
@@ -122,15 +149,16 @@ def test_contacts_without_force_share_alike(tmp_path):
     np.testing.assert_array_equal(readings["shared/missed"][0, 0], [0, 0, -2])
 
 
-@pytest.mark.parametrize(("found", "advice"), [(True, "more slots"), (11.0, "slots: 11")])
+@pytest.mark.parametrize(("found", "advice"), [(True, "more slots"), (1.0, "more slots"), (11.0, "slots: 11")])
 def test_anyones_own_state_is_looked_at_too(tmp_path, found, advice):
-    """A state of one's own that lacks force in its slots is told of; if it counts contacts, with the number that would do."""
+    """A state of one's own that lacks force in its slots is told of; if it counts more contacts, at once, with the number."""
     touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 1}})
+    whole = [0.0, 0, -1.0001] if found == 11.0 else [0.0, 0, -2]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], found))
+        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], min(found, 1.0)))
     with pytest.warns(UserWarning, match=f"pad – item are more than `slots: 1`.*`{advice}` would do"):
-        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -2], found))
+        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], whole, found))
 
 
 def test_no_environments_lack_nothing(tmp_path):

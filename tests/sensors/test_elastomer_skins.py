@@ -34,6 +34,50 @@ def document(folder, fields: str) -> str:
     return str(folder / "hand.yaml")
 
 
+WIDE = """<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".03 .03 .01"/></body>
+  <body name="item" pos="0 0 .02"><freejoint/><geom type="box" size=".03 .03 .01"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("skin", ["soft_gel", "firm_rubber"])
+@pytest.mark.parametrize("poissons_ratio", [0.0, 0.3, 0.48])
+def test_a_layer_that_is_dragged_all_over_follows_the_drag(tmp_path, skin, poissons_ratio):
+    """Simple shear: markers on the surface of what sticks everywhere move with it, whatever E and ν; here of a pad of finite size.
+
+    The field of a taxel's patch is that of a disc, which overlaps its neighbours: 8 % at 2 mm on a layer of 2 mm.
+    """
+    (tmp_path / "scene.xml").write_text(WIDE)
+    line = np.linspace(-0.02, 0.02, 21)
+    points = [
+        {"pos": [x, y, 0.01], "normal": [0, 0, 1], "radius": 1e-3, "area": 4e-6} for x in line.tolist() for y in line.tolist()
+    ]
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {
+                "model": str(tmp_path / "scene.xml"),
+                "layout": {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}},
+            },
+            "objects": {"item": {"body": "item"}},
+            "sensors": {
+                "s": {"kind": "elastomer", "like": skin, "links": "pad", "feels": ["item"], "poissons_ratio": poissons_ratio}
+            },
+        },
+        dtype=torch.float64,
+    )
+    state, drag = touch.example_state(1), 1e-4
+    pos, quat = torch.zeros_like(state.body_pos), torch.zeros_like(state.body_quat)
+    quat[..., 0] = 1
+    for share in np.linspace(0, 1, 6):
+        item = torch.tensor([share * drag, 0, 0.02 - 5e-5], dtype=torch.float64)
+        pos[0, touch.inputs.bodies.index("item")] = item
+        found = touch(tgdsl.SceneState(body_pos=pos, body_quat=quat, contact_found=torch.ones(1, 1)))["s"]
+    centre = found[0, len(points) // 2].numpy()
+    assert centre[0] == pytest.approx(drag, rel=0.08)
+    assert abs(centre[1]) < 1e-3 * drag
+
+
 def test_the_papers_gel_has_the_papers_numbers():
     """Chung et al., appendix: s_d = s_s = 100, λ_d = 8000, λ_s = 2000, α = 1.2, c = 1, 1e-5 m, 1e-4 m, 1000 points, no edge."""
     gel = spec(like="paper_gel")
