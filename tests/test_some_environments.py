@@ -116,9 +116,15 @@ def test_a_look_before_the_first_call_fixes_nothing(touch):
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(touch, monkeypatch):
+def test_compiled_equals_eager(folder, monkeypatch):
+    """Rings, filters, walks, windows, held samples, bits: three graphs, of calls, of masked ones and of looks."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
-    touch = touch.to(torch.float32)
+    noise = {"read_delay": 0.013, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "drift": 1e-5}
+    sensors = {
+        "s": {"kind": "contact_depth", "noise": noise, "rate": 60, "history": {"length": 3, "reduce": "mean"}},
+        "c": {"kind": "contact", "release_threshold": 1e-4, "history": 3},
+    }
+    touch = tgdsl.compile(document(folder, sensors))
     eager, compiled = copy.deepcopy(touch).seed(3), touch.seed(3).compile()
     for call, (reset, read, _) in enumerate(schedule(5, 8)):
         state = felt_state(eager, NUM_ENVS, call)
