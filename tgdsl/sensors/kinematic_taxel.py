@@ -19,8 +19,9 @@ Options, all off by default, in this order:
 with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin k_ω (ω · m_j) as above; j the taxels of one body, c the solver's contacts
 on that body with all of the sensor's objects, f_c their forces on it and m_c their normals.
 
-Balanced, the normal forces of a body's taxels sum to the solver's W, in the proportions of the law above. Their friction is
-that of the law up to a limit: the cone of `friction_cone`, or else all together the solver's own, so that a contact without
+Balanced, the normal forces of a body's taxels sum to the solver's W as magnitudes, each along its own m_j, in the proportions
+of the law above: where normals lean apart, under a ball or beside an edge, their vector sum is smaller. Their friction is that
+of the law up to a limit: the cone of `friction_cone`, or else all together the solver's own, so that a contact without
 friction has none. A taxel's patch is no larger than its probe, so friction twists it with no more than l_j R_j, R_j its radius
 [m]. Nothing grows as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. What pulls has no share of W. ε is the normal force up
 to which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. What
