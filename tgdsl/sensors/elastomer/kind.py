@@ -52,6 +52,8 @@ from tgdsl.sensors.elastomer.reference import reference
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.sensors.noise import TAXEL
 
+FLAT = "flat/"
+"""Constants `flat/<first taxel>`: links whose taxels have one normal. That they are there is all they say."""
 CHANNELS = tuple(Channel(f"displacement_{axis}", "m") for axis in "xyz")
 
 
@@ -83,6 +85,7 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
             CHANNELS, constants, state, needs=frozenset({"distance", "frame"}), range=span, radius=reach, notes=spec.notes
         )
     constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
+    constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(layout)}
     if spec.model != "paper":
         constants["reference_area"] = scalar(spec.reference_area)
     state = {name: Memory(shape="points") for name in point_anchors.PLANES}
@@ -90,6 +93,13 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     return Lowered(
         CHANNELS, constants, state, needs=frozenset({"points"}), range=span, radius=reach, points=request, notes=spec.notes
     )
+
+
+def _flat_links(layout: Layout) -> list[int]:
+    """Return the first taxel of each link all of whose taxels have the same normal."""
+    starts = np.flatnonzero(np.diff(layout.link_id, prepend=-1)).tolist()
+    ends = [*starts[1:], layout.num_taxels]
+    return [first for first, end in zip(starts, ends, strict=True) if (layout.normal[first:end] == layout.normal[first]).all()]
 
 
 def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
@@ -105,7 +115,8 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     move = _elastic if "normal_stiffness" in constants else _gaussian
     found = move(felt.depth, shear, normal, constants)
     if pulls is not None:
-        markers = Markers(probes.pos, normal, constants["shear_falloff"], constants.get("reference_area"))
+        flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
+        markers = Markers(probes.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
         dragged = point_anchors.drag(pulls, markers, felt.depth.shape[0])
         found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after

@@ -38,12 +38,21 @@ BLOCK = 64
 
 
 class Markers(NamedTuple):
-    """Markers of all links: positions [m] and normals, planes (taxel,); λ_s [1/m²]; A_ref [m²], or None: points count once."""
+    """Markers of all links.
+
+    Attributes:
+        pos: Positions [m], planes (taxel,).
+        normal: Normals, likewise.
+        falloff: λ_s [1/m²].
+        reference_area: A_ref [m²], or None: points count once.
+        flat: First taxels of the links whose markers have one normal.
+    """
 
     pos: Vec
     normal: Vec
     falloff: Tensor
     reference_area: Tensor | None
+    flat: frozenset[int] = frozenset()
 
 
 class Pull(NamedTuple):
@@ -140,7 +149,8 @@ def _summed(pull: Pull, markers: Markers) -> Vec:
     total = (zero, zero, zero)
     rows = active_points(pull.pos, pull.strength) if are_compacted(pull.pos, pull.strength) else None
     for link, (first, last) in enumerate(pull.taxels):
-        pos, normal = (planes.vec(part[first:last] for part in vector) for vector in (markers.pos, markers.normal))
+        pos = planes.vec(part[first:last] for part in markers.pos)
+        normal = planes.vec(part[first : first + 1 if first in markers.flat else last] for part in markers.normal)
         if rows is None:
             z, strength = (planes.vec(part[:, link] for part in vector) for vector in (pull.pos, pull.strength))
             found = _summed_on_link(z, strength, pos, normal, markers.falloff)
@@ -165,16 +175,23 @@ def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
     """Return the sum for one link's markers, of one block of points.
 
-    The in-plane offset is found along two tangents of each marker, scaled so that its square is the exponent of 2.
+    The in-plane offset is found along two tangents of each marker, scaled so that its square is the exponent of 2. Where all
+    markers share one normal, so do their tangents, and what there is of each point is found once per point.
     """
     scale = torch.sqrt(falloff / math.log(2.0))
     z, own = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
     offset_u, offset_v = (
-        stored(planes.dot(tangent, marker))[:, None] - planes.dot(planes.vec(stored(part)[:, None] for part in tangent), z)
+        stored(planes.dot(tangent, marker))[:, None] - _along(planes.vec(stored(part)[:, None] for part in tangent), z)
         for tangent in (planes.scale(scale, tangent) for tangent in _tangents(normal))
     )
     fall = torch.exp2(-offset_u * offset_u - offset_v * offset_v)
     return planes.vec((fall * part).sum(dim=-1) for part in own)
+
+
+def _along(tangent: Vec, point: Vec) -> Tensor:
+    """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed anew for each marker."""
+    found = planes.dot(tangent, point)
+    return stored(found) if tangent[0].shape[0] == 1 else found
 
 
 def _tangents(normal: Vec) -> tuple[Vec, Vec]:
