@@ -33,7 +33,12 @@ def here(monkeypatch, capsys):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what is slow in the suite that kinds inherit, which has no marks: other people's pytest would not know them."""
+    """Mark as slow what slow.txt lists, and what is slow in the suite that kinds inherit.
+
+    That suite has no marks: other people's pytest would not know them.
+    """
+    listed = (Path(__file__).parent / "slow.txt").read_text(encoding="utf-8").splitlines()
+    slow = {line for line in listed if not line.startswith("#")}
     for item in items:
-        if getattr(item, "originalname", "") == "test_compiled_equals_eager":
+        if getattr(item, "originalname", "") == "test_compiled_equals_eager" or item.nodeid.split("[")[0] in slow:
             item.add_marker("slow")
