@@ -30,13 +30,13 @@ import tyro
 from module import median_ms
 from torch import Tensor
 
-from tgdsl.geometry.reference import Touch
-from tgdsl.geometry.surface import Surface
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.elastomer import blocks, operators
 from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance_reference
 from tgdsl.sensors.elastomer.kernels import Skin
 from tgdsl.sensors.elastomer.operators import Wish
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
+from tgdsl.surfaces.surface import Surface
 
 PITCH = 1.5e-3
 """Spacing of the markers of the square pads [m]."""

@@ -22,9 +22,9 @@ import tyro
 from module import PAD
 
 import tgdsl
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
 from tgdsl.sensors.elastomer import point_anchors
-from tgdsl.state import SceneState
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,8 @@ class Prepare:
         """Prepare all shapes."""
         import igl
 
-        from tgdsl.compiler.bake import bake
-        from tgdsl.geometry.surface import Surface
+        from tgdsl.quantities.contact_depth.bake import bake
+        from tgdsl.surfaces.surface import Surface
 
         arrays: dict[str, np.ndarray] = {}
         for name, mesh in meshes().items():

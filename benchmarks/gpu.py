@@ -40,12 +40,12 @@ from gpu_plots import HEAD, Row, load_rows
 from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, state_of
 from torch import Tensor
 
-from tgdsl.artifact import load_plan
-from tgdsl.graphed import Graphed
-from tgdsl.module import TactileModule
-from tgdsl.outputs import Output
-from tgdsl.plan import Plan
-from tgdsl.state import SceneState
+from tgdsl.module.artifact import load_plan
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.module.state import SceneState
+from tgdsl.plan.plan import Plan
+from tgdsl.tensors.graphed import Graphed
 
 ROTATED = 160e6
 """Bytes that the sets of buffers have together: the L2 of an H200 holds 60 MB."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from gpu_scenes import CASES, KNOBS, MAIN, artefact, bytes_of
 
-from tgdsl.artifact import load
+from tgdsl.module.artifact import load
 
 CLOSE = 1e-5
 """Largest error that 99.9 % of all numbers may have, of full scale."""

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 import tgdsl
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
 from tgdsl.sensors import KINDS as TGDSL_KINDS
-from tgdsl.state import SceneState
 
 PITCH = 0.07
 """Distance between the middles of two pads [m]."""

@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand, TipForces
-from tgdsl.runtime.xhand1.emulator import Emulator
-from tgdsl.runtime.xhand1.link import LinkCounters, LinkTiming
-from tgdsl.runtime.xhand1.payloads import COMMAND_SIZE, STATE_SIZE
-from tgdsl.runtime.xhand1.protocol import OVERHEAD
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.serial_port import BAUD
+from tgdsl.runtime.xhand1.wire.link import LinkCounters, LinkTiming
+from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
+from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD
+from tgdsl.runtime.xhand1.wire.serial_port import BAUD
 
 WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
 """Time that an exchange's bytes are on the line [s]."""

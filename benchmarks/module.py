@@ -21,8 +21,8 @@ import tyro
 from torch import Tensor
 
 import tgdsl
-from tgdsl.module import TactileModule
-from tgdsl.state import SceneState
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
 
 PAD = """
 <mujoco><worldbody>

@@ -28,8 +28,8 @@ from elastomer import captured
 from module import PAD, median_ms
 
 import tgdsl
-from tgdsl.module import TactileModule
-from tgdsl.state import SceneState
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
 
 CROSSTALK = {"strength": 0.3, "sigma": 3e-3}
 TERMS: dict[str, dict[str, Any]] = {

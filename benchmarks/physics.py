@@ -39,9 +39,9 @@ from torch.profiler import ProfilerActivity, profile
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.scene import scene_model
+from tgdsl.scene.scene import scene_model
 
 # What is timed --------------------------------------------------------------------------------------------------------------
 

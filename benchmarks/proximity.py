@@ -24,11 +24,11 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.compiler.felt import FeltGeom
-from tgdsl.compiler.moments import moment_sums
-from tgdsl.compiler.quadrature import outer_surface
-from tgdsl.compiler.robot import Geom
-from tgdsl.module import TactileModule
-from tgdsl.state import SceneState
+from tgdsl.formats.robot import Geom
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.quantities.moments.fields import moment_sums
+from tgdsl.surfaces.quadrature import outer_surface
 
 SCENE = """
 <mujoco><worldbody>

@@ -30,8 +30,8 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.module import TactileModule
-from tgdsl.runtime.state_values import INTEGRATED
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.simulators.state_values import INTEGRATED
 from tgdsl.runtime.warp import WarpSimulation
 
 SUBSTEPS, STEPS = 5, 6

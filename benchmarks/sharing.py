@@ -18,8 +18,8 @@ import tyro
 from module import median_ms
 
 import tgdsl
-from tgdsl.explain import operations_per_env
-from tgdsl.module import TactileModule
+from tgdsl.module.explain import operations_per_env
+from tgdsl.module.module import TactileModule
 
 ROOT = Path(__file__).parent.parent
 SENSORS = {

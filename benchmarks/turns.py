@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 import torch
 from torch.fx import GraphModule
 
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
 
 Case = tuple[str, ...]
 

@@ -42,10 +42,10 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.module import TactileModule
-from tgdsl.runtime.batch import BatchSimulation
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.state import SceneState
 
 HANDED_OVER = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")
 FORCES = ("contact_force", "contact_torque", "contact_netforce")

@@ -21,7 +21,7 @@ import torch
 import tgdsl
 from tgdsl.runtime.connect import Connection
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.scene import scene_model
+from tgdsl.scene.scene import scene_model
 
 SPEC = Path(__file__).parent / "xhand1_tips.yaml"
 CALIBRATION = Path(__file__).parent / "xhand1_calibration.yaml"

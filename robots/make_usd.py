@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tgdsl.compiler.usd_export import export_usd
+from tgdsl.formats.usd.export.writer import export_usd
 
 ROBOTS = Path(__file__).parent
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import igl
 import numpy as np
 
-from tgdsl.compiler.robot import Model, load_model
-from tgdsl.compiler.sample import Samples, sample
-from tgdsl.geometry.surface import Surface
+from tgdsl.formats.robot import Model, load_model
+from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema import yaml
 from tgdsl.schema.placement import LayoutSpec, Placement
+from tgdsl.surfaces.surface import Surface
 
 MAX_DISTANCE = 1e-3
 """The mean distance must be below this [m]."""

@@ -21,11 +21,11 @@ from reflection import Mirror, MirrorError, flipped
 from ruamel.yaml import YAML
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from tgdsl.compiler.points import point_table
-from tgdsl.compiler.rays import reference_axes
 from tgdsl.errors import TgdslError
+from tgdsl.placement.sample.points import point_table
 from tgdsl.schema import yaml
 from tgdsl.schema.placement import Grid, LayoutSpec, Points, Poisson
+from tgdsl.surfaces.rays import reference_axes
 
 _VECTORS = ["direction", "columns_along", "pos", "normal", "center", "facing"]
 _NOT_GEOMETRY = ["method", "rows", "columns", "count", "spacing", "seed", "radius", "area", "within"]

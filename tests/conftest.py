@@ -20,7 +20,7 @@ def here(monkeypatch, capsys):
         monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)  # the command sets its own
         capsys.readouterr()
         try:
-            from tgdsl.cli import main
+            from tgdsl.commands.cli import main
 
             main()
             code = 0

@@ -1,59 +1,37 @@
-"""The five floors of the design: imports only go down, and what is heavy or foreign stays where it belongs."""
+"""The house: rooms on floors, imports only go down, no circles, files of a size; what is foreign stays where it belongs."""
 
 import ast
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "tgdsl"
-FLOORS = {
-    5: {
-        "cli",
-        "arguments",
-        "cache_commands",
-        "run_commands",
-        "calibrate_commands",
-        "hand_commands",
-        "robot_commands",
-        "rl",
-        "report",
-    },
-    4: {"compiler", "runtime"},
-    3: {
-        "schema",
-        "module",
-        "queries",
-        "buffers",
-        "moment_sources",
-        "clock",
-        "history",
-        "reading",
-        "memory",
-        "felt_objects",
-        "taxels",
-        "observing",
-        "outputs",
-        "calls",
-        "env_ids",
-        "example",
-        "state",
-        "scene",
-        "slot_watch",
-        "artifact",
-        "explain",
-    },
-    2: {"sensors", "observations", "proprioception", "layout", "plan", "places"},
-    1: {"geometry", "devices", "progress", "tables", "units", "fields", "fusion", "graphed", "regions", "errors"},
-}
-FLOOR_OF = {part: floor for floor, parts in FLOORS.items() for part in parts}
+REPOSITORY = Path(__file__).parents[1]
+PACKAGE = REPOSITORY / "tgdsl"
+FLOORS = (
+    ("errors",),
+    ("fields", "console", "tensors", "files"),
+    ("geometry", "surfaces", "layout"),
+    ("quantities",),
+    ("sensors", "observations"),
+    ("plan", "schema"),
+    ("scene",),
+    ("module", "formats"),
+    ("placement",),
+    ("compiler", "runtime"),
+    ("view",),
+    ("calibrate",),
+    ("commands",),
+)
+FLOOR_OF = {part: floor for floor, parts in enumerate(FLOORS) for part in parts}
 EXEMPT = {
     "__init__": "hands out the public names of every floor, each imported when it is first used",
     "__main__": "starts the command line",
     "testing": "stands beside the floors: the suite that kinds inherit runs a document all the way through",
 }
-PURE = ("sensors", "geometry", "layout", "plan", "state", "module")
+PURE = ("sensors", "geometry", "layout", "plan", "module", "tensors")
 """What a compiled module is made of: it knows neither MuJoCo nor YAML."""
 SOURCES = sorted(PACKAGE.rglob("*.py"))
+LARGEST_ROOM, LONGEST_FILE = 16, 400
 
 
 def name_of(file: Path) -> str:
@@ -63,6 +41,7 @@ def name_of(file: Path) -> str:
 
 
 MODULES = {name_of(file): file for file in SOURCES}
+PACKAGES = {"tgdsl", *(f"tgdsl.{name_of(f)}" for f in SOURCES if f.name == "__init__.py" and f.parent != PACKAGE)}
 
 
 def imports(file: Path) -> list[tuple[str, bool]]:
@@ -85,19 +64,17 @@ def imports(file: Path) -> list[tuple[str, bool]]:
     return found
 
 
-PACKAGES = {"tgdsl", *(f"tgdsl.{name_of(f)}" for f in SOURCES if f.name == "__init__.py" and f.parent != PACKAGE)}
-
-
-def part_of(name: str) -> str:
+def room_of(name: str) -> str:
     return name.split(".")[0]
 
 
 def own(file: Path) -> list[str]:
     """Return the modules of tgdsl that a file imports, as names below tgdsl; `import tgdsl` itself is ''."""
-    return [name.removeprefix("tgdsl").lstrip(".") for name, _ in imports(file) if name == "tgdsl" or name.startswith("tgdsl.")]
+    names = [name.removeprefix("tgdsl").lstrip(".") for name, _ in imports(file) if name == "tgdsl" or name.startswith("tgdsl.")]
+    return [name if name in MODULES or not name else name.rpartition(".")[0] for name in names]
 
 
-def test_the_reader_of_imports(tmp_path, monkeypatch):
+def test_the_reader_of_imports(monkeypatch):
     file = PACKAGE / "compiler" / "imaginary.py"
     text = "import numpy.linalg\nfrom tgdsl import errors\nfrom . import lower\nfrom ..geometry.shapes import box\ndef f():\n  import mujoco\n"
     monkeypatch.setattr(Path, "read_text", lambda self, encoding=None: text)
@@ -110,54 +87,69 @@ def test_the_reader_of_imports(tmp_path, monkeypatch):
     ]
 
 
-def test_every_module_has_a_floor():
-    homeless = sorted({part_of(name) for name in MODULES} - FLOOR_OF.keys() - EXEMPT.keys())
+def test_nothing_stands_at_the_root_but_rooms():
+    assert {path.stem for path in PACKAGE.glob("*.py")} == {"__init__", "__main__", "errors"}
+    homeless = sorted({room_of(name) for name in MODULES} - FLOOR_OF.keys() - EXEMPT.keys())
     assert not homeless, f"give {homeless} a floor in FLOORS"
     assert not FLOOR_OF.keys() & EXEMPT.keys()
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if part_of(name) not in EXEMPT])
+@pytest.mark.parametrize("name", [name for name in MODULES if room_of(name) not in EXEMPT])
 def test_imports_go_down(name):
-    here = part_of(name)
+    here = room_of(name)
     for imported in own(MODULES[name]):
-        there = part_of(imported)
+        there = room_of(imported)
         if not imported:  # `import tgdsl`: to find the package's folder
-            assert name == "schema.files", f"{name} imports tgdsl as a whole"
+            assert room_of(name) == "files", f"{name} imports tgdsl as a whole"
             continue
         assert there in FLOOR_OF, f"{name} imports tgdsl.{imported}, which is on no floor"
-        assert FLOOR_OF[there] <= FLOOR_OF[here], (
-            f"{name} (floor {FLOOR_OF[here]}) imports tgdsl.{imported} ({FLOOR_OF[there]})"
-        )
+        assert FLOOR_OF[there] <= FLOOR_OF[here], f"{name} imports tgdsl.{imported}, which is above it"
         assert {here, there} != {"compiler", "runtime"}, f"{name} imports tgdsl.{imported}"
 
 
 def test_no_circles():
-    """Within a floor too: every module can be loaded after those that it imports (imports inside functions aside)."""
-    waiting = {}
-    for name, file in MODULES.items():
-        if part_of(name) in EXEMPT:
-            continue
-        names = {imported.removeprefix("tgdsl.") for imported, is_inside in imports(file) if not is_inside}
-        waiting[name] = {other for other in names & MODULES.keys() if other != name}
-    while ready := [name for name, needed in waiting.items() if not needed & waiting.keys()]:
-        for name in ready:
-            del waiting[name]
-    assert not waiting
+    """Neither between files, imports inside functions counted, nor between rooms."""
+    files = {name: {i for i in own(file) if i and i != name} for name, file in MODULES.items() if room_of(name) not in EXEMPT}
+    rooms: dict[str, set[str]] = {}
+    for name, names in files.items():
+        rooms.setdefault(room_of(name), set()).update(room_of(i) for i in names if room_of(i) != room_of(name))
+    for waiting in (files, rooms):
+        while ready := [name for name, needed in waiting.items() if not needed & waiting.keys()]:
+            for name in ready:
+                del waiting[name]
+        assert not waiting
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if part_of(name) in PURE])
+def test_rooms_are_not_crowded():
+    counts = {folder: len(list(folder.glob("*.py"))) for folder in {file.parent for file in SOURCES}}
+    assert not {folder: count for folder, count in counts.items() if count > LARGEST_ROOM}
+
+
+@pytest.mark.parametrize("folder", ["tgdsl", "tests", "benchmarks", "examples", "robots"])
+def test_files_are_short(folder):
+    lengths = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in (REPOSITORY / folder).rglob("*.py")}
+    assert not {file.name: length for file, length in lengths.items() if length > LONGEST_FILE}
+
+
+def test_tests_mirror_the_rooms():
+    beside = {"helpers", "benchmarks", "robots", "examples"}
+    found = {path.parent.relative_to(REPOSITORY / "tests").as_posix() for path in (REPOSITORY / "tests").rglob("test_*.py")}
+    assert {path for path in found if not (PACKAGE / path).is_dir()} <= beside
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if room_of(name) in PURE])
 def test_what_a_module_is_made_of_knows_neither_mujoco_nor_yaml(name):
-    foreign = {part_of(imported) for imported, _ in imports(MODULES[name])}
+    foreign = {room_of(imported) for imported, _ in imports(MODULES[name])}
     assert not foreign & {"mujoco", "mujoco_warp", "ruamel", "pymeshlab", "trimesh", "igl"}
 
 
 def test_warp_is_imported_in_two_functions():
     """It is an extra: only a query of triangles at run time and physics on a GPU may ask for it."""
     found = [
-        (name, part_of(i), is_inside)
+        (name, room_of(i), is_inside)
         for name, file in MODULES.items()
         for i, is_inside in imports(file)
-        if part_of(i) in ("warp", "mujoco_warp")
+        if room_of(i) in ("warp", "mujoco_warp")
     ]
     assert sorted(found) == [
         ("geometry.bvh", "warp", True),
@@ -168,16 +160,16 @@ def test_warp_is_imported_in_two_functions():
 
 def test_pxr_is_imported_in_functions():
     """It takes a quarter of a second and is wanted for USD alone."""
-    found = {name for name, file in MODULES.items() for i, is_inside in imports(file) if part_of(i) == "pxr" and not is_inside}
+    found = {name for name, file in MODULES.items() for i, is_inside in imports(file) if room_of(i) == "pxr" and not is_inside}
     assert not found
 
 
 def test_only_schema_reads_yaml():
-    readers = {part_of(name) for name, file in MODULES.items() if any(part_of(i) == "ruamel" for i, _ in imports(file))}
+    readers = {room_of(name) for name, file in MODULES.items() if any(room_of(i) == "ruamel" for i, _ in imports(file))}
     assert readers == {"schema"}
 
 
 def test_pymeshlab_is_imported_in_one_function():
     """It is GPL-3: no compiled module, and nothing that only imports tgdsl, may load it."""
-    found = [(name, is_inside) for name, file in MODULES.items() for i, is_inside in imports(file) if part_of(i) == "pymeshlab"]
-    assert found == [("compiler.meshlab", True)]
+    found = [(name, is_inside) for name, file in MODULES.items() for i, is_inside in imports(file) if room_of(i) == "pymeshlab"]
+    assert found == [("surfaces.meshlab", True)]

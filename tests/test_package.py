@@ -13,8 +13,8 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.outputs import Output
-from tgdsl.tables import MAX_ROWS, TaxelTable, text_table, with_units
+from tgdsl.console.tables import MAX_ROWS, TaxelTable, text_table, with_units
+from tgdsl.module.outputs import Output
 
 REPOSITORY = Path(__file__).parents[1]
 

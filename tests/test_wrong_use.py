@@ -13,9 +13,9 @@ import pytest
 import torch
 
 import tgdsl
-from tgdsl.clock import Clock
-from tgdsl.env_ids import env_mask
 from tgdsl.errors import FileError, SimulationError, StateError, TgdslError
+from tgdsl.module.clock import Clock
+from tgdsl.tensors.env_ids import env_mask
 
 REPOSITORY = Path(__file__).parents[1]
 SCENE = """

@@ -13,9 +13,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tgdsl import testing as testing
-    from tgdsl.artifact import load as load
-    from tgdsl.artifact import save as save
+    from tgdsl import testing
     from tgdsl.compiler.pipeline import compile as compile
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
@@ -29,33 +27,35 @@ if TYPE_CHECKING:
         StateError,
         TgdslError,
     )
-    from tgdsl.module import TactileModule
-    from tgdsl.runtime.batch import BatchSimulation
-    from tgdsl.runtime.batch import simulate as simulate
+    from tgdsl.module.artifact import load as load
+    from tgdsl.module.artifact import save as save
+    from tgdsl.module.module import TactileModule
+    from tgdsl.module.state import SceneState
+    from tgdsl.runtime.batch.simulation import BatchSimulation
+    from tgdsl.runtime.batch.simulation import simulate as simulate
     from tgdsl.runtime.connect import connect as connect
     from tgdsl.runtime.warp import WarpSimulation
-    from tgdsl.state import SceneState
 
 _PLACES = {
     "ArtifactError": "errors",
-    "BatchSimulation": "runtime.batch",
+    "BatchSimulation": "runtime.batch.simulation",
     "FileError": "errors",
     "HandError": "errors",
     "ObservationError": "errors",
     "RobotError": "errors",
-    "SceneState": "state",
+    "SceneState": "module.state",
     "SimulationError": "errors",
     "SpecError": "errors",
     "StateError": "errors",
-    "TactileModule": "module",
+    "TactileModule": "module.module",
     "TgdslError": "errors",
     "WarpSimulation": "runtime.warp",
     "compile": "compiler.pipeline",
     "connect": "runtime.connect",
     "instrument": "compiler.scene",
-    "load": "artifact",
-    "save": "artifact",
-    "simulate": "runtime.batch",
+    "load": "module.artifact",
+    "save": "module.artifact",
+    "simulate": "runtime.batch.simulation",
 }
 
 __all__ = [

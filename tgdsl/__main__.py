@@ -1,5 +1,5 @@
 """`python -m tgdsl`."""
 
-from tgdsl.cli import main
+from tgdsl.commands.cli import main
 
 main()

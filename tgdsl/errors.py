@@ -44,7 +44,7 @@ class FileError(TgdslError, OSError):
 
 
 class HandError(TgdslError):
-    """Base of every error of a real (or emulated) hand; `tgdsl.runtime.xhand1.errors` has the others."""
+    """Base of every error of a real (or emulated) hand; `tgdsl.runtime.xhand1.wire.errors` has the others."""
 
 
 @dataclass(frozen=True, order=True)

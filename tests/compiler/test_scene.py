@@ -9,13 +9,13 @@ import pytest
 import trimesh
 
 import tgdsl
-from tgdsl.artifact import save_plan
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.compiler.robot import load_model
 from tgdsl.compiler.scene import instrument, scene_file
 from tgdsl.errors import ArtifactError, RobotError
-from tgdsl.plan import Inputs, Pair, contact_sensor_names
-from tgdsl.scene import scene_model
+from tgdsl.formats.robot import load_model
+from tgdsl.module.artifact import save_plan
+from tgdsl.plan.plan import Inputs, Pair, contact_sensor_names
+from tgdsl.scene.scene import scene_model
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TWO = """
@@ -366,7 +366,7 @@ def test_the_palm_scene_is_found_by_name_in_another_checkout(tmp_path, monkeypat
     assert plan.scene.assets
     assert all(asset.path.startswith("robots:xhand1/") for asset in plan.scene.assets)
     shutil.copytree(ROBOTS, tmp_path / "robots")
-    monkeypatch.setattr("tgdsl.scene.robots_folder", lambda: tmp_path / "robots")
+    monkeypatch.setattr("tgdsl.scene.scene.robots_folder", lambda: tmp_path / "robots")
     monkeypatch.chdir(tmp_path)
     model = scene_model(plan.scene)
     assert {model.body(i).name for i in range(model.nbody)} >= {"cube", "right_hand_link"}

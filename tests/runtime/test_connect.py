@@ -14,23 +14,29 @@ from xhand1_models import JOINTS, document, hand_xml
 
 import tgdsl
 from tgdsl.errors import HandError, ObservationError, SimulationError, TgdslError
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
 from tgdsl.runtime import connect as connecting
 from tgdsl.runtime.connect import Connection
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulated_hand import EmulatedHand
-from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
-from tgdsl.runtime.xhand1.emulator import Emulator
-from tgdsl.runtime.xhand1.errors import HandDisconnectedError, HandTimeoutError, MotionError, StaleReadingError, WatchdogError
-from tgdsl.runtime.xhand1.faulty_line import Faults
-from tgdsl.runtime.xhand1.link import LinkTiming
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.payloads import FORCE_MAX, PASSIVE, encode_command
-from tgdsl.runtime.xhand1.protocol import Frame, encode_frame
-from tgdsl.runtime.xhand1.serial_port import PortInfo
 from tgdsl.runtime.xhand1.source import XHand1Source
+from tgdsl.runtime.xhand1.wire.errors import (
+    HandDisconnectedError,
+    HandTimeoutError,
+    MotionError,
+    StaleReadingError,
+    WatchdogError,
+)
+from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX, PASSIVE, encode_command
+from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
+from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
 
 TERMS = [
     {"type": "agg_force", "of": "depth", "scale": 2000},

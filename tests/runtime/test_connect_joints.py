@@ -9,11 +9,11 @@ from xhand1_models import JOINTS, document, hand_xml
 import tgdsl
 from tgdsl.errors import ObservationError
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.errors import MotionError
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
 from tgdsl.runtime.xhand1.source import HandSample
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.wire.errors import MotionError
 
 PLAIN = Calibration.none()
 ORDER = [str(name) for name in np.random.default_rng(1).permutation(JOINTS)]

@@ -11,10 +11,10 @@ import torch
 import tgdsl
 from tgdsl.errors import HandError, ObservationError, TgdslError
 from tgdsl.runtime.xhand1.calibration import load_calibration
-from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
+from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
+from tgdsl.runtime.xhand1.log.record import LogWriter
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.record import LogWriter
-from tgdsl.scene import scene_model
+from tgdsl.scene.scene import scene_model
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CALIBRATION = EXAMPLES / "xhand1_calibration.yaml"

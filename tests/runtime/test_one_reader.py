@@ -10,7 +10,7 @@ from warp_cases import SCENE, module, warp
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.batch import BatchSimulation
+from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.rollout import rollout
 
 PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')

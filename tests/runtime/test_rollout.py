@@ -7,7 +7,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.batch import simulate
+from tgdsl.runtime.batch.simulation import simulate
 from tgdsl.runtime.rollout import Recorder, Step, recorded_controls, rollout, scripted_controls
 
 SCENE = """

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import tgdsl
-from tgdsl import units
 from tgdsl.errors import SpecError
+from tgdsl.fields import units
 from tgdsl.schema import yaml
 from tgdsl.schema.load import load, load_layout
 

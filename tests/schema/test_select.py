@@ -1,6 +1,6 @@
 """Names, wildcards and groups against what a shell would take."""
 
-from tgdsl.fields import Selection
+from tgdsl.fields.models import Selection
 from tgdsl.schema.select import matching, select
 
 LINKS = [["palm"], ["index_tip", "index_mesh"], ["index_mid"], ["thumb_tip", "thumb_mesh"]]

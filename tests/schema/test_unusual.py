@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from documents import DOCUMENT, LAYOUT, POISSON, valid, write
 
-from tgdsl import units
-from tgdsl.compiler.proposal_text import new_layout
-from tgdsl.compiler.robot import load_model
-from tgdsl.schema.files import robots_folder
+from tgdsl.fields import units
+from tgdsl.files.files import robots_folder
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.text import new_layout
 from tgdsl.schema.load import load
 
 CONTACT = "kind: contact"

@@ -1,7 +1,7 @@
 import pytest
 import torch
+from scenes import module, state
 
-from sensors.scenes import module, state
 from tgdsl.errors import SpecError
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.testing import KindConformance

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 import torch
+from scenes import module, state
 from scipy.spatial.transform import Rotation
 
-from sensors.scenes import module, state
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.testing import FAR_TOLERANCE, KindConformance, moved
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from scenes import module, state
+from test_contact_depth import HARD
 
 import tgdsl
-from sensors.scenes import module, state
-from sensors.test_contact_depth import HARD
-from tgdsl.state import SceneState
+from tgdsl.module.state import SceneState
 
 JITTER = 1e-9
 """What a solver leaves of motion at rest [m, and of a unit quaternion]."""

@@ -5,10 +5,10 @@ import pytest
 import torch
 import trimesh
 from brute import brute_force
+from test_hard_cases import NUM_STEPS, jittered
 
 import tgdsl
-from sensors.test_hard_cases import NUM_STEPS, jittered
-from tgdsl.state import SceneState
+from tgdsl.module.state import SceneState
 
 R = 0.006
 TOLERANCE = 1e-4

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from cube_on_pad import in_link, pad, wrench
+from scenes import module, state
 
 import tgdsl
-from sensors.cube_on_pad import in_link, pad, wrench
-from sensors.scenes import module, state
-from tgdsl.geometry.contacts import Contacts
-from tgdsl.geometry.query import Felt, Probes
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.contacts.contacts import Contacts
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
 

@@ -3,12 +3,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scenes import module, state
 
 import tgdsl
-from sensors.scenes import module, state
 from tgdsl.errors import SpecError
+from tgdsl.module.state import SceneState
 from tgdsl.sensors.proximity import PROXIMITY
-from tgdsl.state import SceneState
 from tgdsl.testing import KindConformance
 
 

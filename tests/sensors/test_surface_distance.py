@@ -1,7 +1,7 @@
 import numpy as np
 import torch
+from scenes import module, state
 
-from sensors.scenes import module, state
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 from tgdsl.testing import KindConformance
 

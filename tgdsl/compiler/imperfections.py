@@ -9,8 +9,8 @@ import numpy as np
 
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import LowerError
-from tgdsl.fields import Selection
-from tgdsl.layout import Layout, Link
+from tgdsl.fields.models import Selection
+from tgdsl.layout.layout import Layout, Link
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import select
 from tgdsl.sensors import Kind

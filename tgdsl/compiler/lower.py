@@ -12,14 +12,13 @@ import numpy as np
 from tgdsl.compiler import passes
 from tgdsl.compiler.felt import contact_parts, settle
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
-from tgdsl.compiler.moment_tables import moment_tables
 from tgdsl.compiler.observed import Observed, observed
 from tgdsl.compiler.passes import Draft, DraftQuery, DraftSensor
-from tgdsl.compiler.point_tables import cloud, own_geoms, planned_skin
 from tgdsl.compiler.resolve import Resolved
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError
-from tgdsl.layout import Link
-from tgdsl.plan import (
+from tgdsl.layout.layout import Link
+from tgdsl.plan.plan import (
     Inputs,
     Origin,
     Plan,
@@ -30,7 +29,8 @@ from tgdsl.plan import (
     PlannedSensor,
     SceneFile,
 )
-from tgdsl.progress import Progress, silent
+from tgdsl.quantities.moments.tables import moment_tables
+from tgdsl.quantities.points.tables import cloud, own_geoms, planned_skin
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path

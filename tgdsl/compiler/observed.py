@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl import observations
-from tgdsl.compiler.joints import RobotJoints, robot_joints
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import did_you_mean
-from tgdsl.layout import Layout
-from tgdsl.observations import OfReading, ReadingObservation, ReadingSpec
-from tgdsl.plan import PlannedObservation, PlannedReading, PlannedSensor
-from tgdsl.proprioception import QUANTITIES, JointObservation, JointSpec
+from tgdsl.formats.joints import RobotJoints, robot_joints
+from tgdsl.layout.layout import Layout
+from tgdsl.observations import observations
+from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
+from tgdsl.observations.proprioception import QUANTITIES, JointObservation, JointSpec
+from tgdsl.plan.plan import PlannedObservation, PlannedReading, PlannedSensor
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path

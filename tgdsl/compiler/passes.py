@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tgdsl.compiler.felt import FeltBody, Settled
-from tgdsl.compiler.geom_tables import accuracy, geom_tables, is_centred, placed_geoms
-from tgdsl.compiler.moment_tables import MomentTables, pack_moments
-from tgdsl.compiler.point_tables import Skin, pack_points, skin_rows
-from tgdsl.compiler.robot import Model
-from tgdsl.layout import Layout
-from tgdsl.plan import SLOT_FIELDS, ContactPart, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
+from tgdsl.formats.robot import Model
+from tgdsl.layout.layout import Layout
+from tgdsl.plan.plan import SLOT_FIELDS, ContactPart, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
+from tgdsl.quantities.contact_depth.geom_tables import accuracy, geom_tables, is_centred, placed_geoms
+from tgdsl.quantities.moments.tables import MomentTables, pack_moments
+from tgdsl.quantities.points.tables import Skin, pack_points, skin_rows
 from tgdsl.sensors.base import Lowered, MomentsRequest, PointsRequest, ProbeSpec
 from tgdsl.sensors.noise.lower import LoweredNoise
 

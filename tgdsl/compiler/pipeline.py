@@ -15,18 +15,18 @@ import torch
 
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
-from tgdsl.compiler.robot import xml_files
 from tgdsl.compiler.scene import scene_file
-from tgdsl.devices import device_of, dtype_of
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
-from tgdsl.layout import Layout
-from tgdsl.module import TactileModule
-from tgdsl.plan import Origin, Plan
-from tgdsl.progress import Progress, silent
-from tgdsl.scene import portable
+from tgdsl.formats.robot import xml_files
+from tgdsl.layout.layout import Layout
+from tgdsl.module.module import TactileModule
+from tgdsl.plan.plan import Origin, Plan
+from tgdsl.scene.scene import portable
 from tgdsl.schema.load import Loaded, load
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
+from tgdsl.tensors.devices import device_of, dtype_of
 
 Document = str | PathLike[str] | Mapping[str, Any]
 

@@ -9,21 +9,21 @@ import numpy as np
 
 from tgdsl.compiler.felt import FeltBody
 from tgdsl.compiler.objects import felt_objects, own_objects
-from tgdsl.compiler.region import cut
-from tgdsl.compiler.robot import Geom, Model, load_model
-from tgdsl.compiler.sample import Samples, sample
 from tgdsl.compiler.variants import OwnObjects
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
-from tgdsl.fields import Selection, SpecModel
-from tgdsl.geometry.surface import Surface
-from tgdsl.layout import Layout, Link
-from tgdsl.progress import Progress, silent
-from tgdsl.regions import OnGeoms, RegionPart
-from tgdsl.schema.files import is_file, robot_names
+from tgdsl.fields.models import Selection, SpecModel
+from tgdsl.fields.regions import OnGeoms, RegionPart
+from tgdsl.files.files import is_file, robot_names
+from tgdsl.formats.robot import Geom, Model, load_model
+from tgdsl.layout.layout import Layout, Link
+from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
+from tgdsl.surfaces.region import cut
+from tgdsl.surfaces.surface import Surface
 
 
 @dataclass(frozen=True)

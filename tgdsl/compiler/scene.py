@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import mujoco
 
-from tgdsl.compiler.compare import differing
-from tgdsl.compiler.robot import Model
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
-from tgdsl.places import ENDINGS, FOLDER_ATTRIBUTES
-from tgdsl.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
-from tgdsl.scene import compiled, muted_mujoco, portable
+from tgdsl.formats.robot import Model
+from tgdsl.plan.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
+from tgdsl.scene.compare import differing
+from tgdsl.scene.places import ENDINGS, FOLDER_ATTRIBUTES
+from tgdsl.scene.scene import compiled, muted_mujoco, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""

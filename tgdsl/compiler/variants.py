@@ -10,11 +10,11 @@ from pathlib import Path
 
 import mujoco
 
-from tgdsl.compiler.robot import Model
 from tgdsl.errors import RobotError
-from tgdsl.plan import Asset, SceneGeom, SceneObject
-from tgdsl.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices
-from tgdsl.schema.files import is_file
+from tgdsl.files.files import is_file
+from tgdsl.formats.robot import Model
+from tgdsl.plan.plan import Asset, SceneGeom, SceneObject
+from tgdsl.scene.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
 Report = Callable[[tuple[str | int, ...], str, str], None]

@@ -16,25 +16,25 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.env_ids import EnvIds
 from tgdsl.errors import HandError, ObservationError, SimulationError, TgdslError, listed
-from tgdsl.module import TactileModule
-from tgdsl.observations import HAND_ONLY, hand_only_error
-from tgdsl.runtime.batch import BatchSimulation, simulate
+from tgdsl.module.module import TactileModule
+from tgdsl.observations.observations import HAND_ONLY, hand_only_error
+from tgdsl.runtime.batch.simulation import BatchSimulation, simulate
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
 from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.emulated_source import EmulatedSource
+from tgdsl.runtime.xhand1.emulator.simulated_body import SimulatedBody
+from tgdsl.runtime.xhand1.emulator.simulated_tips import SimulatedTips
+from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
-from tgdsl.runtime.xhand1.link import LinkTiming
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.replies import Addresses
-from tgdsl.runtime.xhand1.serial_port import list_ports
-from tgdsl.runtime.xhand1.simulated_body import SimulatedBody
-from tgdsl.runtime.xhand1.simulated_tips import SimulatedTips
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen
-from tgdsl.scene import scene_model
+from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.serial_port import list_ports
+from tgdsl.scene.scene import scene_model
+from tgdsl.tensors.env_ids import EnvIds
 
 CONTROL_STEP = 0.02
 Control = Tensor | np.ndarray | None
@@ -303,7 +303,7 @@ def _hand(
 def _replay(
     touch: TactileModule, path: Path, control_step: float, calibration: Calibration | None, lockstep: bool
 ) -> Connection:
-    from tgdsl.runtime.replay import ReplaySource
+    from tgdsl.runtime.xhand1.log.replay import ReplaySource
 
     speed = float("inf") if lockstep else 1.0
     source = ReplaySource(path, control_step=control_step, speed=speed, calibration=calibration)

@@ -18,11 +18,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.module import TactileModule
+from tgdsl.files.files import whole
+from tgdsl.module.module import TactileModule
 from tgdsl.runtime.controls import control_tensor
-from tgdsl.runtime.room import refuse_beyond_memory
+from tgdsl.runtime.simulators.room import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
-from tgdsl.schema.files import whole
 
 PLACES = ("link", "body", "pos", "normal", "area")
 """What is kept of each taxel, as `taxels.taxel_table` calls it."""

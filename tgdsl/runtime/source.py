@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.env_ids import EnvIds
-from tgdsl.state import SceneState
+from tgdsl.module.state import SceneState
+from tgdsl.tensors.env_ids import EnvIds
 
 
 class Source(Protocol):

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import Field, StringConstraints, Tag, create_model
 
-from tgdsl.fields import TEXT_OR_OTHER, SpecModel, Text
-from tgdsl.observations import ObservationSpec
+from tgdsl.fields.models import TEXT_OR_OTHER, SpecModel, Text
+from tgdsl.observations.observations import ObservationSpec
 from tgdsl.schema.branches import decided
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec

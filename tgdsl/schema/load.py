@@ -11,8 +11,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
-from tgdsl.proprioception import QUANTITIES
-from tgdsl.schema import files, yaml
+from tgdsl.files import files
+from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.schema import yaml
 from tgdsl.schema.document import Spec, document_model
 from tgdsl.schema.faults import read_as
 from tgdsl.schema.placement import LayoutSpec

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields import Number, Position, Positive, PositiveLength, SpecModel, Usual
+from tgdsl.fields.models import Number, Position, Positive, PositiveLength, SpecModel, Usual
 
 NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 """How many sizes a primitive has, as MuJoCo defines them: radius; radius and half-length; half-lengths."""

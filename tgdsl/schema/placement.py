@@ -6,8 +6,19 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields import TEXT_OR_OTHER, Area, Direction, Position, PositiveLength, Radius, Selector, SpecModel, Text, Usual
-from tgdsl.regions import Region
+from tgdsl.fields.models import (
+    TEXT_OR_OTHER,
+    Area,
+    Direction,
+    Position,
+    PositiveLength,
+    Radius,
+    Selector,
+    SpecModel,
+    Text,
+    Usual,
+)
+from tgdsl.fields.regions import Region
 
 MAX_COUNT = 1_000_000
 Count = Annotated[StrictInt, Field(ge=1, le=MAX_COUNT)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 
 from tgdsl.errors import did_you_mean
-from tgdsl.fields import Selection
+from tgdsl.fields.models import Selection
 
 Report = Callable[[tuple[str, int], str, str], None]
 """Called with where a pattern stands in its selection, such as `("exclude", 1)`, what is wrong with it, and a hint."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from pydantic import BaseModel
 
-from tgdsl.fields import Usual
+from tgdsl.fields.models import Usual
 from tgdsl.schema.yaml import Path, Source
 
 

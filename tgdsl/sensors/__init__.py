@@ -6,7 +6,7 @@ from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.sensors.elastomer import ELASTOMER
-from tgdsl.sensors.force_taxel import FORCE_TAXEL
+from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.sensors.link_contact import LINK_CONTACT
 from tgdsl.sensors.proximity import PROXIMITY

@@ -17,13 +17,13 @@ from jaxtyping import Float
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
-from tgdsl.fields import Frequency, Selector, SpecModel, Usual
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.geometry.surface import Surface
-from tgdsl.layout import Layout
-from tgdsl.regions import RegionPart
+from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
+from tgdsl.fields.regions import RegionPart
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.noise import BASE, NoiseField
+from tgdsl.surfaces.surface import Surface
 
 
 class HistorySpec(SpecModel):

@@ -18,10 +18,10 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
-from tgdsl.fields import Radius, Usual
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.fields.models import Radius, Usual
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import (
     Channel,
     Constants,

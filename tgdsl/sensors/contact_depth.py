@@ -20,9 +20,9 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
 from tgdsl.sensors.noise import TAXEL
 

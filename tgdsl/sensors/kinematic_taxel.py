@@ -45,12 +45,12 @@ import torch
 from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
-from tgdsl.fields import NonNegative, Positive
+from tgdsl.fields.models import NonNegative, Positive
 from tgdsl.geometry import planes
-from tgdsl.geometry.contacts import Contacts
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import ReferenceContacts, Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.contacts.contacts import Contacts
+from tgdsl.quantities.reference import ReferenceContacts, Touch
 from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import FORCE
 

@@ -20,11 +20,11 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from tgdsl.fields import NonNegative
+from tgdsl.fields.models import NonNegative
 from tgdsl.geometry import planes
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
 
 

@@ -28,12 +28,12 @@ import torch
 from pydantic import Field, StrictInt
 from torch import Tensor
 
-from tgdsl.fields import Area, NonNegative, Positive, Quantity
+from tgdsl.fields.models import Area, NonNegative, Positive, Quantity
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import (
     Channel,
     Constants,

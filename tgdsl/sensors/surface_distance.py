@@ -22,11 +22,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.fields import PositiveLength, Usual
+from tgdsl.fields.models import PositiveLength, Usual
 from tgdsl.geometry import planes
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
 from tgdsl.sensors.noise import PROBE
 

@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch._dynamo.utils import counters
 
-from tgdsl.artifact import load_plan, save_plan
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.module import TactileModule
-from tgdsl.plan import SLOT_FIELDS, Plan
+from tgdsl.module.artifact import load_plan, save_plan
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.plan.plan import SLOT_FIELDS, Plan
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
-from tgdsl.state import SceneState
 from tgdsl.testing.reference import ReferenceModule, assert_agrees
 from tgdsl.testing.states import moved, only
 

@@ -15,7 +15,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 
-from tgdsl.geometry.reference import (
+from tgdsl.module.state import SceneState
+from tgdsl.plan.plan import SLOT_FIELDS, Plan, PlannedMoments, PlannedObject
+from tgdsl.quantities.reference import (
     ReferenceBody,
     ReferenceContacts,
     ReferenceGeom,
@@ -25,9 +27,7 @@ from tgdsl.geometry.reference import (
     distance_to,
     touch,
 )
-from tgdsl.plan import SLOT_FIELDS, Plan, PlannedMoments, PlannedObject
 from tgdsl.sensors.base import Kind, ProbeSpec
-from tgdsl.state import SceneState
 
 TIE_SHIFT = 1e-7
 """Shift of an object [m] that covers float32 rounding: on which side of a tie a reading falls is not defined closer."""

@@ -9,8 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from tgdsl.plan import SLOT_FIELDS
-from tgdsl.state import SHAPES, SceneState
+from tgdsl.module.state import SHAPES, SceneState
+from tgdsl.plan.plan import SLOT_FIELDS
 
 
 def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:

@@ -20,10 +20,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.plan import SLOT_FIELDS, Inputs, contact_sensor_names
-from tgdsl.runtime.lookup import body_id, part_geoms
+from tgdsl.module.state import shape_of
+from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
+from tgdsl.runtime.simulators.lookup import body_id, part_geoms
 from tgdsl.runtime.warp.lane import libraries
-from tgdsl.state import shape_of
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
 """Fields of vectors, in the order of the kernel's arguments."""

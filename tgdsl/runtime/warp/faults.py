@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import listed
-from tgdsl.runtime.faults import DIVERGED, EnvFaults
+from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
 
 POOLS = {
     0: "njmax={njmax} is too small in environments {envs}: constraints are left out, {nefc} were wanted last",

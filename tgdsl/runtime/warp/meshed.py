@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import SimulationError
-from tgdsl.scene import Choice, SceneModels, with_choices
+from tgdsl.scene.scene import Choice, SceneModels, with_choices
 
 SPARE_BODY = "tgdsl/spare"
 """The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""

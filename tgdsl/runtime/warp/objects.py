@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.plan import Inputs
-from tgdsl.runtime.objects import EnvObjects, Values
+from tgdsl.plan.plan import Inputs
+from tgdsl.runtime.simulators.objects import EnvObjects, Values
 from tgdsl.runtime.warp.lane import libraries
 from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.scene import Choice, SceneModels, is_absent
+from tgdsl.scene.scene import Choice, SceneModels, is_absent
 
 Array = np.ndarray
 Row = dict[str, Array]

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.plan import Inputs
-from tgdsl.runtime.joint_fields import JointPlaces
-from tgdsl.runtime.lookup import body_id
+from tgdsl.plan.plan import Inputs
+from tgdsl.runtime.simulators.joint_fields import JointPlaces
+from tgdsl.runtime.simulators.lookup import body_id
 from tgdsl.runtime.warp.contacts import PairContacts
 
 SOURCES = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")

@@ -13,20 +13,20 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.env_ids import EnvIds, env_indices, env_mask
 from tgdsl.errors import SimulationError
-from tgdsl.module import TactileModule
-from tgdsl.runtime.faults import OnFault
-from tgdsl.runtime.lookup import keyframe_id
-from tgdsl.runtime.objects import Values
-from tgdsl.runtime.simulation import Simulation, claim, refuse_unfit
-from tgdsl.runtime.state_values import Rows, StateTable
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.lookup import keyframe_id
+from tgdsl.runtime.simulators.objects import Values
+from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.simulators.state_values import Rows, StateTable
 from tgdsl.runtime.warp.lane import Lane, Replay
 from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.reading import StateReader
 from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.state import SceneState
+from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 
 class WarpSimulation(Simulation):

@@ -15,10 +15,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.plan import Inputs
-from tgdsl.runtime.faults import BAD_VALUES
-from tgdsl.runtime.joint_fields import FORCES, JointPlaces
-from tgdsl.runtime.state_values import INTEGRATED, Rows
+from tgdsl.plan.plan import Inputs
+from tgdsl.runtime.simulators.faults import BAD_VALUES
+from tgdsl.runtime.simulators.joint_fields import FORCES, JointPlaces
+from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries

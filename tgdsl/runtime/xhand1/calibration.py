@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float, Num
 from pydantic import model_validator
 
-from tgdsl.fields import Number, Positive, SpecModel
+from tgdsl.fields.models import Number, Positive, SpecModel
 from tgdsl.runtime.xhand1.driver import Tare
-from tgdsl.runtime.xhand1.payloads import FINGERS
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS
 from tgdsl.schema.load import read_spec
 
 Sign = Literal[-1, 1]

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import listed
-from tgdsl.runtime.xhand1.errors import MotionError
 from tgdsl.runtime.xhand1.motion import ROUNDING, MotionLimits, joint_ids
-from tgdsl.runtime.xhand1.payloads import JOINTS, NUM_JOINTS
+from tgdsl.runtime.xhand1.wire.errors import MotionError
+from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,14 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.runtime.xhand1.errors import HandError, HandTimeoutError, MotionError, StaleReadingError
-from tgdsl.runtime.xhand1.link import Link, LinkCounters, LinkTiming
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
-from tgdsl.runtime.xhand1.payloads import NUM_JOINTS, encode_register_request
-from tgdsl.runtime.xhand1.protocol import Command
 from tgdsl.runtime.xhand1.reader import HandReader, Reading
-from tgdsl.runtime.xhand1.replies import Addresses
-from tgdsl.runtime.xhand1.serial_port import Port, open_serial_port
+from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError, StaleReadingError
+from tgdsl.runtime.xhand1.wire.link import Link, LinkCounters, LinkTiming
+from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS, encode_register_request
+from tgdsl.runtime.xhand1.wire.protocol import Command
+from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 MAX_AGE_S = 0.1
 """Readings that are older are not handed out [s], unless replies may take longer."""

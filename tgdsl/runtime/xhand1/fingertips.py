@@ -6,13 +6,13 @@ import warnings
 from dataclasses import dataclass
 
 from tgdsl.errors import ObservationError
-from tgdsl.observations import HAND_ONLY
-from tgdsl.plan import Plan, PlannedObservation, PlannedSensor
-from tgdsl.proprioception import QUANTITIES
+from tgdsl.observations.observations import HAND_ONLY
+from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.plan.plan import Plan, PlannedObservation, PlannedSensor
 from tgdsl.runtime.xhand1.controls import JointControls
-from tgdsl.runtime.xhand1.errors import MotionError
-from tgdsl.runtime.xhand1.payloads import FINGERS, JOINTS
-from tgdsl.scene import scene_model
+from tgdsl.runtime.xhand1.wire.errors import MotionError
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, JOINTS
+from tgdsl.scene.scene import scene_model
 
 TIP_BODIES = ("thumb_rota_link2", "index_rota_link2", "mid_link2", "ring_link2", "pinky_link2")
 """The fingertips' bodies, without the `right_hand_` or `left_hand_` that they have in robot files."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from tgdsl.runtime.xhand1.errors import HandChecksumError, HandRefusedError, HandTimeoutError
-from tgdsl.runtime.xhand1.find import FoundHand
-from tgdsl.runtime.xhand1.link import Link, LinkTiming
-from tgdsl.runtime.xhand1.payloads import encode_register_request
-from tgdsl.runtime.xhand1.protocol import Command, Register
-from tgdsl.runtime.xhand1.serial_port import Port, open_serial_port
+from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandRefusedError, HandTimeoutError
+from tgdsl.runtime.xhand1.wire.find import FoundHand
+from tgdsl.runtime.xhand1.wire.link import Link, LinkTiming
+from tgdsl.runtime.xhand1.wire.payloads import encode_register_request
+from tgdsl.runtime.xhand1.wire.protocol import Command, Register
+from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
 
 UNTOLD = "not told"
 

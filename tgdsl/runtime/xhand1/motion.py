@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import listed
-from tgdsl.runtime.xhand1.errors import HandError, MotionError, WatchdogError
-from tgdsl.runtime.xhand1.payloads import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
+from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
+from tgdsl.runtime.xhand1.wire.payloads import JOINTS, NUM_JOINTS, PASSIVE, JointCommand, Mode
 
 JointArray = Float[np.ndarray, " joint"]
 ROUNDING = 1e-6

@@ -19,12 +19,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.module import TactileModule
+from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.fingertips import HandTerm, hand_terms
 from tgdsl.runtime.xhand1.source import HandSample
-from tgdsl.scene import scene_model
+from tgdsl.scene.scene import scene_model
 
 
 class HandObserver:

@@ -12,12 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from tgdsl.runtime.xhand1.errors import HandClosedError, HandDisconnectedError, HandError, ProtocolError
-from tgdsl.runtime.xhand1.link import Link, LinkCounters
 from tgdsl.runtime.xhand1.motion import Motion
-from tgdsl.runtime.xhand1.payloads import JOINTS, PASSIVE, STATE_SIZE, HandState, JointCommand, decode_state, encode_command
-from tgdsl.runtime.xhand1.protocol import Command
-from tgdsl.runtime.xhand1.replies import Reply
+from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, ProtocolError
+from tgdsl.runtime.xhand1.wire.link import Link, LinkCounters
+from tgdsl.runtime.xhand1.wire.payloads import (
+    JOINTS,
+    PASSIVE,
+    STATE_SIZE,
+    HandState,
+    JointCommand,
+    decode_state,
+    encode_command,
+)
+from tgdsl.runtime.xhand1.wire.protocol import Command
+from tgdsl.runtime.xhand1.wire.replies import Reply
 
 _RECONNECT_S = 0.02
 _LAST_TRIES = 6

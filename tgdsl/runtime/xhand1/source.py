@@ -15,15 +15,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.env_ids import EnvIds
 from tgdsl.errors import StateError
+from tgdsl.module.state import SceneState
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.errors import HandError, MotionError, StaleReadingError
 from tgdsl.runtime.xhand1.pace import Pace, RealTime
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
-from tgdsl.state import SceneState
+from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, StaleReadingError
+from tgdsl.tensors.env_ids import EnvIds
 
 
 @dataclass(frozen=True, eq=False)

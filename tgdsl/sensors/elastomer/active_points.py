@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.fusion import wants_derivatives
 from tgdsl.geometry.planes import Vec
+from tgdsl.tensors.fusion import wants_derivatives
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
 LARGEST_BLOCK = 16

@@ -21,10 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.geometry import planes, reference
+from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.query import Felt
-from tgdsl.geometry.reference import Touch
+from tgdsl.quantities import reference
+from tgdsl.quantities.contact_depth.query import Felt
+from tgdsl.quantities.reference import Touch
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
 """What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.errors import LowerError
-from tgdsl.geometry.surface import Surface
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
 from tgdsl.sensors.elastomer.boundary import correction, element_size
@@ -18,6 +17,7 @@ from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, Skin
 from tgdsl.sensors.elastomer.operators import Response, Wish, fold
 from tgdsl.sensors.elastomer.pad import unroll
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
+from tgdsl.surfaces.surface import Surface
 
 PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3), "pressure": (3, 1)}
 """Planes that each operator puts out and takes in."""

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.geometry.shapes_kernel import chosen, dot
-from tgdsl.geometry.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
+from tgdsl.quantities.points.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 WORD, MANY = 32, 512
 """Points that are taken together, by a program of one warp, and most that are looked at at once."""

@@ -42,8 +42,8 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.query import Felt, Probes
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
 from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, Memory, PointsRequest, State, SurfaceOf, scalar
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links

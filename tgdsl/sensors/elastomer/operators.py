@@ -26,7 +26,7 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError
 from tgdsl.sensors.elastomer.kernels import Skin
-from tgdsl.sensors.link_products import are_for_kernel, products
+from tgdsl.tensors.link_products import are_for_kernel, products
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
 """Time per multiply-add of each form, over that of a large matrix product (one CPU core, float32, 512 environments)."""

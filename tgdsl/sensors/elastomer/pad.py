@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from tgdsl.geometry.surface import Surface
 from tgdsl.sensors.elastomer.flatten import flatten, has_area, jacobians
 from tgdsl.sensors.elastomer.mesh import mesh
 from tgdsl.sensors.elastomer.sheet import Sheet, components, half_edges, loops, open_sides, opened, refused, welded
+from tgdsl.surfaces.surface import Surface
 
 REACH = 1e-3
 """Largest distance of a taxel from the pad's surface [m]."""

@@ -23,13 +23,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.fusion import stored, takes_kernel
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.geometry.points import Meeting, MetPoints, are_for_kernel, met_points, tile_size
-from tgdsl.geometry.reference import ReferencePoints
+from tgdsl.quantities.points.points import Meeting, MetPoints, are_for_kernel, met_points, tile_size
+from tgdsl.quantities.reference import ReferencePoints
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import Law, capped
+from tgdsl.tensors.fusion import stored, takes_kernel
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
 """What is carried from call to call: e_p in the link's frame [m], and 1 where the point holds on."""
@@ -79,7 +79,7 @@ def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) 
     """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
     if not all(are_for_kernel(meeting) and len(meeting.source.links.shapes) == 1 for meeting in meetings):
         return advance([met_points(meeting) for meeting in meetings], law, state)
-    from tgdsl.geometry.skin_kernel import grid_tables
+    from tgdsl.quantities.points.skin_kernel import grid_tables
     from tgdsl.sensors.elastomer.grip_kernel import grip
 
     pulls, first = [], 0

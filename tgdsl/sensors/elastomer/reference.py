@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.geometry.reference import Touch
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.reference import Touch
 from tgdsl.sensors.base import ReferenceState
 from tgdsl.sensors.elastomer import blocks
 from tgdsl.sensors.elastomer.anchors import Law, advance_reference

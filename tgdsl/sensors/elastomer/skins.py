@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tgdsl import units
 from tgdsl.errors import did_you_mean
+from tgdsl.fields import units
 
 
 def young_of_shore(hardness: float) -> float:

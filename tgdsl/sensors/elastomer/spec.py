@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StrictInt, WithJsonSchema, model_validator
 
-from tgdsl.fields import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
-from tgdsl.regions import Region
+from tgdsl.fields.models import Area, NonNegative, Number, Positive, PositiveLength, Pressure, Radius, SpecModel, Usual
+from tgdsl.fields.regions import Region
 from tgdsl.sensors.base import ContactProbeSpec
 from tgdsl.sensors.elastomer import skins
 

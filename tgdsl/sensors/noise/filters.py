@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from tgdsl.fusion import stored
-from tgdsl.sensors.link_products import products
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.instant import Now, Signal
+from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.link_products import products
 
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import LowerError, did_you_mean
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.filters import KERNEL
 from tgdsl.sensors.noise.spec import ALL, ZERO, Amplitude, Crosstalk, Hysteresis, Knobs

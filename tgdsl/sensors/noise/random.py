@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from tgdsl.fusion import stored
+from tgdsl.tensors.fusion import stored
 
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 """What numbers are for: the first three are drawn at each step, the others at each reset."""

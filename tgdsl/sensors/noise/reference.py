@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, UInt64
 
-from tgdsl.layout import Layout
+from tgdsl.layout.layout import Layout
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.lower import quantity
 from tgdsl.sensors.noise.spec import ALL, ZERO, Knobs, Range

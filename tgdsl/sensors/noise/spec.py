@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import Tag, model_validator
 
-from tgdsl.fields import TEXT_OR_OTHER, Quantity, SpecModel, Text, Usual
+from tgdsl.fields.models import TEXT_OR_OTHER, Quantity, SpecModel, Text, Usual
 
 Range = tuple[float, float]
 """Lowest and highest value; the same for a plain number."""

@@ -33,9 +33,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from tgdsl.fusion import stored
 from tgdsl.sensors.noise import filters, random
 from tgdsl.sensors.noise.instant import Now, Signal, uniform
+from tgdsl.tensors.fusion import stored
 
 TERMS = ("radius_noise", "gain", "hysteresis", "crosstalk", "delay", "bias", "white_noise", "drift", "quantization", "dead")
 """The stages that a plan names, in their order."""

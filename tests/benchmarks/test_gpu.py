@@ -1,0 +1,237 @@
+"""`benchmarks/gpu.py` without a GPU: its bytes, errors and limits by values worked out by hand, and a dry run."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+import gpu
+import gpu_plots
+from gpu_plots import TARGETS, Row, judged, unmet
+from gpu_scenes import CASES, EVERY_KNOB, bytes_of, document, make_artefacts, noise_of, state_of
+
+import tgdsl
+from tgdsl.module.outputs import Output
+
+ROW = Row(
+    case="kinematic",
+    kind="kinematic_taxel",
+    noise="clean",
+    num_envs=16_384,
+    num_taxels=100,
+    num_objects=1,
+    points=0,
+    in_contact=0.6,
+    error=1e-6,
+    error_largest=1e-5,
+    graph=0.025,
+    plain=0.2,
+    replayed=0.06,
+    copy=0.0125,
+    sets=4,
+    moved=41_041_920,
+    per_taxel=24.0,
+    ring_per_taxel=0.0,
+    anchors_per_taxel=0.0,
+    per_anchor=0.0,
+    transient=None,
+    seconds=1.0,
+)
+
+
+def module_of(name, tmp_path):
+    return tgdsl.compile(document(CASES[name], tmp_path))
+
+
+class TestBytes:
+    def test_two_bodies_their_velocities_and_one_pair_make_six_numbers_of_100_taxels(self, tmp_path):
+        size = bytes_of(module_of("kinematic", tmp_path))
+        assert size.inputs == 2 * (3 + 4 + 3 + 3) * 4 + 1
+        assert size.outputs == 100 * 6 * 4
+        assert (size.state, size.anchors, size.ring_entry, size.num_taxels) == (0, 0, 0, 100)
+        assert size.moved == size.held == 105 + 2400
+        assert size.per_taxel == 24.0
+
+    def test_noisy_carries_two_numbers_of_hysteresis_one_of_drift_and_two_counts(self, tmp_path):
+        size = bytes_of(module_of("kinematic-noisy", tmp_path))
+        assert size.state == 100 * 6 * 3 * 4 + 2 * 8
+        assert size.moved == 105 + 2400 + 2 * 7216
+        assert size.per_taxel == 24 + 72 + 0.16
+
+    def test_a_ring_of_three_calls_is_held_whole_and_touched_at_three_entries(self, tmp_path):
+        size = bytes_of(module_of("kinematic-full", tmp_path))
+        assert (size.ring_calls, size.ring_entry) == (3, 2400)
+        assert size.moved == 105 + 2400 + 2 * 7216 + 3 * 2400
+        assert size.held == 105 + 2400 + 7216 + 3 * 2400
+        assert (size.per_taxel, size.ring_per_taxel) == (24 + 72 + 0.16, 3 * 24)
+
+    def test_an_elastomer_tracks_each_point_in_four_numbers(self, tmp_path):
+        size = bytes_of(module_of("elastomer-500-points", tmp_path))
+        assert (size.num_anchors, size.anchors, size.per_anchor) == (500, 8000, 16.0)
+        assert (size.outputs, size.state, size.per_taxel) == (1200, 0, 12.0)
+        assert size.moved == 2 * (3 + 4) * 4 + 1 + 1200 + 2 * 8000
+
+    def test_stacked_readings_are_refused(self, tmp_path):
+        described = document(CASES["depth"], tmp_path)
+        described["sensors"]["on_pad0"]["history"] = 3
+        with pytest.raises(ValueError, match="expected sensors without `history`"):
+            bytes_of(tgdsl.compile(described))
+
+
+class TestLimits:
+    def test_a_row_within_all_limits(self):
+        assert unmet(ROW, None) == [] and judged(ROW, None) == "yes"
+
+    @pytest.mark.parametrize(
+        ("changes", "said"),
+        [
+            ({"graph": 0.031}, "graph 0.031 ms > 0.03 ms"),
+            ({"replayed": 0.09}, "from Python 0.09 ms > 0.08 ms"),
+            ({"per_taxel": 41.0}, "41.0 B per taxel > 40 B"),
+            ({"per_anchor": 20.0}, "20.0 B per tracked point > 16 B"),
+            ({"error": 2e-5}, "error 2.0e-05 > 1e-05"),
+        ],
+    )
+    def test_what_is_missed_is_said(self, changes, said):
+        row = replace(ROW, **changes)
+        assert unmet(row, None) == [said] and judged(row, None) == f"no: {said}"
+
+    def test_six_times_less_than_the_rival(self):
+        row = replace(ROW, case="kinematic-10-objects", graph=0.41 / 5)
+        assert unmet(row, None) == ["5.0 times less than the rival's, not 6"]
+        assert unmet(replace(row, graph=0.41 / 6.01), None) == []
+
+    def test_full_noise_is_compared_with_clean(self):
+        row = replace(ROW, case="kinematic-full", noise="full", graph=0.075, per_taxel=96.0)
+        assert judged(row, None) == "–"
+        assert judged(row, ROW) == "yes"
+        assert unmet(replace(row, graph=0.08), ROW) == ["3.20 × clean > 3 ×"]
+        assert unmet(replace(row, per_taxel=121.0), ROW) == ["121.0 B per taxel > 120 B"]
+
+    def test_rows_without_a_limit_are_asked_for_error_and_bytes(self):
+        row = replace(ROW, num_envs=1_024, graph=9.0)
+        assert judged(row, None) == "–"
+        assert judged(replace(row, error=1.0), None).startswith("no: error")
+
+    def test_limits_are_of_cases_that_are_measured(self):
+        assert all(num_envs in CASES[name].envs for name, num_envs in TARGETS)
+
+    def test_rate_and_ratio(self):
+        assert ROW.rate == pytest.approx(16_384 * 100 / 25e-6)
+        line = gpu_plots.limits_table([ROW])[3]
+        assert line == (
+            "| kinematic | 16,384 × 100 | 1e-06 (1e-05) | 0.0250 | 0.03 | yes | 0.200 | 0.060 | 41.0 | 2.00 | 0.41 | 16.4 |"
+        )
+        assert "not measured" in gpu_plots.limits_table([ROW])[2]
+
+
+class TestErrors:
+    OUTPUTS = (
+        Output("s", "s", "k", (2, 2), "taxel", ("pad",), ("force_x", "torque_x"), ("N", "N·m")),
+        Output("s/missed", "s", "k", (1, 1), "body", ("pad",), ("missed_x",), ("N",)),
+    )
+
+    def errors(self, apart_s, apart_missed):
+        want = {"s": np.array([[[4.0, 0.5], [-8.0, 0.0]]]), "s/missed": np.array([[[0.1]]])}
+        found = {"s": want["s"] + apart_s, "s/missed": want["s/missed"] + apart_missed}
+        return gpu.full_scale_errors(self.OUTPUTS, found, want)
+
+    def test_each_channel_has_its_own_scale_and_a_remainder_that_of_its_unit(self):
+        found = self.errors([[[0.8, 0.1], [0.0, 0.0]]], [[[0.4]]])
+        assert found == pytest.approx([0.1, 0.2, 0, 0, 0.05])
+
+    def test_what_should_be_nothing_and_is_not_errs_without_bound(self):
+        want = {"s": np.zeros((1, 1, 2)), "s/missed": np.zeros((1, 1, 1))}
+        found = {"s": np.array([[[1e-9, 0.0]]]), "s/missed": np.zeros((1, 1, 1))}
+        assert gpu.full_scale_errors(self.OUTPUTS, found, want).tolist() == [np.inf, 0, 0]
+
+    def test_what_is_no_number_is_an_error(self):
+        with pytest.raises(ValueError, match="s/missed is not finite"):
+            self.errors(0.0, np.nan)
+
+
+def test_sets_exceed_the_cache():
+    assert gpu.num_sets(50e6) == 4
+    assert gpu.num_sets(1e9) == 2
+    assert gpu.num_sets(1e3) == gpu.MOST_SETS
+
+
+def test_medians_leave_out_the_first_and_stop_when_it_takes_long():
+    times = iter([99.0, 3.0, 1.0, 2.0])
+    assert gpu.median_of(lambda: next(times), 3) == 2.0
+    long = iter([1.0, 600.0, 500.0, 700.0])
+    assert gpu.median_of(lambda: next(long), 30) == 600.0
+
+
+def test_every_call_of_a_batch_is_made():
+    calls = []
+    gpu.median_ms(lambda: calls.append(1), 3, torch.device("cpu"), batch=5)
+    assert len(calls) == 5 * (1 + 3)
+
+
+def test_full_noise_gives_each_kind_the_knobs_that_it_has():
+    assert noise_of(CASES["kinematic-full"]) == {"noise": EVERY_KNOB}
+    assert "radius_noise" not in noise_of(CASES["link_contact-full"])["noise"]
+    assert noise_of(CASES["kinematic"]) == {}
+
+
+def test_part_of_the_taxels_feels_the_lowest_cube(tmp_path):
+    for name in ("kinematic-5-sensors", "kinematic-10-objects"):
+        touch = module_of(name, tmp_path)
+        state = state_of(touch, 64, 0)
+        state.contact_found[:] = True
+        felt = torch.cat([reading.ne(0).any(dim=-1) for reading in touch(state).values()], dim=1).double().mean()
+        assert (
+            0.3 < felt < 0.95
+        )  # the cube covers 4/9 of a pad, 2/3 where it goes on in one direction; probes reach 4 mm farther
+
+
+def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
+    names, results = ["depth", "kinematic-noisy"], tmp_path / "gpu.json"
+    make_artefacts(tmp_path / "art", [CASES[name] for name in names])
+    own = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1", "--check-envs", "4"]
+    for rows in (names, names[:1]):  # a row that is measured again takes the place of the old one
+        options = gpu.parsed(["run", str(tmp_path / "art"), "--out", str(results), *own, "--rows", *rows, "--envs", "3", "5"])
+        options.call(options)
+    kept = json.loads(results.read_text())
+    assert kept["device"] == "CPU"
+    rows = gpu_plots.load_rows([results])
+    assert sorted(row.key for row in rows) == [(name, num_envs) for name in names for num_envs in (3, 5)]
+    for row in rows:
+        assert 0 <= row.error <= 1e-5
+        assert min(row.graph, row.plain, row.copy) > 0
+    noisy = next(row for row in rows if row.key == ("kinematic-noisy", 3))
+    assert noisy.moved == 3 * (105 + 2400 + 2 * 7216)
+    for command in (
+        ["table", str(results)],
+        ["plot", str(results), "--out", str(tmp_path / "images")],
+        ["bytes", str(tmp_path / "art")],
+    ):
+        options = gpu.parsed(command)
+        options.call(options)
+    assert "| depth | 5 × 100 |" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["gpu_memory.png", "gpu_throughput.png"]
+
+
+def test_a_row_that_fails_is_said_and_the_others_go_on(tmp_path, capsys):
+    names = ["kinematic", "depth"]
+    make_artefacts(tmp_path, [CASES["depth"]])
+    own = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1", "--check-envs", "2", "--envs", "2"]
+    options = gpu.parsed(["run", str(tmp_path), "--out", str(tmp_path / "gpu.json"), *own, "--rows", *names])
+    options.call(options)
+    said = capsys.readouterr().out
+    assert "kinematic: FAILED" in said and "kinematic.safetensors" in said
+    assert [row.case for row in gpu_plots.load_rows([tmp_path / "gpu.json"])] == ["depth"]
+
+
+def test_time_that_is_up_leaves_the_rest_and_says_so(tmp_path, capsys):
+    own = ["--device", "cpu", "--eager", "--minutes", "-1", "--rows", "depth", "kinematic"]
+    options = gpu.parsed(["run", str(tmp_path), "--out", str(tmp_path / "gpu.json"), *own])
+    options.call(options)
+    assert "not measured: depth kinematic" in capsys.readouterr().out

@@ -1,0 +1,249 @@
+"""The command line, as users run it: what it prints, what it writes, and how it ends."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tgdsl
+from tgdsl.schema.document import json_schema
+
+REPOSITORY = Path(__file__).parents[2]
+SCENE = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos="0 0 .029">
+      <joint name="lift" type="slide" axis="0 0 1"/><geom type="box" size=".02 .02 .02" mass=".25"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift"/></actuator>
+  <keyframe><key name="rest" ctrl="0"/><key name="squeeze" ctrl="-5"/></keyframe>
+</mujoco>
+"""
+DOCUMENT = """tgdsl: 1
+robot:
+  model: scene.xml
+  layout:
+    resolutions:
+      low: {pad: {method: grid, rows: 2, columns: 3, direction: [0, 0, -1], radius: 4 mm}}
+      high: {pad: {method: grid, rows: 4, columns: 4, direction: [0, 0, -1], radius: 4 mm}}
+objects: {cube: {body: cube}}
+resolution: low
+sensors:
+  touch: {kind: kinematic_taxel, links: pad, feels: [cube], outputs: [force], normal_stiffness: 500}
+  bit: {kind: contact, links: pad, feels: [cube]}
+observations:
+  policy: [{type: force, of: touch}, {type: agg_bool, of: bit}]
+"""
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """A folder with a document and its compiled artefact, made by the command itself."""
+    folder = tmp_path_factory.mktemp("cli")
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "pad.yaml").write_text(DOCUMENT)
+    ran = tgdsl_in(folder, "compile", "pad.yaml")
+    assert ran.returncode == 0, ran.stderr
+    (folder / "stdout.txt").write_text(ran.stdout)
+    return folder
+
+
+def tgdsl_in(folder: Path, *arguments: str, filters: str = "error") -> subprocess.CompletedProcess:
+    environment = {**os.environ, "PYTHONWARNINGS": filters, "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
+    command = [sys.executable, "-m", "tgdsl", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def fails(here):
+    """Run a command that a user got wrong; return what it says."""
+
+    def run(folder: Path, *arguments: str) -> str:
+        code, _, message = here(folder, *arguments)
+        assert code == 2, message
+        return message
+
+    return run
+
+
+# compile
+
+
+def test_compile_says_what_it_made(base):
+    lines = (base / "stdout.txt").read_text().splitlines()
+    assert lines[:2] == ["6 taxels on 1 links at resolution low", "sensors: touch (kinematic_taxel, 6), bit (contact, 6)"]
+    assert lines[2].startswith(f"pad.safetensors: {(base / 'pad.safetensors').stat().st_size} bytes in ")
+    touch = tgdsl.load(base / "pad.safetensors")
+    assert [output.name for output in touch.outputs] == ["touch", "bit"]
+
+
+def test_compile_with_overrides_into_a_new_folder(base, tmp_path, here):
+    out = tmp_path / "new" / "folder" / "pad.safetensors"
+    arguments = ("--set", "resolution=high", "--set", "sensors.touch.normal_stiffness=400", "-o", str(out))
+    code, said, error = here(base, "compile", "pad.yaml", *arguments)
+    assert code == 0, error
+    assert said.startswith("16 taxels on 1 links at resolution high\n")
+    plan = tgdsl.load(out).plan
+    assert 400.0 in [
+        float(value) for name, value in plan.arrays.items() if name.startswith("sensors/touch/") and value.size == 1
+    ]
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        (
+            "resolution=mid",
+            '--set resolution=mid: resolution: unknown resolution "mid"; known resolutions: high, low\n1 mistake\n',
+        ),
+        ("resolution", 'tgdsl: --set resolution: expected KEY=VALUE, such as "resolution=high"\n'),
+        ("sensors.bit.threshold=3 kg", '"kg" is not a unit of length, expected one of m, cm, mm, um, µm\n1 mistake\n'),
+        ("sensors.bit.treshold=3 mm", 'unknown key "treshold"; did you mean "threshold"?\n1 mistake\n'),
+        ("tgdsl.x=3", "--set tgdsl.x=3: tgdsl.x: does not lead to a key of a mapping\n1 mistake\n"),
+    ],
+)
+def test_bad_overrides(base, fails, argument, message):
+    assert fails(base, "compile", "pad.yaml", "--set", argument).endswith(message)
+
+
+def test_documents_that_cannot_be_read(base, tmp_path, fails):
+    assert fails(base, "compile", "none.yaml") == "none.yaml: cannot read this file: No such file or directory\n1 mistake\n"
+    (tmp_path / "scene.xml").write_text("<mujoco><worldbody><geo/></worldbody></mujoco>")
+    (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    message = fails(tmp_path, "compile", "pad.yaml")
+    assert message.startswith("tgdsl: scene.xml: XML Error: ")
+    assert "geo" in message
+    assert not list(tmp_path.glob("*.safetensors"))
+
+
+def test_files_that_cannot_be_written(base, tmp_path, fails):
+    (tmp_path / "file").write_text("")
+    assert fails(base, "compile", "pad.yaml", "-o", str(tmp_path / "file" / "x.safetensors")).startswith("tgdsl: ")
+    assert (
+        fails(base, "schema", "-o", str(tmp_path / "none" / "s.json"))
+        == f"tgdsl: {tmp_path}/none/s.json: No such file or directory\n"
+    )
+
+
+def test_commands_that_do_not_exist(base, fails):
+    for arguments in (("compil",), ()):
+        assert "compile, explain, schema, run" in fails(base, *arguments)
+
+
+# explain
+
+
+def test_explain_of_document_and_artefact(base, here):
+    ran = tgdsl_in(base, "explain", "pad.safetensors")
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout == tgdsl.load(base / "pad.safetensors").explain() + "\n"
+    assert here(base, "explain", "pad.yaml") == (0, ran.stdout, "")
+    assert "16 probes against cube (box)" in here(base, "explain", "pad.yaml", "--set", "resolution=high")[1]
+
+
+def test_an_artefact_cannot_be_overridden(base, fails):
+    message = "tgdsl: an artefact cannot be overridden; compile the document with --set instead\n"
+    assert fails(base, "explain", "pad.safetensors", "--set", "resolution=high") == message
+
+
+def test_a_damaged_artefact(base, tmp_path, fails):
+    (tmp_path / "x.safetensors").write_bytes((base / "pad.safetensors").read_bytes()[:-5])
+    assert fails(tmp_path, "explain", "x.safetensors").startswith("tgdsl: x.safetensors: cannot read this artefact: ")
+
+
+def test_a_reader_that_has_gone(base):
+    """`tgdsl explain … | head -1` ends without a word."""
+    command = f'"{sys.executable}" -m tgdsl explain pad.safetensors | true; exit ${{PIPESTATUS[0]}}'
+    ran = subprocess.run(["bash", "-c", command], cwd=base, capture_output=True, text=True, check=False)
+    assert ran.returncode in (0, 1)  # 0: all was written before the reader went
+    assert ran.stderr == ""
+
+
+# schema
+
+
+def test_schema_in_the_repository_is_the_one_of_the_code():
+    kept = (REPOSITORY / "tgdsl.schema.json").read_text(encoding="utf-8")
+    assert json.loads(kept) == json_schema(), "run `tgdsl schema`"
+    assert kept == json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def test_schema_command(tmp_path, here):
+    assert here(tmp_path, "schema") == (0, "tgdsl.schema.json\n", "")
+    assert json.loads((tmp_path / "tgdsl.schema.json").read_text(encoding="utf-8")) == json_schema()
+
+
+def test_a_mistake_ends_without_a_traceback(base):
+    ran = tgdsl_in(base, "run", "pad.safetensors", "--keyframes", "rest", "sqeeze")
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert ran.stderr == 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n'
+
+
+# run
+
+
+def test_run(base, tmp_path):
+    ran = tgdsl_in(base, "run", "pad.safetensors", "--seconds", "0.1", "--out", str(tmp_path / "out"), filters="default")
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    lines = ran.stdout.splitlines()
+    assert lines[0] == "t = 0.30 s"
+    assert lines[1].split() == ["link", "touch", "[N]", "bit", "[taxels]"]
+    assert lines[3].split()[0] == "pad"
+    assert lines[3].split()[2] == "6/6"
+    out = tmp_path / "out"
+    assert lines[4:] == [f"readings: {out}/readings.npz", f"picture:  {out}/picture.png", f"overview: {out}/overview.png"]
+    with np.load(out / "readings.npz") as archive:
+        np.testing.assert_allclose(archive["time"], 0.01 * np.arange(1, 31))
+        np.testing.assert_allclose(archive["ctrl"][:, 0], [0] * 10 + list(np.linspace(0, -5, 10)) + [-5] * 10)
+        assert archive["touch"].shape == (30, 1, 6, 3)
+        assert archive["bit"].all()
+        force = np.linalg.norm(archive["touch"][-1, 0].sum(axis=0))
+    assert float(lines[3].split()[1]) == pytest.approx(force, abs=6e-4)
+    for name in ("picture.png", "overview.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_recorded_controls(base, tmp_path, here):
+    controls = np.zeros((4, 3, 1))
+    controls[:, 2] = 50.0
+    np.savez(tmp_path / "c.npz", ctrl=controls)
+    arguments = ("--controls", str(tmp_path / "c.npz"), "--num-envs", "3", "--substeps", "10", "--out", str(tmp_path))
+    code, _, error = here(base, "run", "pad.yaml", *arguments)
+    assert code == 0, error
+    with np.load(tmp_path / "readings.npz") as archive:
+        assert archive["bit"].shape == (4, 3, 6, 1)
+        assert archive["bit"][-1, 0].all()
+        assert not archive["bit"][-1, 2].any()
+        np.testing.assert_allclose(archive["time"], [0.02, 0.04, 0.06, 0.08])
+
+
+def test_bad_runs(base, tmp_path, fails):
+    np.savez(tmp_path / "two.npz", ctrl=np.zeros((3, 2)))
+    cases = {
+        ("--keyframes", "rest", "sqeeze"): 'tgdsl: the scene has no keyframe "sqeeze"; did you mean "squeeze"?\n',
+        ("--keyframes",): "tgdsl: 0 keyframes held for 1 s: expected at least one, and more than 0 s\n",
+        ("--num-envs", "0"): "tgdsl: num_envs is 0 and substeps 5, expected at least 1 of each\n",
+        ("--controls", "none.npz"): "tgdsl: none.npz: expected an .npz file with an array `ctrl`: ",
+        ("--controls", str(tmp_path / "two.npz")): "tgdsl: control has shape (2,), expected (1, 1) or (1,)\n",
+    }
+    for arguments, message in cases.items():
+        assert fails(base, "run", "pad.safetensors", *arguments, "--out", str(tmp_path / "out")).startswith(message)
+    assert not (tmp_path / "out" / "readings.npz").exists()
+
+
+def test_run_holds_a_scene_without_keyframes(here, tmp_path):
+    start, end = SCENE.index("<keyframe>"), SCENE.index("</mujoco>")
+    (tmp_path / "scene.xml").write_text(SCENE[:start] + SCENE[end:])
+    (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    code, out, _ = here(tmp_path, "run", "pad.yaml", "--seconds", "0.1", "--out", "held")
+    assert code == 0 and "its initial state is held for 0.1 s" in out
+    with np.load(tmp_path / "held" / "readings.npz") as kept:
+        assert kept["touch"].shape[0] == 10

@@ -1,0 +1,193 @@
+"""How commands end when something outside stops them: Ctrl-C, a reader that goes, a full disk, a path that cannot be."""
+
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+REPOSITORY = Path(__file__).parents[2]
+SCENE = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos="0 0 .029">
+      <joint name="lift" type="slide" axis="0 0 1"/><geom type="box" size=".02 .02 .02" mass=".25"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift"/></actuator>
+</mujoco>
+"""
+DOCUMENT = """tgdsl: 1
+robot:
+  model: scene.xml
+  layout: {resolutions: {low: {pad: {method: grid, rows: 2, columns: 3, direction: [0, 0, -1], radius: 4 mm}}}}
+objects: {cube: {body: cube}}
+sensors: {touch: {kind: contact_depth, links: pad, feels: [cube]}}
+"""
+STAGE = """#usda 1.0
+(
+    defaultPrim = "cube"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Cube "cube" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI"])
+{
+    double size = 0.04
+}
+"""
+
+
+@pytest.fixture
+def base(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    (tmp_path / "cube.usda").write_text(STAGE)
+    return tmp_path
+
+
+def started(folder, *arguments, **more):
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1", "COLUMNS": "200"}
+    command = [sys.executable, "-m", "tgdsl", *arguments]
+    return subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True, **more)
+
+
+def files_in(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+# Ctrl-C
+
+
+@pytest.mark.parametrize("where", ["stepping", "writing"])
+def test_ctrl_c_ends_cleanly(base, here, monkeypatch, where):
+    """Nothing half written is left, and what was there is."""
+    (base / "out").mkdir()
+    (base / "out" / "readings.npz").write_bytes(b"before")
+
+    def interrupted(*arguments, **_):
+        if where == "writing":
+            arguments[0].write(b"half")
+        raise KeyboardInterrupt
+
+    if where == "stepping":
+        monkeypatch.setattr(BatchSimulation, "step", interrupted)
+    else:
+        monkeypatch.setattr(np, "savez_compressed", interrupted)
+    before = files_in(base)
+    code, _, error = here(base, "run", "pad.yaml", "--seconds", "0.1")
+    assert (code, error.splitlines()[-1]) == (130, "interrupted")
+    assert files_in(base) == before
+    assert (base / "out" / "readings.npz").read_bytes() == b"before"
+
+
+# A reader that goes
+
+
+@pytest.mark.parametrize("arguments", [("explain", "pad.yaml"), ("--help",), ("run", "--help"), ("--version",)])
+def test_a_reader_that_has_gone_before_the_first_line(base, arguments):
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "wb") as out:
+        process = started(base, *arguments, stdout=out)
+    _, error = process.communicate()
+    assert (process.returncode, error) == (1, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize("arguments", [("explain", "pad.yaml"), ("--version",)])
+def test_output_to_a_full_disk(base, arguments):
+    with Path("/dev/full").open("wb") as full:
+        process = started(base, *arguments, stdout=full)
+    _, error = process.communicate()
+    assert (process.returncode, error) == (2, "tgdsl: standard output: No space left on device\n")
+
+
+# Files that cannot be
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file"),
+    [
+        (("compile", "pad.yaml", "-o", "new/x.safetensors"), "new/x.safetensors"),
+        (("run", "pad.yaml", "--seconds", "0.1"), "out/readings.npz"),
+        (("schema",), "tgdsl.schema.json"),
+        (("layout", "new", "xhand1"), "layout.yaml"),
+        (("import", "cube.usda"), "cube.xml"),
+    ],
+)
+def test_a_file_that_grows_too_large_is_named_and_not_left(base, arguments, file):
+    before = files_in(base)
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # noqa: E731
+    process = started(base, *arguments, stdout=subprocess.PIPE, preexec_fn=limit)
+    _, error = process.communicate()
+    assert (process.returncode, error.splitlines()[-1]) == (2, f"tgdsl: {file}: File too large")
+    assert files_in(base) == before
+
+
+def test_a_picture_that_grows_too_large(base):
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))  # noqa: E731
+    process = started(base, "run", "pad.yaml", "--seconds", "0.05", stdout=subprocess.PIPE, preexec_fn=limit)
+    _, error = process.communicate()
+    assert (process.returncode, error.splitlines()[-1]) == (2, "tgdsl: out/picture.png: File too large")
+    assert files_in(base / "out") == ["readings.npz"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "pad.yaml", "-o", "pad.yaml"), "pad.yaml/readings.npz: {base}/pad.yaml is a file, expected a folder"),
+        (("run", "pad.yaml", "-o", "made"), "made/picture.png: this is a folder, expected a file's name"),
+        (("compile", "pad.yaml", "-o", "made"), "made: this is a folder, expected a file's name"),
+        (("compile", "pad.yaml", "-o", "pad.yaml/x"), "pad.yaml/x: {base}/pad.yaml is a file, expected a folder"),
+        (("import", "none.usd", "-o", "made"), "made: this is a folder, expected a file's name"),
+        (("export-usd", "xhand1", "-o", "made"), "made: this is a folder, expected a file's name"),
+        (("layout", "new", "xhand1", "-o", "made"), "made: this is a folder, expected a file's name"),
+        (("render", "xhand1", "-o", "made"), "cannot write made: this is a folder, expected a file's name"),
+        (("schema", "-o", "made"), "made: this is a folder, expected a file's name"),
+    ],
+)
+def test_a_wrong_path_is_found_before_the_work(base, here, monkeypatch, arguments, message):
+    (base / "made" / "picture.png").mkdir(parents=True)
+    monkeypatch.setattr("tgdsl.compiler.pipeline.compile_plan", None)  # nothing is compiled, let alone stepped
+    before = sorted(base.rglob("*"))
+    code, _, error = here(base, *arguments)
+    assert (code, error) == (2, f"tgdsl: {message.format(base=base)}\n")
+    assert sorted(base.rglob("*")) == before
+
+
+# Controls
+
+
+def test_a_bad_control_is_named_by_its_place(base, here):
+    controls = np.zeros((5, 2, 1))
+    controls[3, 1, 0] = np.nan
+    controls[4] = np.inf
+    np.savez(base / "c.npz", ctrl=controls)
+    code, _, error = here(base, "run", "pad.yaml", "--controls", "c.npz", "--num-envs", "2")
+    assert (code, error) == (2, "tgdsl: c.npz: `ctrl[3, 1, 0]` is nan, and 2 more: expected finite numbers\n")
+
+
+def test_a_step_that_fails_is_named(base, here):
+    controls = np.zeros((5, 2, 1))
+    controls[3, 1] = 9e9  # on 0.25 kg: beyond the acceleration that MuJoCo takes
+    np.savez(base / "c.npz", ctrl=controls)
+    code, _, error = here(base, "run", "pad.yaml", "--controls", "c.npz", "--num-envs", "2")
+    assert code == 2
+    assert error.startswith("tgdsl: control step 3 of 5: environments 1 diverged")
+    assert not (base / "out").exists()
+
+
+def test_readings_beyond_all_memory(base, here):
+    code, _, error = here(base, "run", "pad.yaml", "--num-envs", "10000", "--seconds", "1e6")
+    assert code == 2
+    assert error.startswith("tgdsl: readings of 10000 environments at 100000000 steps need about ")
+    code, _, error = here(base, "run", "pad.yaml", "--seconds", "1e12")
+    assert code == 2
+    assert error.startswith("tgdsl: controls of 100000000000000 steps need about ")

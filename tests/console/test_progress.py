@@ -1,0 +1,142 @@
+"""Long work says what it is doing: to whoever asks, and on a terminal."""
+
+import fcntl
+import io
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from pathlib import Path
+
+import pytest
+
+import tgdsl
+from tgdsl.console.progress import StatusLine
+
+REPOSITORY = Path(__file__).parents[2]
+SCENE = """
+<mujoco>
+  <asset><mesh name="wedge" vertex="0 0 0  .02 0 0  0 .02 0  0 0 .02"/></asset>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="side" pos=".1 0 0"><geom name="side" type="box" size=".03 .03 .01"/></body>
+    <body name="item" pos="0 0 .029"><joint name="lift" type="slide" axis="0 0 1"/><geom type="mesh" mesh="wedge"/></body>
+  </worldbody>
+  <actuator><motor joint="lift"/></actuator>
+</mujoco>
+"""
+DOCUMENT = """tgdsl: 1
+robot:
+  model: scene.xml
+  layout: {resolutions: {low: {"*d*": {method: grid, rows: 2, columns: 3, direction: [0, 0, -1], radius: 4 mm}}}}
+objects: {item: {body: item, tolerance: 0.5 mm, surface: visual}}
+sensors:
+  depth: {kind: contact_depth, links: "*", feels: [item]}
+  near: {kind: proximity, links: pad, feels: [item]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "pad.yaml").write_text(DOCUMENT)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_compile_tells_what_it_does_in_its_order(folder):
+    said = []
+    tgdsl.compile("pad.yaml", progress=said.append)
+    assert said == [
+        "reading robot and scene",
+        "placing taxels on pad (1 of 2 links)",
+        "placing taxels on side (2 of 2 links)",
+        "lowering sensor depth",
+        "lowering sensor near",
+        "object item: distances",
+        "object item: moments of its surface",
+        "compiling the scene",
+    ]
+
+
+def test_variants_are_counted(folder):
+    shapes = [{"type": "box", "size": [0.01] * 3}, {"type": "sphere", "size": [0.01]}]
+    said = []
+    overrides = {
+        "objects": {"item": {"body": "item", "variants": shapes}},
+        "sensors.near": {"kind": "contact", "links": "pad", "feels": ["item"]},
+    }
+    tgdsl.compile("pad.yaml", overrides=overrides, progress=said.append)
+    assert [line for line in said if line.startswith("object")] == [
+        "object item: distances (1 of 2 variants)",
+        "object item: distances (2 of 2 variants)",
+    ]
+
+
+def test_who_is_told_changes_nothing(folder):
+    plans = [tgdsl.compile("pad.yaml", progress=progress).plan.to_json() for progress in (None, lambda what: None)]
+    assert plans[0] == plans[1]
+
+
+def test_what_the_listener_raises_ends_the_work(folder):
+    def stop(what):
+        if what.startswith("object"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tgdsl.compile("pad.yaml", progress=stop)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_a_status_line_is_drawn_over_itself_and_wiped(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "11")
+    screen, quiet = Terminal(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", screen)
+    with StatusLine() as progress:
+        progress("a first long line")
+        progress("second")
+    assert screen.getvalue() == "\r\x1b[Ka first lo\r\x1b[Ksecond\r\x1b[K"
+    monkeypatch.setattr(sys, "stderr", quiet)
+    with StatusLine() as progress:
+        progress("first")
+    assert quiet.getvalue() == ""
+
+
+def test_a_command_on_a_terminal(folder):
+    """What is said stands on the terminal that standard error is; what is printed stays as it is."""
+    master, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PYTHONWARNINGS": "error", "NO_COLOR": "1"}
+    command = [sys.executable, "-m", "tgdsl", "run", "pad.yaml", "--seconds", "0.05"]
+    with os.fdopen(master, "rb", buffering=0) as screen:
+        with os.fdopen(terminal, "wb") as out:
+            process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=out, text=True)
+        shown = b""
+        while True:
+            try:
+                part = screen.read(4096)
+            except OSError:  # the other end is closed
+                break
+            if not part:
+                break
+            shown += part
+        said, _ = process.communicate()
+    assert process.returncode == 0, shown
+    text = shown.decode()
+    for what in (
+        "object item: distances",
+        "starting the simulation",
+        "stepping",
+        "drawing the picture",
+        "drawing the overview",
+    ):
+        assert what in text
+    assert text.endswith("\r\x1b[K")
+    assert "drawing" not in said
+    assert said.splitlines()[-1] == "overview: out/overview.png"

@@ -1,0 +1,161 @@
+"""The cache has a bound: what was not used for longest goes first, whoever else uses it at the same time."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tgdsl.errors import TgdslError
+from tgdsl.files import cache
+
+VALUES = 1000
+"""Numbers of an entry, 8 bytes each; its file is a little larger."""
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("TGDSL_CACHE_BYTES", raising=False)
+    return tmp_path / "cache"
+
+
+def key(i: int) -> str:
+    return cache.digest(b"test", [np.array(i)])
+
+
+def value_of(i: int, made: list[int] | None = None) -> np.ndarray:
+    """Return entry i from the cache, or make it."""
+
+    def make() -> np.ndarray:
+        if made is not None:
+            made.append(i)
+        return np.full(VALUES, float(i))
+
+    return cache.cached(key(i), make, lambda value: {"value": value}, lambda found: found["value"])
+
+
+def bounded(monkeypatch, count: int) -> int:
+    """Bound the cache to so many entries; return the size of one."""
+    value_of(-1)
+    (entry,) = cache.entries()
+    cache.forget(-1)
+    monkeypatch.setenv("TGDSL_CACHE_BYTES", str(count * entry.size))
+    return entry.size
+
+
+def used(i: int, age: float) -> None:
+    """Have entry i last used so long ago [s]."""
+    os.utime(cache.folder() / f"{key(i)}.npz", (1.7e9 - age, 1.7e9 - age))
+
+
+def there() -> set[int]:
+    return {i for i in range(40) if (cache.folder() / f"{key(i)}.npz").exists()}
+
+
+def test_what_was_not_used_for_longest_goes_first(monkeypatch):
+    size = bounded(monkeypatch, 4)
+    for i in range(4):
+        value_of(i)
+    for i in range(4):
+        used(i, 100.0 - i)
+    made: list[int] = []
+    np.testing.assert_array_equal(value_of(0, made), np.zeros(VALUES))  # used again, so that 1 and 2 are now the oldest
+    assert not made
+    value_of(4)
+    assert there() == {0, 2, 3, 4}
+    value_of(5)
+    assert there() == {0, 3, 4, 5}
+    np.testing.assert_array_equal(value_of(1, made), np.ones(VALUES))
+    assert made == [1], "what went is made again"
+    assert sum(entry.size for entry in cache.entries()) <= 4 * size
+
+
+def test_other_peoples_files_are_left_alone_and_unfinished_ones_are_not(place, monkeypatch):
+    bounded(monkeypatch, 1)
+    (place / "mine.npz").write_bytes(bytes(10**6))
+    (place / "notes.tmp").write_bytes(bytes(10**6))
+    old, new = place / f"{key(1)}.abc.tmp", place / f"{key(2)}.abc.tmp"
+    old.write_bytes(bytes(10**6))
+    new.write_bytes(bytes(10**6))
+    os.utime(old, (1.7e9, 1.7e9))
+    value_of(0)
+    assert there() == {0}
+    assert {path.name for path in place.iterdir()} == {"mine.npz", "notes.tmp", new.name, f"{key(0)}.npz"}
+
+
+def test_an_entry_larger_than_the_bound_is_not_kept(monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE_BYTES", "100")
+    np.testing.assert_array_equal(value_of(3), np.full(VALUES, 3.0))
+    assert cache.entries() == []
+
+
+@pytest.mark.parametrize("text", ["2 GB", "-1", "1e9", "x"])
+def test_a_bound_that_is_none(monkeypatch, text):
+    monkeypatch.setenv("TGDSL_CACHE_BYTES", text)
+    with pytest.raises(TgdslError) as caught:
+        value_of(0)
+    assert str(caught.value) == f'TGDSL_CACHE_BYTES is "{text}", expected a number of bytes such as 2147483648'
+    monkeypatch.setenv("TGDSL_CACHE_BYTES", "")
+    assert cache.max_bytes() == 2**31
+
+
+def test_a_file_that_another_process_removes_first_counts_once(monkeypatch):
+    """Two that forget at once take the same files, so that no more goes than must."""
+    size = bounded(monkeypatch, 40)
+    for i in range(10):
+        value_of(i)
+        used(i, 100.0 - i)
+    real: Callable[[], list[cache.Entry]] = cache.entries
+
+    def then_another_forgets() -> list[cache.Entry]:
+        found = real()
+        monkeypatch.setattr(cache, "entries", real)
+        assert len(cache.forget(6 * size)) == 4
+        return found
+
+    monkeypatch.setattr(cache, "entries", then_another_forgets)
+    assert cache.forget(6 * size) == []
+    assert there() == {4, 5, 6, 7, 8, 9}
+
+
+PROGRAM = """
+import sys
+sys.path[:0] = sys.argv[1:3]
+from test_cache import VALUES, value_of
+import numpy as np
+for turn in range(6):
+    for i in range(12):
+        np.testing.assert_array_equal(value_of(i), np.full(VALUES, float(i)))
+"""
+
+
+def test_several_processes_at_once(monkeypatch):
+    """Each reads what the others write and remove; nobody fails, and what is left is whole and within the bound."""
+    size = bounded(monkeypatch, 5)
+    paths = [str(Path(__file__).parent), str(Path(cache.__file__).parents[2])]
+    running = [subprocess.Popen([sys.executable, "-c", PROGRAM, *paths], stderr=subprocess.PIPE) for _ in range(3)]
+    for process in running:
+        _, errors = process.communicate()
+        assert process.returncode == 0, errors.decode()
+    cache.forget(cache.max_bytes())
+    assert sum(entry.size for entry in cache.entries()) <= 5 * size
+    for i in there():
+        made: list[int] = []
+        np.testing.assert_array_equal(value_of(i, made), np.full(VALUES, float(i)))
+        assert not made
+
+
+def test_the_command_shows_and_clears(tmp_path, place, here, monkeypatch):
+    assert here(tmp_path, "cache") == (0, f"{place}: 0 entries, 0 bytes, of at most 2147483648 bytes\n", "")
+    size = bounded(monkeypatch, 4)
+    for i in range(3):
+        value_of(i)
+    (place / "mine.txt").write_text("x")
+    assert here(tmp_path, "cache") == (0, f"{place}: 3 entries, {3 * size} bytes, of at most {4 * size} bytes\n", "")
+    assert here(tmp_path, "cache", "--clear") == (0, f"{place}: removed 3 entries, {3 * size} bytes\n", "")
+    assert here(tmp_path, "cache", "--clear") == (0, f"{place}: removed 0 entries, 0 bytes\n", "")
+    assert [path.name for path in place.iterdir()] == ["mine.txt"]

@@ -1,0 +1,53 @@
+"""Small surfaces and placements for the tests of the sampler."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from pydantic import TypeAdapter
+
+from tgdsl.errors import SampleError
+from tgdsl.placement.sample.sample import sample
+from tgdsl.schema.placement import Placement
+from tgdsl.surfaces.surface import Surface
+
+HERE = Path()
+DOWN = [0, 0, -1]
+
+
+def placement(method: str, **keys: object) -> Placement:
+    keys = {"method": method, "radius": 0.002} | keys
+    return TypeAdapter(Placement).validate_python({key: value for key, value in keys.items() if value is not None})
+
+
+def surface_of(*meshes: trimesh.Trimesh) -> Surface:
+    parts = [
+        Surface(np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.faces), int), ((f"g{i}", f"mesh{i}"),))
+        for i, mesh in enumerate(meshes)
+    ]
+    return Surface.joined(parts)
+
+
+def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0), cuts: int = 0) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(size)
+    for _ in range(cuts):
+        mesh = mesh.subdivide()
+    return mesh.apply_translation(at)
+
+
+def ball(radius: float, at: tuple[float, float, float] = (0, 0, 0), subdivisions: int = 4) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius).apply_translation(at)
+
+
+def plate(normal: np.ndarray, size: float = 0.02) -> trimesh.Trimesh:
+    """An open square whose edges run along y and across."""
+    across = np.cross([0.0, 1.0, 0.0], normal)
+    corners = [a * across + b * np.array([0, 1.0, 0]) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return trimesh.Trimesh(size / 2 * np.array(corners), [[0, 2, 1], [0, 3, 2]], process=False)
+
+
+def error_of(surface: Surface, where: Placement, folder: Path = HERE) -> SampleError:
+    with pytest.raises(SampleError) as caught:
+        sample(surface, where, folder)
+    return caught.value

@@ -1,0 +1,191 @@
+"""Artefacts: the same bytes from the same document, whole or not at all, and refused by name when they are something else."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load, save
+
+import tgdsl
+from tgdsl.compiler.pipeline import compile_plan
+from tgdsl.errors import ArtifactError, TgdslError
+from tgdsl.module.artifact import load_plan, save_plan
+from tgdsl.plan.plan import FORMAT
+
+SCENE = """
+<mujoco>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+    <body name="ball" pos="1 0 .03"><freejoint/><geom size=".02"/></body>
+  </worldbody>
+</mujoco>
+"""
+DOCUMENT = """
+tgdsl: 1
+robot:
+  model: scene.xml
+  layout:
+    groups: {b: [pad], a: ["p*"]}
+    resolutions:
+      even: {pad: {method: poisson, count: 20, radius: 4 mm}}
+objects: {cube: {body: cube}, ball: {body: ball}}
+sensors:
+  touch: {kind: kinematic_taxel, links: b, feels: [cube, ball], outputs: [force]}
+  bit: {kind: contact, links: [pad], feels: [ball], threshold: 1 mm, release_threshold: 0.5 mm}
+observations:
+  policy: [{type: force, of: touch}, {type: agg_bool, of: bit}]
+"""
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("document")
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "hand.yaml").write_text(DOCUMENT)
+    return folder / "hand.yaml"
+
+
+@pytest.fixture(scope="module")
+def artifact(document):
+    save_plan(compile_plan(document), document.parent / "hand.safetensors")
+    return document.parent / "hand.safetensors"
+
+
+def test_the_same_bytes_twice(document, artifact, tmp_path):
+    size = save_plan(compile_plan(document), tmp_path / "again.safetensors")
+    content = artifact.read_bytes()
+    assert (tmp_path / "again.safetensors").read_bytes() == content
+    assert size == len(content)
+
+
+def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
+    program = "import sys; from tgdsl.module.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_plan(sys.argv[1]), sys.argv[2])"
+    for seed in ("1", "4242"):
+        out = tmp_path / f"{seed}.safetensors"
+        command = [sys.executable, "-c", program, str(document), str(out)]
+        subprocess.run(command, env={**os.environ, "PYTHONHASHSEED": seed}, cwd=tmp_path, check=True)
+        assert out.read_bytes() == artifact.read_bytes()
+
+
+def test_a_plan_comes_back_whole(document, artifact):
+    plan, found = compile_plan(document), load_plan(artifact)
+    for field in dataclasses.fields(plan):
+        if field.name != "arrays":
+            assert getattr(found, field.name) == getattr(plan, field.name), field.name
+    assert list(found.arrays) == list(plan.arrays)
+    for name, array in plan.arrays.items():
+        assert found.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(found.arrays[name], array)
+        with pytest.raises(ValueError, match="read-only"):
+            found.arrays[name][...] = 0
+
+
+def test_a_loaded_module_reads_the_same(document, artifact, tmp_path):
+    touch = tgdsl.compile(document)
+    assert tgdsl.save(touch, tmp_path / "saved.safetensors") == artifact.stat().st_size
+    again = tgdsl.load(tmp_path / "saved.safetensors")
+    state = touch.example_state(16)
+    for name, reading in touch(state).items():
+        assert torch.equal(again(state)[name], reading)
+    assert again.inputs == touch.inputs
+    assert tgdsl.load(artifact, dtype=torch.float64).dtype == torch.float64
+
+
+def refused(path) -> str:
+    with pytest.raises(ArtifactError) as caught:
+        tgdsl.load(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    return message.removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize("keep", [0, 4, 100, -1], ids=["empty", "no_header", "half_header", "last_byte_gone"])
+def test_truncated_files(artifact, tmp_path, keep):
+    (tmp_path / "t.safetensors").write_bytes(artifact.read_bytes()[:keep])
+    assert refused(tmp_path / "t.safetensors").startswith("cannot read this artefact: ")
+
+
+def test_damaged_header(artifact, tmp_path):
+    content = bytearray(artifact.read_bytes())
+    content[20:40] = b"\xff" * 20
+    (tmp_path / "d.safetensors").write_bytes(content)
+    assert refused(tmp_path / "d.safetensors").startswith("cannot read this artefact: ")
+
+
+def test_files_that_are_no_artefacts(tmp_path):
+    assert refused(tmp_path / "none.safetensors").startswith("cannot read this artefact: ")
+    (tmp_path / "folder.safetensors").mkdir()
+    assert refused(tmp_path / "folder.safetensors").startswith("cannot read this artefact: ")
+    (tmp_path / "foreign.safetensors").write_bytes(save({"weight": np.zeros(3)}, {"format": "pt"}))
+    assert refused(tmp_path / "foreign.safetensors") == "this safetensors file was not written by tgdsl"
+    (tmp_path / "bare.safetensors").write_bytes(save({"weight": np.zeros(3)}))
+    assert refused(tmp_path / "bare.safetensors") == "this safetensors file was not written by tgdsl"
+
+
+def rewritten(artifact, path, text: str) -> None:
+    path.write_bytes(save(load(artifact.read_bytes()), {"tgdsl": text}))
+
+
+def test_other_versions_and_other_contents(artifact, tmp_path):
+    path, plain = tmp_path / "other.safetensors", json.loads(load_plan(artifact).to_json())
+    rewritten(artifact, path, json.dumps(plain | {"format": FORMAT + 1}))
+    assert refused(path) == f"plan format {FORMAT + 1} is not {FORMAT}, which this version of tgdsl reads; compile again"
+    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
+    assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile again"
+    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "links"}))
+    assert refused(path).startswith("a plan has the parts ")
+    rewritten(artifact, path, json.dumps(plain | {"links": 3}))
+    assert refused(path).startswith("not a plan: ")
+    for text in ("", "{", "3", "null"):
+        rewritten(artifact, path, text)
+        assert refused(path).startswith("not a plan: ")
+
+
+def test_a_kind_that_is_not_given(artifact, tmp_path):
+    path, plain = tmp_path / "own.safetensors", json.loads(load_plan(artifact).to_json())
+    plain["sensors"][0]["kind"] = "kinematic_taxle"
+    rewritten(artifact, path, json.dumps(plain))
+    with pytest.raises(TgdslError) as caught:
+        tgdsl.load(path)
+    assert str(caught.value) == (
+        'sensor "touch" is of kind "kinematic_taxle", which is not given; did you mean "kinematic_taxel"?'
+    )
+
+
+def test_a_failure_leaves_what_was_there(artifact, tmp_path, monkeypatch):
+    plan, path = load_plan(artifact), tmp_path / "hand.safetensors"
+    path.write_bytes(b"before")
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="no space left"):
+        save_plan(plan, path)
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_has_the_mode_of_any_other(artifact, tmp_path):
+    (tmp_path / "plain").write_bytes(b"")
+    save_plan(load_plan(artifact), tmp_path / "hand.safetensors")
+    assert (tmp_path / "hand.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.safetensors", "plain"]
+
+
+def test_arrays_that_were_tampered_with(artifact, tmp_path):
+    content = artifact.read_bytes()
+    arrays = load(content)
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+    changed = {**arrays, "queries/0/0/reach": arrays["queries/0/0/reach"] * 2}
+    lacking = {name: value for name, value in arrays.items() if name != "queries/0/0/reach"}
+    for bad in (changed, lacking):
+        (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
+        with pytest.raises(ArtifactError, match="the arrays are not those that the plan was written with"):
+            load_plan(tmp_path / "bad.safetensors")

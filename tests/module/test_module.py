@@ -1,0 +1,332 @@
+import copy
+import pickle
+import warnings
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.errors import SpecError, StateError, TgdslError
+from tgdsl.module.explain import operations_per_env
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.sensors import KINDS
+from tgdsl.sensors.base import Channel, ContactProbeSpec, Kind, Lowered
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".02 .02 .01"/></body>
+  <body name="tip" pos=".1 0 0"><geom type="sphere" size=".01"/></body>
+  <body name="item" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+  <body name="far" pos="1 0 0"><freejoint/><geom type="sphere" size=".02"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def document(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    grid = {"method": "grid", "rows": 3, "columns": 4, "direction": [0, 0, -1], "radius": 0.004}
+    ball = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.003}]}
+    sensor = {"links": "flat", "feels": ["item"]}
+    return {
+        "tgdsl": 1,
+        "robot": {
+            "model": str(tmp_path / "scene.xml"),
+            "layout": {"groups": {"flat": "pad", "all": ["flat", "tip"]}, "resolutions": {"r": {"pad": grid, "tip": ball}}},
+        },
+        "objects": {"item": {"body": "item"}, "far": {"body": "far"}},
+        "sensors": {
+            "touch": {"kind": "kinematic_taxel", "readout": "both", **sensor},
+            "contact": {"kind": "contact", "release_threshold": "0.1 mm", **sensor},
+        },
+    }
+
+
+@pytest.fixture
+def touch(document):
+    return tgdsl.compile(document)
+
+
+def test_what_is_missing_or_misshapen_is_named(touch):
+    good = touch.example_state(3)
+    names = "body_pos, body_quat, body_linvel, body_angvel, contact_found"
+    table = [
+        ({"body_quat": None}, f"SceneState.body_quat is missing; this module wants {names}"),
+        ({"body_pos": good.body_pos[:, :1]}, "SceneState.body_pos has shape (3, 1, 3), expected (env, 2, 3)"),
+        ({"body_quat": good.body_quat[:2]}, "SceneState.body_quat holds 2 environments, body_pos 3"),
+        ({"contact_found": good.contact_found[:, 0]}, "SceneState.contact_found has shape (3,), expected (env, 1)"),
+        ({"body_pos": good.body_pos.half()}, "SceneState.body_pos is torch.float16, expected torch.float32 or torch.float64"),
+        ({"body_pos": good.body_pos.to("meta")}, "SceneState.body_pos is on meta, the module on cpu"),
+    ]
+    for change, message in table:
+        state = copy.copy(good)
+        for name, value in change.items():
+            setattr(state, name, value)
+        with pytest.raises(StateError) as caught:
+            touch(state)
+        assert str(caught.value) == message
+
+
+def test_what_is_not_wanted_is_ignored(touch):
+    state = touch.example_state(2)
+    expected = touch(state)["touch"]
+    state.contact_netforce = torch.zeros(7)
+    torch.testing.assert_close(touch(state)["touch"], expected, rtol=0, atol=0)
+
+
+def test_contacts_may_be_boolean_or_counts(touch):
+    state = touch.example_state(4)
+    found = torch.tensor([[0.0], [1.0], [4.0], [0.0]])
+    readings = []
+    for kind in (found, found > 0, found.int()):
+        state.contact_found = kind
+        touch.reset()
+        readings.append(touch(state)["touch"])
+    torch.testing.assert_close(readings[0], readings[1], rtol=0, atol=0)
+    torch.testing.assert_close(readings[0], readings[2], rtol=0, atol=0)
+
+
+def test_outputs_and_taxels_describe_the_readings(touch):
+    readings = touch(touch.example_state(5))
+    assert {output.name: (5, *output.shape) for output in touch.outputs} == {k: tuple(v.shape) for k, v in readings.items()}
+    first = touch.outputs[0]
+    assert (first.name, first.kind, first.channels[:4]) == (
+        "touch",
+        "kinematic_taxel",
+        ("force_x", "force_y", "force_z", "torque_x"),
+    )
+    assert first.units == ("N",) * 3 + ("N·m",) * 3
+    table = touch.taxels["touch"]
+    assert list(table.dtype.names) == ["link", "body", "pos", "normal", "tangent", "radius", "area", "row", "column", "groups"]
+    assert set(table["link"]) == {"pad"} and set(table["groups"]) == {"all,flat"}
+    np.testing.assert_allclose(table["pos"][:, 2], 0.01)
+    assert [tuple(cell) for cell in zip(table["row"], table["column"], strict=True)] == [
+        (r, c) for r in range(3) for c in range(4)
+    ]
+
+
+def test_readings_are_views_of_channel_major_storage(touch):
+    reading = touch(touch.example_state(5))["touch"]
+    assert reading.transpose(1, 2).is_contiguous()
+
+
+def test_both_readouts_are_the_same_without_noise(touch):
+    readings = touch(touch.example_state(5))
+    torch.testing.assert_close(readings["touch"], readings["touch/clean"], rtol=0, atol=0)
+
+
+def test_only_what_is_needed_is_planned(touch):
+    """Links without a sensor and objects that none feels reach neither inputs nor arrays; one query serves both sensors."""
+    assert touch.inputs.bodies == ("item", "pad")
+    assert len(touch.plan.queries) == 1
+    assert not any("far" in name or "tip" in name for name in touch.plan.arrays)
+    assert dict(touch.plan.dropped) == {"link tip": "no sensor is on it", "object far": "no sensor feels it"}
+
+
+def test_a_shared_query_costs_once(document):
+    both = operations_per_env(tgdsl.compile(document))
+    del document["sensors"]["contact"]
+    alone = operations_per_env(tgdsl.compile(document))
+    assert both - alone < 0.1 * alone
+
+
+def test_explain_names_counts_inputs_and_what_was_dropped(touch):
+    text = touch.explain()
+    for part in (
+        "12 taxels",
+        "link tip: no sensor is on it",
+        "pad – item",
+        "touch, contact: depth",
+        "remembers bit",
+        "contact_found",
+    ):
+        assert part in text
+    assert f"{operations_per_env(touch)} elementary operations" in text
+    assert f"{4 * 12 * (6 + 6 + 1)} bytes of readings" in text
+
+
+def test_float64_constants_are_the_plans_to_the_bit(document):
+    touch = tgdsl.compile(document)
+    exact = tgdsl.compile(document, dtype=torch.float64)
+    for moved in (touch.double(), tgdsl.compile(document).to(torch.float64), tgdsl.compile(document).double().float().double()):
+        for (name, a), (_, b) in zip(moved.constants.named_buffers(), exact.constants.named_buffers(), strict=True):
+            assert torch.equal(a, b), name
+        assert moved.dtype == torch.float64
+    assert touch.constants["pairs/link"].dtype == torch.int64
+
+
+def test_a_changed_constant_stays_changed(touch):
+    touch.constants["sensors/touch/normal_stiffness"].fill_(123.0)
+    assert touch.double().constants["sensors/touch/normal_stiffness"].item() == 123.0
+
+
+def test_parameters_have_gradients(document):
+    touch = tgdsl.compile(document, dtype=torch.float64)
+    stiffness = touch.constants["sensors/touch/normal_stiffness"].requires_grad_()
+    state = touch.example_state(8)
+    force = touch(state)["touch"][..., :3].sum()
+    (gradient,) = torch.autograd.grad(force, stiffness)
+    with torch.no_grad():
+        stiffness += 1.0
+        difference = touch(state)["touch"][..., :3].sum() - force
+    assert gradient.item() == pytest.approx(difference.item(), rel=1e-9)
+
+
+def test_state_works_under_inference_mode_and_after_it(touch):
+    state = touch.example_state(2)
+    with torch.inference_mode():
+        touch(state)
+        touch(state)
+        touch.reset([1])
+    touch(state)
+    touch.reset()
+    assert touch.num_envs == 2
+
+
+def test_a_cpu_has_no_graphs(touch):
+    with pytest.raises(TgdslError, match="`graph` needs a module on a GPU, this one is on cpu"):
+        touch.compile(graph=True)
+
+
+def test_the_batch_of_a_module_with_state_is_fixed(touch, document):
+    assert touch.num_envs is None and touch.has_state
+    touch(touch.example_state(3))
+    with pytest.raises(StateError, match="this module holds the state of 3 environments, the scene has 4"):
+        touch(touch.example_state(4))
+    del document["sensors"]["contact"]
+    stateless = tgdsl.compile(document)
+    for num_envs in (1, 4, 2):
+        assert stateless(stateless.example_state(num_envs))["touch"].shape[0] == num_envs
+    assert stateless.num_envs is None and not stateless.state_dict()
+
+
+def test_a_module_can_be_copied_and_pickled(touch):
+    state = touch.example_state(2)
+    expected = touch(state)["touch"]
+    for other in (copy.deepcopy(touch), pickle.loads(pickle.dumps(touch))):
+        torch.testing.assert_close(other(state)["touch"], expected, rtol=0, atol=0)
+
+
+def test_example_states_are_reproducible(touch):
+    a, b, c = touch.example_state(2), touch.example_state(2), touch.example_state(2, seed=1)
+    assert torch.equal(a.body_pos, b.body_pos) and not torch.equal(a.body_pos, c.body_pos)
+
+
+def test_state_moves_between_dtypes(touch):
+    state = touch.example_state(2).to(torch.float32)
+    assert state.body_pos.dtype == torch.float32 and isinstance(state, SceneState)
+
+
+class InverseSpec(ContactProbeSpec):
+    """One over one plus depth: a kind that tgdsl does not have."""
+
+    kind: Literal["inverse"]
+    """The kind."""
+
+
+INVERSE = Kind(
+    InverseSpec,
+    lower=lambda spec, layout, surface_of: Lowered((Channel("inverse", "1"),)),
+    forward=lambda felt, probes, constants, state: ({"inverse": 1 / (1 + felt.depth)}, {}),
+    reference=lambda spec, layout, touch, state: (1 / (1 + touch.depth[:, None]), {}),
+)
+
+
+def test_kinds_of_your_own(document, tmp_path):
+    document["sensors"] = {"mine": {"kind": "inverse", "links": "pad", "feels": ["item"]}}
+    with pytest.raises(SpecError, match='unknown kind "inverse"'):
+        tgdsl.compile(document)
+    touch = tgdsl.compile(document, kinds=[INVERSE])
+    assert touch(touch.example_state(2))["mine"].shape == (2, 12, 1)
+    tgdsl.save(touch, tmp_path / "mine.safetensors")
+    with pytest.raises(TgdslError, match='sensor "mine" is of kind "inverse", which is not given'):
+        tgdsl.load(tmp_path / "mine.safetensors")
+    again = tgdsl.load(tmp_path / "mine.safetensors", kinds=[INVERSE])
+    state = touch.example_state(2)
+    torch.testing.assert_close(again(state)["mine"], touch(state)["mine"], rtol=0, atol=0)
+    assert isinstance(TactileModule(touch.plan, (*KINDS, INVERSE)), torch.nn.Module)
+
+
+TILES = {
+    "a depth": ({"kind": "contact_depth"}, True),
+    "a force": ({"kind": "force_taxel"}, True),
+    "two links": ({"kind": "contact_depth", "links": "all"}, False),
+    "noise": ({"kind": "contact_depth", "noise": {"white_noise": 1e-4}}, False),
+    "a velocity": ({"kind": "kinematic_taxel"}, False),
+    "moments": ({"kind": "proximity"}, False),
+    "frames": ({"kind": "elastomer"}, False),
+}
+
+
+@pytest.mark.parametrize("name", TILES)
+def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
+    sensor, is_tiled = TILES[name]
+    document["sensors"] = {"mine": {"links": "pad", "feels": ["item"], **sensor}}
+    options = tgdsl.compile(document).inductor_options()
+    assert options == {"assert_indirect_indexing": False, "triton.prefer_nd_tiling": is_tiled}
+
+
+def test_as_many_modules_as_one_likes_are_compiled(document, monkeypatch):
+    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    sensor = {"kind": "contact_depth", "links": "pad", "feels": ["item"]}
+    for count in (1, 2, 3):
+        document["sensors"] = {f"depth{i}": sensor for i in range(count)}
+        touch, plain = tgdsl.compile(document).compile(backend="eager"), tgdsl.compile(document)
+        state = touch.example_state(2)
+        with torch._dynamo.config.patch(recompile_limit=2):
+            found, expected = touch(state), plain(state)
+        assert len(found) == count and all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float16, torch.bfloat16, torch.bool, torch.complex64])
+def test_only_float32_and_float64_are_a_modules(document, touch, tmp_path, dtype):
+    """A bfloat16 knows 4 cm to 0.1 mm, so depths erred by half of full scale; an integer read zeros."""
+    path = tmp_path / "touch.safetensors"
+    tgdsl.save(touch, path)
+    refused = pytest.raises(TgdslError, match=rf"^a module cannot be of {dtype}, expected torch\.float32 or torch\.float64; ")
+    for make in (
+        lambda: tgdsl.compile(document, dtype=dtype),
+        lambda: tgdsl.load(path, dtype=dtype),
+        lambda: TactileModule(touch.plan, dtype=dtype),
+    ):
+        with refused:
+            make()
+    if dtype not in (torch.int64, torch.bool):  # torch itself casts modules to floating point or complex dtypes alone
+        for cast in (lambda: touch.to(dtype), lambda: touch.type(dtype), lambda: torch.nn.Sequential(touch).to(dtype)):
+            with warnings.catch_warnings(), refused:
+                warnings.filterwarnings("ignore", "Complex modules")
+                cast()
+        assert {b.dtype for b in touch.buffers() if b.is_floating_point()} == {touch.dtype}
+
+
+def test_a_module_is_cast_between_its_dtypes(touch):
+    state = touch.example_state(3)
+    single = touch(state)["touch"]
+    touch.free()
+    double = touch.double()(state)["touch"]
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5 * float(double.abs().max()))
+
+
+def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+    wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'
+    scene = SCENE.replace('<geom type="box" size=".02 .02 .02"/>', '<geom type="mesh" mesh="wedge"/>')
+    (tmp_path / "scene.xml").write_text(scene.replace("<mujoco>", f"<mujoco>{wedge}"))
+    document["sensors"] = {"mine": {"kind": "contact_depth", "links": "pad", "feels": ["item"]}}
+    assert not tgdsl.compile(document).inductor_options()["triton.prefer_nd_tiling"]
+
+
+def test_the_index_of_a_variant_is_looked_at(document):
+    document["objects"]["item"]["variants"] = [{"type": "sphere", "size": [0.01]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]
+    assert tgdsl.compile(document).inductor_options()["assert_indirect_indexing"]
+
+
+def test_no_compiler_means_eager_and_a_warning(touch, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.warns(UserWarning, match=r"no C\+\+ compiler \(g\+\+, clang\+\+ or \$CXX\) was found: the module stays eager"):
+        touch.compile()
+    touch(touch.example_state(2))

@@ -1,0 +1,146 @@
+"""Even samples against closed forms and statistics."""
+
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+from surfaces import DOWN, HERE, ball, box, error_of, placement, surface_of
+
+from tgdsl.placement.sample import spread
+from tgdsl.placement.sample.sample import sample
+from tgdsl.surfaces import meshlab
+from tgdsl.surfaces.region import Region
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 50, 120, 500])
+def test_poisson_gives_the_exact_count_evenly_on_the_surface(count):
+    radius = 0.01
+    mesh = ball(radius)
+    found = sample(surface_of(mesh), placement("poisson", count=count), HERE)
+    assert found.pos.shape == (count, 3)
+    np.testing.assert_allclose(found.area.sum(), mesh.area, rtol=1e-9)
+    assert (found.area > 0).all()
+    np.testing.assert_array_equal(found.cell, np.full((count, 2), -1))
+    _, face = KDTree(mesh.triangles_center).query(found.pos, k=8)
+    height = ((found.pos[:, None] - mesh.triangles_center[face]) * mesh.face_normals[face]).sum(-1)
+    own = np.abs((found.normal[:, None] * mesh.face_normals[face]).sum(-1) - 1).argmin(axis=1)
+    assert np.abs(height[np.arange(count), own]).max() < 1e-9  # in the plane of the face whose normal it has
+    if count >= 50:
+        ideal = np.sqrt(2 * mesh.area / (np.sqrt(3) * count))  # hexagonal packing
+        nearest = KDTree(found.pos).query(found.pos, k=2)[0][:, 1]
+        assert nearest.min() > 0.7 * ideal
+        random = np.random.default_rng(0).normal(size=(count, 3))
+        random *= radius / np.linalg.norm(random, axis=1, keepdims=True)
+        uniform = KDTree(random).query(random, k=2)[0][:, 1]
+        assert nearest.mean() > 1.4 * uniform.mean()  # bluer: uniform points have 1/2√density
+        assert nearest.std() / nearest.mean() < 0.12
+        assert found.area.std() / found.area.mean() < 0.25
+
+
+def test_poisson_is_the_same_bytes_each_time_and_differs_by_seed():
+    def bytes_of(seed: int, **keys: object) -> bytes:
+        found = sample(surface_of(box((0.01, 0.02, 0.03))), placement("poisson", seed=seed, **keys), HERE)
+        return b"".join(getattr(found, name).tobytes() for name in ("pos", "normal", "tangent", "area"))
+
+    for keys in ({"count": 40}, {"spacing": 0.003}):
+        assert bytes_of(3, **keys) == bytes_of(3, **keys)
+        assert bytes_of(3, **keys) != bytes_of(4, **keys)
+
+
+@pytest.mark.parametrize("spacing", [0.002, 0.0051, 0.1])
+def test_spacing_is_kept_and_leaves_no_gap(spacing):
+    surface = surface_of(box((0.02, 0.02, 0.01)))
+    found = sample(surface, placement("poisson", spacing=spacing), HERE)
+    if len(found.pos) > 1:
+        assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() >= spacing
+    pool = spread.pool(meshlab.outer_shell(surface), Region(None, (), (), ()), 0, None, spacing)
+    assert KDTree(found.pos).query(pool.pos)[0].max() <= spacing
+    np.testing.assert_allclose(found.area.sum(), 2 * (0.0004 + 0.0002 + 0.0002), rtol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["outward", "inside_out"])
+def test_poisson_leaves_out_an_inner_shell(sign):
+    inner, outer = ball(0.005, (0.002, 0, 0)), ball(0.01)
+    inner.faces, outer.faces = inner.faces[:, ::sign], outer.faces[:, ::-sign]
+    for meshes in ((inner, outer), (outer, inner), (trimesh.util.concatenate([outer, inner]),)):
+        found = sample(surface_of(*meshes), placement("poisson", count=100), HERE)
+        assert np.linalg.norm(found.pos, axis=1).min() > 0.0098
+        assert ((found.normal * found.pos).sum(axis=1) > 0).all()
+        np.testing.assert_allclose(found.area.sum(), outer.area, rtol=1e-9)
+
+
+def test_poisson_samples_the_union_of_overlapping_boxes():
+    found = sample(surface_of(box((2, 2, 2)), box((2, 2, 2), (1, 1, 1))), placement("poisson", count=600), HERE)
+    for corner in (np.zeros(3), np.ones(3)):
+        assert (np.abs(found.pos - corner).max(axis=1) > 1 - 1e-9).all()
+    np.testing.assert_allclose(found.area.sum(), 2 * 24 - 6, rtol=0.01)
+
+
+@pytest.mark.parametrize(("shift", "size", "area"), [((2, 0, 0), (2, 2, 2), 40), ((1, 0, 0), (2, 2, 2), 32)])
+def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, area):
+    found = sample(surface_of(box((2, 2, 2)), box(size, shift)), placement("poisson", count=300), HERE)
+    np.testing.assert_allclose(found.area.sum(), area, rtol=0.01)
+    assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
+
+
+def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
+    inner, outer = ball(0.008), ball(0.01)
+    inner.faces = inner.faces[:, ::-1]
+    hole = [mesh.faces[np.argmax(mesh.triangles_center[:, 2])] for mesh in (inner, outer)]
+    joined = trimesh.util.concatenate([inner, outer])
+    rim = [hole[0][::-1], hole[1] + len(inner.vertices)]
+    corner = [np.argmin(np.linalg.norm(joined.vertices[rim[0]] * 1.25 - joined.vertices[i], axis=1)) for i in rim[1]]
+    a, b = rim[0][corner], rim[1]
+    tunnel = [f for i in range(3) for f in ([b[i], a[i], b[i - 2]], [a[i], a[i - 2], b[i - 2]])]
+    faces = [f for f in joined.faces.tolist() if set(f) not in (set(rim[0]), set(rim[1]))]
+    mesh = trimesh.Trimesh(joined.vertices, faces + tunnel, process=False)
+    assert mesh.is_watertight
+    assert mesh.body_count == 1
+    found = sample(surface_of(mesh), placement("poisson", count=300), HERE)
+    assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 3
+
+
+def test_poisson_on_open_meshes():
+    bowl = ball(0.01)
+    bowl.update_faces(bowl.triangles_center[:, 2] > 0)
+    marble = ball(0.002)
+    found = sample(surface_of(bowl, marble), placement("poisson", count=200), HERE)
+    assert (np.linalg.norm(found.pos, axis=1) < 0.0021).any()  # a bowl encloses nothing
+    np.testing.assert_allclose(found.area.sum(), bowl.area + marble.area, rtol=0.01)
+    punctured = trimesh.Trimesh((shell := ball(0.01)).vertices, shell.faces[3:], process=False)
+    found = sample(surface_of(punctured, marble), placement("poisson", count=200), HERE)
+    assert np.linalg.norm(found.pos, axis=1).min() > 0.0098  # a few missing triangles do not make a bowl
+
+
+def test_poisson_mends_windings_that_disagree():
+    mesh = ball(0.01)
+    faces = mesh.faces.copy()
+    faces[::2] = faces[::2, ::-1]
+    mixed = trimesh.Trimesh(mesh.vertices, faces, process=False)
+    found = sample(surface_of(mixed), placement("poisson", count=80), HERE)
+    assert ((found.normal * found.pos).sum(axis=1) > 0).all()
+
+
+def test_poisson_densifies_for_a_small_region():
+    region = {"sphere": {"center": [0.03, 0, 0.05], "radius": "0.5 mm"}}
+    found = sample(surface_of(box((0.1, 0.1, 0.1))), placement("poisson", count=300, region=region), HERE)
+    assert len(found.pos) == 300
+    np.testing.assert_allclose(found.area.sum(), np.pi * 0.0005**2, rtol=0.03)
+
+
+def test_poisson_errors(monkeypatch):
+    surface = surface_of(ball(0.01))
+    away = placement("poisson", count=3, region={"box": {"min": [1, 1, 1], "max": [2, 2, 2]}})
+    assert str(error_of(surface, away)) == "no part of the link's outer surface is in the region; widen `region`"
+    inside = placement("poisson", count=3, region={"geoms": "g0"})
+    assert str(error_of(surface_of(ball(0.005), ball(0.01)), inside)) == (
+        "no part of the link's outer surface is in the region; widen `region`"
+    )
+    assert str(error_of(surface, placement("poisson", spacing=1e-5))) == (
+        "a spacing of 1e-05 m is too fine for a surface of 0.00126 m²; expected at least 0.0004 m"
+    )
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)
+    assert str(error_of(surface, placement("poisson", count=3))).startswith("`poisson` needs pymeshlab: ")
+    assert len(sample(surface, placement("grid", rows=1, columns=1, direction=DOWN), HERE).pos) == 1

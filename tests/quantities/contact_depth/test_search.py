@@ -1,0 +1,111 @@
+"""That `search` makes of a kernel's answer what `feel` makes of distances; the kernel itself is tested beside it."""
+
+import sys
+from types import ModuleType
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from tgdsl.quantities.contact_depth import search as searching
+from tgdsl.quantities.contact_depth.query import FeltObject, Probes, feel, measure, relate
+from tgdsl.quantities.contact_depth.search import geom_tables, is_searchable, search
+from tgdsl.quantities.contacts.contacts import Contacts
+
+NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
+WHICH = (0, 1, 2, 4, 5)
+"""The objects that are felt."""
+
+
+class Deepest(NamedTuple):
+    """What the kernel returns."""
+
+    depth: torch.Tensor
+    normal: tuple
+    pair: torch.Tensor
+
+
+def brute_force(pairs, pos, tables, reach):
+    """Return what the kernel does of centred boxes, from the distances."""
+    ends = tables.spheres[0, :, 1].cumsum(0).long()
+    boxes = [box(tables.geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
+    near = measure(pairs, Probes(pos, tables.pair), boxes)
+    felt = feel(pairs, Probes(pos, tables.pair), near, reach, ("normal",))
+    depths = torch.stack([r + pairs.gate[:, own.pair] - own.distance for r, own in zip(reach, near, strict=True)])
+    deepest = depths.max(dim=0)
+    pair = tables.pair.gather(0, deepest.indices)
+    return Deepest(felt.depth, felt.normal, torch.where(deepest.values > 0, pair, -1))
+
+
+@pytest.fixture
+def kernel(monkeypatch):
+    """A kernel that runs everywhere, in float64."""
+    stub = ModuleType("deepest_kernel")
+    stub.deepest = brute_force
+    monkeypatch.setitem(sys.modules, "tgdsl.quantities.contact_depth.deepest_kernel", stub)
+    monkeypatch.setattr(searching, "takes_kernel", lambda *_: True)
+
+
+def box(size, first_pair, num_pairs):
+    identity = torch.eye(3, dtype=torch.float64).reshape(1, 1, 9)
+    return FeltObject(
+        "box", first_pair, num_pairs, ("box",), (True,), size, 0 * size, identity, None, None, (None,)
+    )  # fmt: skip
+
+
+@pytest.fixture
+def scene():
+    """Two links and six boxes, some of which each probe reaches; which pairs are felt, and how far."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape):
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    num_bodies = NUM_LINKS + NUM_OBJECTS
+    link, target = (
+        torch.arange(NUM_LINKS).repeat(NUM_OBJECTS),
+        NUM_LINKS + torch.arange(NUM_OBJECTS).repeat_interleave(NUM_LINKS),
+    )
+    state = (0.05 * random(NUM_ENVS, num_bodies, 3), random(NUM_ENVS, num_bodies, 4))
+    motion = (random(NUM_ENVS, num_bodies, 3), random(NUM_ENVS, num_bodies, 3))
+    gate = torch.where(random(NUM_ENVS, len(link)) > -1, 0.0, -torch.inf)
+    pairs = relate(*state, link, target, torch.float64, *motion, gate)
+    owner = torch.arange(NUM_TAXELS) % NUM_LINKS
+    probes = Probes((0.03 * random(3, NUM_TAXELS)).unbind(), owner.expand(NUM_OBJECTS, -1))
+    boxes = [
+        box(0.01 + 0.02 * random(1, 1, 3).abs(), NUM_LINKS * i, NUM_LINKS)._replace(name=f"{i}") for i in range(NUM_OBJECTS)
+    ]
+    reach = torch.full((len(WHICH), NUM_TAXELS), 0.03, dtype=torch.float64)
+    return pairs, probes, boxes, owner + NUM_LINKS * torch.tensor(WHICH)[:, None], reach
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_motion_is_that_of_the_object_found(scene, kernel, is_known):
+    pairs, probes, boxes, pair, reach = scene
+    needs, felt = ("motion", "normal", "contacts"), [boxes[i] for i in WHICH]
+    none = torch.zeros(NUM_ENVS, NUM_LINKS, 0, dtype=torch.float64)
+    contacts = Contacts(*[(none, none, none)] * 4, (none[..., 0:1].sum(-1),) * 3)
+    known = {"pair": pair} | (dict(zip(("spheres", "geoms"), geom_tables(felt), strict=True)) if is_known else {})
+    found = search(pairs, probes, felt, known, reach, needs, contacts)
+    near = measure(pairs, probes, boxes)
+    expected = feel(pairs, probes, [near[i] for i in WHICH], reach, needs, contacts)
+    assert 0.2 < (expected.depth > 0).double().mean() < 0.9
+    torch.testing.assert_close(found.depth, expected.depth)
+    for part, other in zip(
+        (*found.normal, *found.velocity, *found.angular), (*expected.normal, *expected.velocity, *expected.angular), strict=True
+    ):
+        torch.testing.assert_close(part, other)
+    assert found.contacts is contacts
+
+
+def test_a_cpu_has_no_kernel_for_it(scene):
+    pairs, probes, boxes, pair, reach = scene
+    assert search(pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach, ("normal",)) is None
+
+
+def test_what_the_kernel_cannot_answer_is_left_to_torch():
+    many = ["box"] * searching.THRESHOLD
+    assert is_searchable(many, {"normal", "motion", "contacts"}) and is_searchable(many, ())
+    assert not is_searchable(many, {"normal", "distance"})
+    assert not is_searchable(many[1:], {"normal"})
+    assert not is_searchable([*many, "ellipsoid"], {"normal"})

@@ -1,0 +1,143 @@
+"""Robots in USD feel as their MJCF twins do: the same layouts, and the same readings through a squeeze.
+
+What the two models differ by is the order of floating-point operations: 1e-16, which contacts make 1e-12 of within a second.
+"""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.compiler.resolve import resolve
+from tgdsl.formats.robot import load_model
+from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.schema.load import load
+from tgdsl.sensors import KINDS
+
+ROOT = Path(__file__).resolve().parents[2]
+HANDS = {"xhand1": "right_hand_link", "sharpa": "right_hand_C_MC"}
+SHARPA_SCENE = f"""
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <asset><model name="sharpa" file="{ROOT / "robots" / "sharpa" / "sharpa_right.xml"}"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 0.1"/>
+    <frame pos="0 0 0.06" quat="0 0.70710678 0 0.70710678">
+      <attach model="sharpa" body="right_hand_C_MC" prefix=""/>
+    </frame>
+    <body name="cube" pos="0.07 -0.005 0.115">
+      <freejoint name="cube"/>
+      <geom type="box" size="0.02 0.02 0.02" mass="0.1" friction="0.9 0.005 0.0001"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+FULL_SCALE = 1e-6
+"""Largest difference of a reading, of the largest of the run. Joint frames in float32 alone would make 1.5e-6."""
+STEPS, HOLD, RAMP = 500, 100, 250
+"""Control steps of 2 ms in all, before the squeeze, and from its start to its end."""
+
+pytestmark = [
+    pytest.mark.slow,
+    # Scenes hold keyframes, lights and the like, which USD does not: the exporter says so.
+    pytest.mark.filterwarnings("ignore:.*USD holds no"),
+]
+
+
+def document(model: Path, hand: str, resolution: str, obj: str) -> dict:
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(model), "layout": str(ROOT / "robots" / hand / "layout.yaml")},
+        "objects": {"thing": {"body": obj}},
+        "resolution": resolution,
+        "sensors": {
+            "touch": {"kind": "kinematic_taxel", "links": "hand", "feels": ["thing"], "normal_stiffness": 500},
+            "depth": {"kind": "contact_depth", "links": "hand", "feels": ["thing"]},
+        },
+    }
+
+
+def scene(hand: str, folder: Path) -> tuple[Path, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a scene with a hand and a free cube, its first positions, and the controls that hold and that squeeze."""
+    if hand == "xhand1":
+        file = ROOT / "examples" / "palm_cube.xml"
+        model = load_model(file).compiled
+        rest, squeeze = model.key("rest"), model.key("squeeze")
+        return file, rest.qpos, rest.ctrl, squeeze.ctrl
+    file = folder / "sharpa_cube.xml"
+    file.write_text(SHARPA_SCENE)
+    model = load_model(file).compiled
+    wanted = {"MCP_FE": 1.3, "PIP": 1.2, "DIP": 0.6, "CMC_FE": 1.5, "IP": 0.5}
+    squeeze = np.array([wanted.get(model.actuator(i).name.split("_", 2)[2], 0.0) for i in range(model.nu)])
+    return file, model.qpos0, np.zeros(model.nu), squeeze
+
+
+def run(file: Path, hand: str, qpos: np.ndarray, hold: np.ndarray, squeeze: np.ndarray) -> dict[str, np.ndarray]:
+    """Return positions, and depth, force and torque of all taxels, after each step; one hand closes, the other half as far."""
+    touch = tgdsl.compile(document(file, hand, "med", "cube"), dtype=torch.float64)
+    sim = tgdsl.simulate(touch, 2)
+    sim.batch.qpos[...] = qpos
+    steps: dict[str, list[np.ndarray]] = {"qpos": [], "depth": [], "force": [], "torque": []}
+    for step in range(STEPS):
+        part = np.clip((step - HOLD) / RAMP, 0.0, 1.0)
+        sim.step(np.stack([hold + part * (squeeze - hold), hold + part / 2 * (squeeze - hold)]))
+        readings = touch(sim.state())
+        steps["qpos"].append(sim.batch.qpos.copy())
+        steps["depth"].append(readings["depth"][..., 0].numpy().copy())
+        steps["force"].append(readings["touch"][..., :3].numpy().copy())
+        steps["torque"].append(readings["touch"][..., 3:].numpy().copy())
+    return {name: np.stack(values) for name, values in steps.items()}
+
+
+def test_twins_are_made_again_byte_for_byte():
+    files = [file.with_suffix(".usda") for file in sorted((ROOT / "robots").glob("*/*.xml"))]
+    before = [file.read_bytes() for file in files]
+    runpy.run_path(str(ROOT / "robots" / "make_usd.py"), run_name="__main__")
+    assert [file.read_bytes() for file in files] == before
+    assert max(map(len, before)) < 3_000_000
+
+
+@pytest.mark.parametrize("resolution", ["low", "med", "high"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_layouts_are_the_same(hand, resolution):
+    """The palm is what is felt: any object would do."""
+    files = [ROOT / "robots" / hand / f"{hand}_right{ending}" for ending in (".xml", ".usda")]
+    first, second = (resolve(load(document(file, hand, resolution, HANDS[hand]), None, KINDS)).layout for file in files)
+    assert set(first.groups) == {"tips", "palm", "fingers", "hand"}
+    assert [link.name for link in first.links] == [link.name for link in second.links]
+    assert first.groups == second.groups
+    np.testing.assert_array_equal(first.link_id, second.link_id)
+    np.testing.assert_allclose(second.pos, first.pos, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(second.normal, first.normal, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(second.tangent, first.tangent, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(second.radius, first.radius)
+
+
+@pytest.mark.parametrize("hand", HANDS)
+def test_a_squeeze_reads_the_same(hand, tmp_path):
+    file, qpos, hold, squeeze = scene(hand, tmp_path)
+    export_usd(file, tmp_path / "scene.usda")
+    first, second = (run(model, hand, qpos, hold, squeeze) for model in (file, tmp_path / "scene.usda"))
+    assert (first["depth"][-1] > 0).any(axis=-1).all()  # the cube is felt to the end, in both environments
+    for name, values in first.items():
+        off = np.abs(second[name] - values).max() / np.abs(values).max()
+        assert off < FULL_SCALE, f"{name} differs by {off:.1e} of {np.abs(values).max():.3g}"
+
+
+@pytest.mark.filterwarnings("ignore:.*collides the convex hull")
+def test_an_artefact_of_a_usd_robot_is_kept_and_run(tmp_path):
+    model = ROOT / "robots" / "xhand1" / "xhand1_right.usda"
+    for name in ("first", "second"):
+        touch = tgdsl.compile(document(model, "xhand1", "low", HANDS["xhand1"]))
+        tgdsl.save(touch, tmp_path / name)
+    assert (tmp_path / "first").read_bytes() == (tmp_path / "second").read_bytes()
+    readings = []
+    for own in (touch, tgdsl.load(tmp_path / "first")):
+        sim = tgdsl.simulate(own, 1)
+        sim.step(np.full(12, 0.5))
+        readings.append(own(sim.state())["depth"].numpy().copy())
+    np.testing.assert_array_equal(*readings)

@@ -1,0 +1,264 @@
+"""Environments that diverge or are given what is not finite: named, started anew by choice, and of no concern to the others."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from warp_cases import SCENE, module, warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulators.faults import BAD_CONTROL, BAD_VALUES, EnvFaults
+from tgdsl.runtime.simulators.state_values import Rows
+
+BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
+CONTROLS = np.random.default_rng(3).normal(size=(6, 2))
+PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
+SAID = r"^environments had faults and were started anew: {}; this is said once, `fault_counts` counts on$"
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log into the current folder
+
+
+def assert_same(sim, env, other, env_there, fields) -> None:
+    """Assert that two environments are alike, bit for bit."""
+    for name in ("qpos", "qvel", "ctrl"):
+        assert torch.equal(getattr(sim, name)[env], getattr(other, name)[env_there]), name
+    state, expected = sim.state(), other.state()
+    for name in fields:
+        if name != "dt":
+            assert torch.equal(getattr(state, name)[env], getattr(expected, name)[env_there]), name
+
+
+@BOTH
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_an_environment_that_diverges_is_started_anew_and_the_others_go_on(tmp_path, simulator, substeps):
+    touch, keys = module(tmp_path), {"keyframe": "home", "substeps": substeps}
+    sim, twin = simulator(touch, 4, on_fault="reset", **keys), simulator(touch, 4, **keys)
+    for i, control in enumerate(CONTROLS):
+        if i == 2:
+            sim.qvel[1, 0], sim.qpos[3, 7] = torch.nan, torch.inf
+        if i == 2:
+            with pytest.warns(UserWarning, match=SAID.format("2 diverged")):
+                sim.step(control)
+        else:
+            sim.step(control)
+        twin.step(control)
+        if i == 2:
+            twin.reset([1, 3])
+        assert sim.faults.tolist() == [False, i == 2, False, i == 2]
+        for env in range(4):
+            assert_same(sim, env, twin, env, touch.inputs.fields)
+    assert sim.fault_counts.tolist() == [0, 1, 0, 1]
+    sim.qvel[1] = torch.nan
+    sim.step()  # nothing is said a second time
+    assert sim.fault_counts.tolist() == [0, 2, 0, 1] and sim.faults.tolist() == [False, True, False, False]
+
+
+@BOTH
+def test_controls_that_are_not_finite_start_their_environment_anew(tmp_path, simulator):
+    touch = module(tmp_path)
+    sim, twin = (simulator(touch, 3, keyframe="home", **keys) for keys in ({"on_fault": "reset"}, {}))
+    good = np.random.default_rng(0).normal(size=(3, 2))
+    for one in (sim, twin):
+        one.step(good)
+    with pytest.warns(UserWarning, match=SAID.format("2 had controls that are not finite")):
+        sim.step(np.where([[True], [False], [False]], [[np.nan, 0.1]], np.where([[0], [0], [1]], np.inf, good)))
+    twin.step(good)
+    twin.reset([0, 2])
+    assert sim.faults.tolist() == [True, False, True]
+    assert torch.isfinite(sim.ctrl).all()
+    for env in range(3):
+        assert_same(sim, env, twin, env, touch.inputs.fields)
+    sim.step(np.array([np.nan, 0.0]))  # for all alike
+    assert sim.fault_counts.tolist() == [2, 1, 2]
+    for env in range(3):
+        assert_same(sim, env, simulator(touch, 1, keyframe="home"), 0, touch.inputs.fields)
+
+
+@BOTH
+def test_what_a_module_remembers_of_a_faulty_environment_is_forgotten(tmp_path, simulator):
+    noise = {"read_delay": "4 ms"}
+    touch = module(tmp_path, PRESSED, links=("table",), noise=noise)
+    other = module(tmp_path, PRESSED, links=("table",), noise=noise)
+    sim, twin = simulator(touch, 3, on_fault="reset"), simulator(other, 3)
+    for i in range(6):
+        if i == 3:
+            sim.qvel[1, 0] = torch.nan
+            with pytest.warns(UserWarning, match=SAID.format("1 diverged")):
+                sim.step()
+        else:
+            sim.step()
+        twin.step()
+        if i == 3:
+            twin.reset([1])
+        assert torch.equal(touch(sim.state())["touch"], other(twin.state())["touch"])
+    assert touch(sim.state())["touch"].any()
+
+
+SLIDER = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="table"><geom type="box" size=".05 .05 .01"/></body>
+    <body name="cube" pos="0 0 1">
+      <joint name="slide" type="slide" axis="1 0 0" damping="50"/>
+      <geom type="box" size=".02 .02 .02" mass=".25"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@BOTH
+def test_a_divergence_in_one_of_many_physics_steps_counts(tmp_path, simulator):
+    """Damping brings the speed below the limit again before the control step ends; MuJoCo on the CPU begins again by itself."""
+    touch = module(tmp_path, SLIDER, links=("table",))
+    plain, sim = warp(touch, 2), simulator(touch, 2, substeps=5, on_fault="reset")
+    plain.qvel[1] = sim.qvel[1] = 3e10
+    speeds = []
+    for _ in range(5):
+        plain._worlds.step(1)
+        speeds.append(float(plain.qvel[1]))
+    np.testing.assert_allclose(speeds, 3e10 / (1 + 0.002 * 50 / 0.25) ** np.arange(1, 6), rtol=1e-5)
+    assert speeds[0] > 1e10 > speeds[-1]
+    with pytest.warns(UserWarning, match=SAID.format("1 diverged")):
+        sim.step()
+    assert sim.fault_counts.tolist() == [0, 1] and sim.qvel.flatten().tolist() == [0, 0]
+
+
+@BOTH
+def test_in_substates_a_module_begins_one_episode_per_fault(tmp_path, simulator):
+    """Not another one at each physics step that follows: gains would be drawn anew, and delays never fill."""
+    touch = module(tmp_path, noise={"gain": [0.5, 2.0], "read_delay": "4 ms"})
+    sim = simulator(touch, 3, keyframe="home", substeps=4, on_fault="reset")
+    control = torch.zeros(3, 2, dtype=torch.float64)
+    for state in sim.substates(control):
+        touch(state)
+    control[1] = torch.nan
+    states = sim.substates(control)
+    with pytest.warns(UserWarning, match="were started anew"):
+        touch(next(states))
+    for state in states:
+        touch(state)
+    assert touch.memory.clock.get_buffer("episode").tolist() == [0, 1, 0]
+    assert touch.memory.clock.get_buffer("age").tolist() == [8, 4, 8]
+
+
+@BOTH
+def test_in_substates_an_environment_starts_anew_where_its_fault_is(tmp_path, simulator):
+    touch = module(tmp_path)
+    sim = simulator(touch, 3, keyframe="home", substeps=5, on_fault="reset")
+    fresh = simulator(touch, 1, keyframe="home")
+    start, states = fresh.state(), sim.substates()
+    next(states)
+    sim.qvel[2, 0] = torch.nan
+    with pytest.warns(UserWarning, match=SAID.format("1 diverged")):
+        state = next(states)
+    assert torch.equal(state.body_pos[2], start.body_pos[0]) and torch.isfinite(state.body_linvel).all()
+    for _ in range(3):
+        next(states)
+        fresh.step()
+        assert_same(sim, 2, fresh, 0, touch.inputs.fields)
+    assert next(states, None) is None
+    assert sim.faults.tolist() == [False, False, True]  # of the whole control step
+
+
+def test_stepping_and_reading_in_one_reads_the_new_episode(tmp_path):
+    noise = {"read_delay": "4 ms"}
+    modules = [module(tmp_path, PRESSED, noise=noise) for _ in range(2)]
+    sim, twin = (warp(touch, 3, keyframe="home", substeps=2, on_fault="reset") for touch in modules)
+    for i in range(5):
+        if i == 2:
+            sim.qvel[1, 0] = twin.qvel[1, 0] = torch.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("error" if i != 2 else "ignore")
+            found = sim.step_and_read(CONTROLS[i])["touch"]
+            twin.step(CONTROLS[i])
+        assert torch.equal(found, modules[1](twin.state())["touch"]) and torch.isfinite(found).all()
+    assert sim.fault_counts.tolist() == [0, 1, 0]
+
+
+@BOTH
+def test_faults_wait_for_a_reset_unless_they_shall_not(tmp_path, simulator):
+    touch = module(tmp_path)
+    sim = simulator(touch, 3, keyframe="home")
+    assert not sim.faults.any()
+    sim.qvel[1, 0] = torch.nan
+    for _ in range(2):  # as long as it is not reset
+        with pytest.raises(SimulationError, match=r"^environments 1 diverged.*; reset them to go on$"):
+            sim.step()
+        assert sim.faults.tolist() == [False, True, False]
+    assert sim.fault_counts.tolist() == [0, 1, 0]
+    sim.reset(sim.faults)
+    assert not sim.faults.any()
+    sim.step()
+    with pytest.raises(SimulationError, match=r"^control is not finite in environments 2$"):
+        sim.step(np.array([[0, 0], [0, 0], [0, np.nan]]))
+    assert not sim.faults.any()  # it was refused, and nothing has happened
+
+
+@BOTH
+def test_a_reset_of_faulty_environments_may_say_where_they_begin(tmp_path, simulator):
+    touch = module(tmp_path)
+    sim = simulator(touch, 3, keyframe="home", on_fault="reset")
+    sim.qvel[1, 0] = torch.nan
+    with pytest.warns(UserWarning, match="1 diverged"):
+        sim.step()
+    sim.reset(sim.faults, qvel=np.zeros((3, 8)))
+    assert sim.qvel[1].tolist() == [0.0] * 8 and sim.qvel[0].any() and not sim.faults.any()
+
+
+def test_pools_that_overflow_raise_whatever_becomes_of_faults(tmp_path):
+    sim = warp(module(tmp_path), 2, njmax=5, on_fault="reset")
+    with pytest.raises(SimulationError, match=r"^MuJoCo Warp: njmax=5 is too small in environments 0, 1"):
+        sim.step()
+    assert not sim.faults.any() and not sim.fault_counts.any()
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (BAD_CONTROL, "control is not finite in environments 1; reset them to go on"),
+        (
+            BAD_VALUES,
+            "values given for the state of environments 1 are not finite, or hold a quaternion of length 0, and were left out; "
+            "reset them to go on",
+        ),
+    ],
+)
+def test_what_a_gpu_notes_without_waiting_is_named_later(tmp_path, kind, text):
+    sim = warp(module(tmp_path), 3, keyframe="home")
+    sim._faults.note(kind, torch.tensor([False, True, False]))
+    with pytest.raises(SimulationError) as caught:
+        sim.step()
+    assert str(caught.value) == text
+
+
+def test_values_that_a_gpu_finds_bad_are_left_out(tmp_path):
+    """What the device judges, without the host: the rows that are good are set, the bad ones are noted."""
+    sim = warp(module(tmp_path), 4, keyframe="home")
+    qpos = torch.from_numpy(np.tile(sim.model.qpos0, (4, 1)))
+    qpos[0, 3:7], qpos[1, 0], qpos[3, 0] = 0.0, torch.nan, torch.nan
+    table, mask, before = sim._table, torch.tensor([True, True, True, False]), sim.qpos.clone()
+    values, bad = table._judged("qpos", qpos)
+    sim._worlds.put(mask, Rows({"qpos": values.float()}, bad.any(dim=0)))
+    assert torch.equal(sim.qpos[[0, 1, 3]], before[[0, 1, 3]])
+    np.testing.assert_allclose(sim.qpos[2], sim.model.qpos0, atol=1e-7)
+    assert sim.faults.tolist() == [True, True, False, False]
+
+
+def test_what_becomes_of_faults_is_one_of_two():
+    with pytest.raises(SimulationError, match=r'^on_fault is "rest"; did you mean "reset"\?$'):
+        EnvFaults(2, torch.device("cpu"), "rest")
+
+
+def test_simulate_hands_it_on(tmp_path):
+    sim = tgdsl.simulate(module(tmp_path), 2, on_fault="reset")
+    sim.qvel[0] = torch.nan
+    with pytest.warns(UserWarning, match="1 diverged"):
+        sim.step()

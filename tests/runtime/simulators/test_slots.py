@@ -1,0 +1,272 @@
+"""More contacts than slots: no newton is lost, and whoever reads is told, once; and numbers that are none come out as none."""
+
+import dataclasses
+import warnings
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from test_object_parts import LOAD, MODELS, RESTING, compiled, of_kinds, simulated
+from warp_cases import warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+TEN = '<body name="item" pos="0 0 .02"><freejoint/>{}</body>'.format(
+    "".join(
+        f'<geom type="box" pos="{x} {y} 0" size=".004 .004 .01" mass=".03"/>'
+        for x in (-0.02, -0.01, 0, 0.01, 0.02)
+        for y in (-0.01, 0.01)
+    )
+)
+"""Ten boxes that are one body of 0.3 kg: 40 contacts, or as many as both simulators find."""
+ONE = '<body name="item" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02" mass=".3"/></body>'
+TWO = ONE + '<body name="other" pos="0 0 .08"><freejoint/><geom type="box" size=".02 .02 .02" mass=".1"/></body>'
+ITEM = {"item": {"body": "item"}}
+
+
+def settled(touch, which="mujoco", **options):
+    sim = simulated(touch, which, substeps=250, **options)
+    sim.step()
+    return sim, sim.state()
+
+
+def test_disabled_sensors_are_refused(tmp_path):
+    """MuJoCo then fills no sensor: contacts would silently be none."""
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
+    model = tgdsl.instrument(spec, touch.inputs).compile()
+    BatchSimulation(touch, 1, model=model).close()
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+    with pytest.raises(SimulationError, match="the scene has sensors disabled, and contacts are read of sensors"):
+        BatchSimulation(touch, 1, model=model)
+
+
+def test_contacts_that_press_from_both_sides_are_warned_of_too(tmp_path):
+    """Their net force is nothing: what is not shown leaves no trace in it."""
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    _, state = settled(touch)
+    squeezed = dataclasses.replace(
+        state,
+        contact_found=torch.full_like(state.contact_found, touch.inputs.slots + 3.0),
+        contact_netforce=state.contact_force.sum(dim=2),
+    )
+    with pytest.warns(UserWarning, match=r"are more than `slots: 8`.*`slots: 11` would do"):
+        touch(squeezed)
+
+
+@pytest.mark.parametrize("which", MODELS)
+def test_more_contacts_than_slots_carry_the_whole_load(tmp_path, which):
+    """Ten boxes: with 8 slots the sum is m g, the balanced taxels press with it, and who reads is told how many slots would do."""
+    touch = compiled(tmp_path, TEN, ITEM, of_kinds(["item"]))
+    sim, state = settled(touch, which)
+    with pytest.warns(UserWarning, match=r"contacts of pad – item are more than `slots: 8`.*`slots: (\d+)` would do") as told:
+        readings = touch(state)
+    most = int(state.contact_found.max())
+    assert most > 24 and f"`slots: {most}` would do" in str(told[0].message)
+    shown = float(state.contact_force[0, 0, :, 2].sum())
+    assert shown > -0.5 * LOAD
+    net = state.contact_netforce[0, 0].to(readings["shared"].dtype)
+    assert float(net[2]) == pytest.approx(-LOAD, rel=RESTING)
+    torch.testing.assert_close(readings["shared"][0].sum(dim=0), net, rtol=1e-5, atol=1e-5 * LOAD)
+    torch.testing.assert_close(readings["shared/missed"][0, 0], torch.zeros_like(net), rtol=0, atol=1e-5 * LOAD)
+    depth = compiled(tmp_path, TEN, ITEM, {"plain": {"kind": "kinematic_taxel", "outputs": ["force"], "feels": ["item"]}})
+    plain = depth.to(touch.dtype)(state)["plain"]
+    factor = readings["balanced"].norm() / plain.norm()
+    torch.testing.assert_close(readings["balanced"], plain * factor, rtol=1e-4, atol=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        touch(state)
+        sim.step()
+        touch(sim.state())
+    enough = compiled(
+        tmp_path, TEN, ITEM, of_kinds(["item"]) | {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": most}}
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = enough(settled(enough, which)[1])
+    torch.testing.assert_close(found["balanced"].norm() / plain.norm(), factor, rtol=1e-3, atol=0)
+
+
+def made(touch, pos, force, net, found=True):
+    """Return a state of a body 1 mm in the pad, whose contacts are given [m], [N]."""
+    fields = {
+        name: torch.zeros(1, 1, touch.inputs.slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")
+    }
+    for slot, (place, push) in enumerate(zip(pos, force, strict=True)):
+        fields["pos"][0, 0, slot], fields["force"][0, 0, slot] = torch.tensor(place), torch.tensor(push)
+        fields["normal"][0, 0, slot, 2] = -1
+    rows = [[0.0, 0, 0.029] if body == "item" else [0.0, 0, 0] for body in touch.inputs.bodies]
+    num = len(rows)
+    return tgdsl.SceneState(
+        body_pos=torch.tensor([rows], dtype=torch.float64),
+        body_quat=torch.tensor([[[1.0, 0, 0, 0]] * num], dtype=torch.float64),
+        body_linvel=torch.zeros(1, num, 3, dtype=torch.float64),
+        body_angvel=torch.zeros(1, num, 3, dtype=torch.float64),
+        contact_found=torch.tensor([[found]]),
+        contact_netforce=torch.tensor([[net]], dtype=torch.float64),
+        **{f"contact_{name}": value for name, value in fields.items()},
+    )
+
+
+@pytest.mark.filterwarnings("ignore:contacts of pad")
+@pytest.mark.parametrize("which", ["double", "single", "compiled"])
+def test_what_is_lacking_acts_at_the_centre_of_what_is_shown(tmp_path, monkeypatch, which):
+    """Two contacts of 1 N and 3 N show 4 of 10 N: moment about the pad's origin as of 10 N at (3 x₂ + x₁) / 4, to 1e-5."""
+    sensors = {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 2}}
+    touch = compiled(tmp_path, ONE, ITEM, sensors, dtype=torch.float64 if which == "double" else torch.float32)
+    if which == "compiled":
+        monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+        touch.compile()
+    pos, force = [[-0.01, 0.004, 0.01], [0.012, -0.008, 0.01]], [[0.0, 0, -1], [0.5, 0, -3]]
+    net = [0.5, 1.0, -10.0]
+    readings = touch(made(touch, pos, force, net))
+    taxels = readings["shared"][0].double()
+    np.testing.assert_allclose(taxels.sum(dim=0), net, atol=1e-5 * 10)
+    assert readings["shared/missed"].abs().max() < 1e-5 * 10
+    places = np.array(touch.taxels["shared"]["pos"].tolist())
+    weight = np.linalg.norm(force, axis=1)
+    centre = weight @ np.array(pos) / weight.sum()
+    lacking = np.array(net) - np.sum(force, axis=0)
+    expected = np.cross(pos, force).sum(axis=0) + np.cross(centre, lacking)
+    moment = np.cross(places, taxels.detach().numpy()).sum(axis=0) + readings["shared/residual"][0, 0].double().numpy()
+    np.testing.assert_allclose(moment, expected, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:contacts of pad")
+def test_contacts_without_force_share_alike(tmp_path):
+    """A state that says where contacts are but not which force each has: 2 N act at their middle; nowhere at all: they are missed."""
+    touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 2}})
+    pos = [[-0.015, 0.015, 0.01], [0.015, 0.015, 0.01]]
+    taxels = touch(made(touch, pos, np.zeros((2, 3)).tolist(), [0.0, 0, -2]))["shared"][0]
+    np.testing.assert_allclose(taxels.sum(dim=0), [0, 0, -2], atol=1e-12)
+    left = torch.tensor(touch.taxels["shared"]["pos"][:, 0] < 0)
+    assert float(taxels[left, 2].sum()) == pytest.approx(-1, rel=1e-9)
+    readings = touch(made(touch, [], [], [0.0, 0, -2]))
+    assert not readings["shared"].any()
+    np.testing.assert_array_equal(readings["shared/missed"][0, 0], [0, 0, -2])
+
+
+@pytest.mark.parametrize(("found", "advice"), [(True, "more slots"), (1.0, "more slots"), (11.0, "slots: 11")])
+def test_anyones_own_state_is_looked_at_too(tmp_path, found, advice):
+    """A state of one's own that lacks force in its slots is told of; if it counts more contacts, at once, with the number."""
+    touch = compiled(tmp_path, ONE, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"], "slots": 1}})
+    whole = [0.0, 0, -1.0001] if found == 11.0 else [0.0, 0, -2]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], [0.0, 0, -1.0001], min(found, 1.0)))
+    with pytest.warns(UserWarning, match=f"pad – item are more than `slots: 1`.*`{advice}` would do"):
+        touch(made(touch, [[0.0, 0, 0.01]], [[0.0, 0, -1]], whole, found))
+
+
+def test_no_environments_lack_nothing(tmp_path):
+    touch = compiled(tmp_path, ONE, ITEM, of_kinds(["item"]))
+    assert all(len(reading) == 0 for reading in touch(touch.example_state(0)).values())
+
+
+def test_each_pair_is_told_of_once(tmp_path):
+    """Two pairs, the second later: two warnings, and then none, also for a module that is compiled."""
+    objects = {"item": {"body": "item"}, "other": {"body": "other"}}
+    touch = compiled(tmp_path, TWO, objects, {"shared": {"kind": "force_taxel", "feels": ["item", "other"], "slots": 1}})
+    state = touch.example_state(3)
+    whole = state.contact_netforce.clone()
+    for name in ("item", "other"):
+        pair = [pair.object for pair in touch.inputs.pairs].index(name)
+        whole[1, pair] += 1.0
+        with pytest.warns(UserWarning, match=f"contacts of pad – {name} are more") as told:
+            touch(dataclasses.replace(state, contact_netforce=whole))
+        assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        touch(dataclasses.replace(state, contact_netforce=2 * whole))
+
+
+def test_steps_and_reads_in_one_warn_too(tmp_path):
+    touch = compiled(tmp_path, TEN, ITEM, {"shared": {"kind": "force_taxel", "feels": ["item"]}}, dtype=torch.float32)
+    sim = warp(touch, 1, substeps=20)
+    with pytest.warns(UserWarning, match="contacts of pad – item are more than `slots: 8`"):
+        sim.step_and_read()
+
+
+# Not-a-number
+
+
+KINDS = {
+    **of_kinds(["item"]),
+    "depth": {"kind": "contact_depth", "feels": ["item"]},
+    "bit": {"kind": "contact", "feels": ["item"]},
+    "skin": {"kind": "elastomer", "feels": ["item"]},
+    "points": {"kind": "elastomer", "feels": ["item"], "anchors": "points"},
+    "open": {"kind": "contact_depth", "feels": ["item"], "gate": "geometric"},
+}
+READ = {
+    "contact_found": {"shared", "balanced", "depth", "bit", "skin", "points"},
+    "contact_netforce": {"link", "shared", "balanced"},
+    "contact_force": {"shared", "balanced"},
+    "contact_torque": {"shared"},
+    "contact_pos": {"shared"},
+    "contact_normal": {"shared", "balanced"},
+}
+"""Which sensors depend on which field."""
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory):
+    """A module with sensors of all kinds, and the state of three environments in which a body rests on the pad."""
+    touch = compiled(tmp_path_factory.mktemp("three"), ONE, ITEM, KINDS)
+    state = settled(touch, num_envs=3)[1]
+    np.testing.assert_allclose(-state.contact_netforce[:, 0, 2], LOAD, rtol=RESTING)
+    return touch, state
+
+
+@pytest.mark.parametrize("name", READ)
+def test_what_is_no_number_is_read_as_none(three, name):
+    """In one environment, in its first contact: none in what depends on it there, and everything else is what it was."""
+    touch, state = three
+    touch.reset()
+    before = {key: value.clone() for key, value in touch(state).items()}
+    assert all(before[key].any() for key in KINDS)
+    touch.reset()
+    field = getattr(state, name).clone()
+    field[(1, 0, 0, 2)[: field.ndim]] = torch.nan
+    after = touch(dataclasses.replace(state, **{name: field}))
+    for key in KINDS:
+        torch.testing.assert_close(after[key][[0, 2]], before[key][[0, 2]], rtol=0, atol=0)
+        if key in READ[name]:
+            assert after[key][1].isnan().any(), key
+            felt = before[key][1].abs().sum(dim=-1) > 0
+            assert after[key][1][felt].isnan().any(dim=-1).all(), key
+        else:
+            torch.testing.assert_close(after[key][1], before[key][1], rtol=0, atol=0)
+
+
+def test_a_force_without_a_normal_is_not_hidden(three):
+    """Nobody takes it for none: what needs the normal is not-a-number there, and all else reads what it read."""
+    touch, state = three
+    touch.reset()
+    before = {key: value.clone() for key, value in touch(state).items()}
+    touch.reset()
+    normal = state.contact_normal.clone()
+    normal[1] = 0
+    after = touch(dataclasses.replace(state, contact_normal=normal))
+    for key in KINDS:
+        torch.testing.assert_close(after[key][[0, 2]], before[key][[0, 2]], rtol=0, atol=0)
+        if key in READ["contact_normal"]:
+            assert after[key][1].isnan().any(), key
+        else:
+            torch.testing.assert_close(after[key][1], before[key][1], rtol=0, atol=0)
+
+
+def test_an_unused_slot_is_nowhere(three):
+    """Where force, torque and normal are zero, the place does not matter, whatever it is."""
+    touch, state = three
+    touch.reset()
+    before = touch(state)["shared"].clone()
+    is_used = state.contact_normal.any(dim=-1, keepdim=True)
+    assert not is_used.all()
+    for place in (1e9, torch.nan):
+        touch.reset()
+        after = touch(dataclasses.replace(state, contact_pos=torch.where(is_used, state.contact_pos, place)))
+        torch.testing.assert_close(after["shared"], before, rtol=0, atol=0)

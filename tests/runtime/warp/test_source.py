@@ -1,0 +1,225 @@
+"""MuJoCo Warp as a source like any other: through `tgdsl.simulate`, substep by substep, in rollouts and pictures."""
+
+import numpy as np
+import pytest
+import torch
+from warp_cases import SCENE, WEIGHT, module, warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.rollout import rollout
+from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.view.overview import overview
+from tgdsl.view.table import table
+from tgdsl.view.view import picture
+
+NOISE = {"white_noise": 5e-3, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "read_delay": "3 ms"}
+PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
+CONTROL = np.array([0.3, -0.2])
+
+
+# through `tgdsl.simulate`
+
+
+def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
+    touch, asked = module(tmp_path), {}
+
+    def started(self, touch, num_envs, **keys):
+        asked.update(keys, num_envs=num_envs)
+
+    monkeypatch.setattr(WarpSimulation, "__init__", started)
+    sim = tgdsl.simulate(touch, 7, device="cuda:1", substeps=5, keyframe="home", nconmax=20, njmax=90)
+    assert isinstance(sim, WarpSimulation)
+    keys = {"substeps": 5, "keyframe": "home", "nconmax": 20, "njmax": 90, "on_fault": "raise"}
+    assert asked == {"num_envs": 7, "device": "cuda:1", **keys}
+    assert isinstance(tgdsl.simulate(touch, 1, device="cpu"), BatchSimulation)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"device": "cpu", "nconmax": 8}, r'^nconmax and njmax are for physics on a GPU; on "cpu" there is always room$'),
+        ({"njmax": 8}, r"^nconmax and njmax are for physics on a GPU"),
+        ({"device": "cuda", "threads": 2}, r'^threads is 2, but only physics on "cpu" has threads, and the device is "cuda"$'),
+        ({"device": "tpu"}, r'^there is no device "tpu" to run physics on'),
+    ],
+)
+def test_arguments_for_another_device(tmp_path, keys, message):
+    with pytest.raises(SimulationError, match=message):
+        tgdsl.simulate(module(tmp_path), 1, **keys)
+
+
+# substep by substep
+
+
+def test_substates_are_those_of_single_steps(tmp_path):
+    coarse_touch, fine_touch = (module(tmp_path, PRESSED, noise=NOISE) for _ in range(2))
+    coarse, fine = warp(coarse_touch, 2, substeps=3, keyframe="home"), warp(fine_touch, 2, keyframe="home")
+    at_once = warp(module(tmp_path, PRESSED, noise=NOISE), 2, substeps=3, keyframe="home")
+    for _ in range(3):
+        states = list(coarse.substates(CONTROL))
+        assert [state.dt for state in states] == pytest.approx([0.002] * 3)
+        for state in states:
+            fine.step(CONTROL)
+            other = fine.state()
+            for name in coarse_touch.inputs.fields:
+                assert torch.equal(torch.as_tensor(getattr(state, name)), torch.as_tensor(getattr(other, name))), name
+            assert torch.equal(coarse_touch(state)["touch"], fine_touch(other)["touch"])
+        at_once.step(CONTROL)
+        for name in ("qpos", "qvel", "time", "ctrl"):
+            assert torch.equal(at_once.arrays[name], coarse.arrays[name]), name
+    assert coarse.state().dt == pytest.approx(0.006)
+
+
+def test_who_stops_early_has_made_fewer_physics_steps(tmp_path):
+    sim = warp(module(tmp_path), 2, substeps=4, keyframe="home")
+    states = sim.substates(CONTROL)
+    first = next(states)
+    kept = first.body_pos.clone()
+    next(states)
+    assert torch.equal(first.body_pos, kept) and not torch.equal(kept, sim.state().body_pos)
+    torch.testing.assert_close(sim.arrays["time"], torch.full((2,), 0.004))
+    with pytest.raises(SimulationError, match=r"^control has shape \(3,\)"):
+        next(sim.substates(np.zeros(3)))
+
+
+# stepping and reading in one
+
+
+@pytest.mark.parametrize("fields", [{"noise": NOISE}, {"history": 3}, {"noise": "noisy", "rate": "250 Hz"}])
+def test_stepping_and_reading_in_one_is_one_after_the_other(tmp_path, fields):
+    touch, other = (module(tmp_path, PRESSED, **fields) for _ in range(2))
+    sim, twin = warp(touch, 2, keyframe="home"), warp(other, 2, keyframe="home")
+    for i in range(4):
+        readings = sim.step_and_read(CONTROL)
+        twin.step(CONTROL)
+        expected = other(twin.state())
+        assert all(torch.equal(readings[name], value) for name, value in expected.items())
+        if i == 1:
+            sim.reset([1])
+            twin.reset([1])
+
+
+class Forgetful:
+    """Counts how often a graph is forgotten, in place of a `Replay`."""
+
+    def __init__(self, body):
+        self.body, self.count = body, 0
+
+    def forget(self):
+        self.count += 1
+
+    def __call__(self):
+        return self.body()
+
+
+def test_a_graph_is_captured_anew_when_the_module_holds_other_tensors_and_only_then(tmp_path):
+    touch = module(tmp_path, PRESSED, noise={"white_noise": 5e-3, "hysteresis": {"strength": 0.5, "time_constant": 0.05}})
+    sim = warp(touch, 2, substeps=2)
+    sim._step_and_read = replay = Forgetful(sim._physics_and_touch)
+
+    def forgotten() -> int:
+        before = replay.count
+        sim.step_and_read()
+        return replay.count - before
+
+    forgotten()  # what it remembers, and dt, are made during this call
+    assert [forgotten() for _ in range(3)] == [1, 0, 0]
+    sim.reset([0])
+    touch(sim.state())
+    sim.step()
+    assert forgotten() == 0
+    for state in sim.substates():
+        touch(state)  # another dt
+    assert [forgotten() for _ in range(3)] == [1, 1, 0]
+    touch.seed(3)  # written in place, where a graph reads it
+    assert [forgotten() for _ in range(2)] == [0, 0]
+    touch.free()
+    assert [forgotten() for _ in range(3)] == [1, 1, 0]
+    touch.double()
+    assert forgotten() == 1
+
+
+def test_under_inference_mode(tmp_path):
+    """As rollouts of reinforcement learning run, whose tensors elsewhere refuse to be changed in place."""
+    touch, other = (module(tmp_path, PRESSED, noise=NOISE) for _ in range(2))
+    sim, twin = warp(touch, 2), warp(other, 2)
+    with torch.inference_mode():
+        for _ in range(2):
+            inside = sim.step_and_read(torch.zeros(2))["touch"]
+        sim.reset(torch.tensor([False, True]))
+        sim.step(torch.zeros(2, 2))
+        touch(sim.state())
+    for _ in range(2):
+        outside = twin.step_and_read(torch.zeros(2))["touch"]
+    assert torch.equal(inside, outside)
+    sim.step()
+
+
+# rollouts and pictures
+
+
+def test_rollouts_tables_and_pictures(tmp_path):
+    touch = module(tmp_path, PRESSED)
+    sims = warp(touch, 2, keyframe="home"), BatchSimulation(touch, 2, keyframe="home")
+    controls = np.tile(CONTROL, (5, 1))
+    steps = [list(rollout(touch, sim, controls))[-1] for sim in sims]
+    assert steps[0].time == pytest.approx(steps[1].time)
+    torch.testing.assert_close(steps[0].readings["touch"], steps[1].readings["touch"], atol=1e-4, rtol=0)
+    assert table(touch, steps[0].readings)[2].startswith("table")
+    for draw in (picture, overview):
+        assert draw(touch, sims[0], steps[0].readings, tmp_path / "one.png", env=1).stat().st_size > 10_000
+
+
+def test_poses_of_all_bodies_are_of_the_states_instant(tmp_path):
+    touch = module(tmp_path)
+    sims = warp(touch, 2, keyframe="home"), BatchSimulation(touch, 2, keyframe="home")
+    for _ in range(2):
+        for found, expected in zip(sims[0].body_poses(1), sims[1].body_poses(1), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+        for sim in sims:
+            sim.step()
+    sims[0].reset([1])
+    assert np.abs(sims[0].body_poses(1)[0][-1] - warp(touch, 1, keyframe="home").body_poses(0)[0][-1]).max() < 1e-7
+
+
+def test_models_of_environments_have_the_objects_that_are_there(tmp_path):
+    variants = [{"type": "box", "size": [0.02, 0.02, 0.02]}, {"type": "sphere", "size": [0.015]}]
+    touch = module(tmp_path, links=("table",), target={"variants": variants})
+    sims = warp(touch, 3), BatchSimulation(touch, 3)
+    for sim in sims:
+        sim.set_objects({"cube": [1, 0]}, env_ids=[2, 1])  # in any order, each with its own
+    for env, number in enumerate((0, 0, 1)):
+        models = [sim.env_model(env) for sim in sims]
+        np.testing.assert_array_equal(models[0].geom_rgba, models[1].geom_rgba)
+        for i in range(2):
+            assert (models[0].geom(f"tgdsl/cube/{i}").rgba[3] > 0) == (number == i)
+        assert [int(sim.state().variant[env, 0]) for sim in sims] == [number, number]
+
+
+# a run of 200 steps
+
+
+def weighed(sim, touch) -> tuple[float, float]:
+    """Return the mean force on the table [N] and the cube's height [m] over the last 50 of 200 control steps."""
+    pair = [(pair.link, pair.object) for pair in touch.inputs.pairs].index(("table", "cube"))
+    forces, heights = [], []
+    for i in range(200):
+        sim.step()
+        if i >= 150:
+            state = sim.state()
+            forces.append(float(state.contact_netforce[:, pair, 2].mean()))
+            heights.append(float(state.body_pos[:, touch.inputs.bodies.index("cube"), 2].mean()))
+    return float(np.mean(forces)), float(np.mean(heights))
+
+
+def test_two_hundred_steps_of_a_resting_cube(tmp_path):
+    """Newton: it presses with its weight; and it lies as deep as on the CPU."""
+    touch = module(tmp_path, PRESSED, links=("table",), kind="link_contact")
+    (force, height), (expected_force, expected_height) = (
+        weighed(sim, touch) for sim in (warp(touch, 2), BatchSimulation(touch, 2))
+    )
+    assert force == pytest.approx(-WEIGHT, rel=1e-4)
+    assert expected_force == pytest.approx(-WEIGHT, rel=1e-5)
+    assert height == pytest.approx(expected_height, abs=1e-7)

@@ -1,0 +1,449 @@
+"""MuJoCo Warp on its CPU device against MuJoCo's batch on the same states, and against Newton.
+
+What one state gives is float32 on one side, float64 on the other: poses and velocities agree to a few roundings. Forces follow
+from depths of some micrometres below positions of some centimetres, and from a solver: at rest they agree as well, in motion
+to less.
+"""
+
+import copy
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import trimesh
+from warp_cases import (
+    MOVING_FORCE,
+    SCENE,
+    TOLERANCE,
+    WEIGHT,
+    assert_agree,
+    hand_over,
+    module,
+    pushed,
+    wanting_contacts,
+    warp,
+)
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.runtime.warp.lane import Lane, Replay
+from tgdsl.runtime.warp.worlds import constraint_rows
+
+# the same readings as on the CPU
+
+
+def test_one_state_gives_the_readings_of_the_cpu(tmp_path):
+    touch, model = wanting_contacts(tmp_path)
+    sim, cpu = warp(touch, 6, model=model, keyframe="home"), BatchSimulation(touch, 6, model=model, keyframe="home")
+    assert_agree(sim.state(), cpu.state(), touch.inputs.fields)
+    sim.warp_model.opt.tolerance.fill_(model.opt.tolerance)  # mujoco_warp's own is 100 times MuJoCo's
+    pushed(sim, 0)
+    num_found = 0
+    for i in range(40):
+        hand_over(sim, cpu)
+        control = np.random.default_rng(i).normal(size=(6, 2))
+        sim.step(control)
+        cpu.step(control)
+        state, other = sim.state(), cpu.state()
+        assert_agree(state, other, touch.inputs.fields, MOVING_FORCE)
+        found, expected = touch(state)["touch"], touch(other)["touch"]
+        scale = expected.abs().amax((0, 1)) + 1e-12
+        assert ((found - expected).abs().amax((0, 1)) <= TOLERANCE * scale).all()
+        num_found += int((expected != 0).any())
+    assert num_found > 20
+
+
+def test_poses_and_contacts_are_those_at_the_start_of_the_last_substep(tmp_path):
+    touch, model = wanting_contacts(tmp_path)
+    keys = {"model": model, "keyframe": "home", "substeps": 4}
+    sim, cpu = warp(touch, 2, **keys), BatchSimulation(touch, 2, **keys)
+    sim.warp_model.opt.tolerance.fill_(model.opt.tolerance)
+    sim.step()
+    cpu.step()
+    state, cube = sim.state(), touch.inputs.bodies.index("cube")
+    assert_agree(state, cpu.state(), touch.inputs.fields, MOVING_FORCE)
+    assert (sim.arrays["qpos"][:, :3] - state.body_pos[:, cube]).abs().max() > 1e-4  # `qpos` is one substep further
+    assert sim.control_step == pytest.approx(0.008)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "times"), [("", 0), ('<jointpos joint="one"/>', 1), ('<jointpos joint="one" nsample="2" delay=".002"/>', 4)]
+)
+def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor, times):
+    """Sensors are read after the last substep alone; one that remembers earlier steps needs them all, and ours need none."""
+    touch = module(tmp_path)
+    spec = mujoco.MjSpec.from_string(SCENE.replace("</mujoco>", f"<sensor>{sensor}</sensor></mujoco>"))
+    tgdsl.instrument(spec, touch.inputs)
+    sim = warp(touch, 2, model=spec.compile(), keyframe="home", substeps=4)
+    plain_step, flags = sim._worlds._mjw.step, []
+
+    def step(model, data):
+        flags.append(model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR))
+        plain_step(model, data)
+
+    monkeypatch.setattr(sim._worlds._mjw, "step", step)
+    sim.step()
+    assert [bool(flag) for flag in flags] == [times < 4] * 3 + [times < 1]
+    assert bool(sim.warp_model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SENSOR)) == (times < 1)
+    assert (sim.state().contact_found > 0).any()
+
+
+def test_a_resting_cube_weighs_what_it_weighs(tmp_path):
+    touch, model = wanting_contacts(tmp_path)
+    sim = warp(touch, 2, model=model, substeps=200)
+    for _ in range(3):
+        sim.step()
+    state = sim.state()
+    pair = [(pair.link, pair.object) for pair in touch.inputs.pairs].index(("table", "cube"))
+    expected = torch.tensor([0, 0, -WEIGHT]).expand(2, 3)
+    torch.testing.assert_close(state.contact_netforce[:, pair], expected, atol=1e-4, rtol=0)
+    torch.testing.assert_close(state.contact_force[:, pair].sum(dim=1), expected, atol=1e-4, rtol=0)
+    assert state.contact_netforce.dtype == torch.float32
+
+
+def test_stepping_and_reading_in_one(tmp_path):
+    text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
+    modules = [module(tmp_path, text, kind="contact", threshold=1e-3, release_threshold=5e-4) for _ in range(2)]
+    sim, twin = (warp(touch, 2, substeps=2) for touch in modules)
+    seen = []
+    for _ in range(3):
+        readings = sim.step_and_read(np.array([0.3, -0.2]))
+        twin.step(np.array([0.3, -0.2]))
+        torch.testing.assert_close(readings["touch"], modules[1](twin.state())["touch"], atol=0, rtol=0)
+        seen.append(bool(readings["touch"].any()))
+    assert seen[0]
+
+
+class PretendedGpu(Lane):
+    """A lane that captures: its replays are counted and do nothing."""
+
+    def __init__(self):
+        super().__init__("cpu")
+        self.is_captured, self.captures, self.replays = True, 0, 0
+
+    def capture(self, body):
+        self.captures += 1
+        return None, body()
+
+    def replay(self, graph):
+        self.replays += 1
+
+
+def test_work_is_captured_at_its_third_call_and_then_replayed():
+    lane, calls = PretendedGpu(), []
+    replay = Replay(lane, lambda: calls.append(0) or len(calls))
+    assert [replay() for _ in range(5)] == [1, 2, 3, 3, 3]
+    assert (lane.captures, lane.replays) == (1, 3)
+    replay.forget()
+    assert [replay() for _ in range(3)] == [4, 5, 6]
+    assert (lane.captures, lane.replays) == (2, 4)
+
+
+@pytest.mark.slow
+def test_a_cube_at_rest_and_squeezed_fares_as_on_the_cpu():
+    """200 control steps of their own on either side: 1,000 physics steps from float32 and from float64."""
+    touch = tgdsl.compile(Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml")
+    keys = {"substeps": 5, "keyframe": "rest"}
+    modules = touch, copy.deepcopy(touch)
+    sims = warp(modules[0], 4, **keys), BatchSimulation(modules[1], 4, **keys)
+    rest, squeeze = (sims[0].model.key(name).ctrl for name in ("rest", "squeeze"))
+    strength, cube = np.array([[0.0], [0.8], [1.0], [1.1]]), touch.inputs.bodies.index("cube")
+    forces, heights = ([[], []] for _ in range(2))
+    for i in range(200):
+        for which, sim in enumerate(sims):
+            sim.step(rest + (squeeze - rest) * strength * min(1.0, i / 100))
+            if i >= 150:
+                state = sim.state()
+                forces[which].append(modules[which](state)["touch"][..., :3].norm(dim=-1).sum(dim=1))
+                heights[which].append(state.body_pos[:, cube, 2].double())
+    force, expected = (torch.stack(own).mean(dim=0) for own in forces)
+    assert expected.min() > 5 and (expected[1:] - expected[0]).abs().max() > 0.5
+    torch.testing.assert_close(force, expected, rtol=0.01, atol=0)
+    torch.testing.assert_close(torch.stack(heights[0]).mean(0), torch.stack(heights[1]).mean(0), rtol=0, atol=1e-4)
+
+
+# resetting
+
+
+def test_reset_starts_the_named_environments_and_no_others(tmp_path):
+    touch, model = wanting_contacts(tmp_path)
+    sims = [warp(touch, 4, model=model, keyframe="home") for _ in range(2)]
+    start = sims[0].state()
+    for sim in sims:
+        pushed(sim, 1)
+        for _ in range(5):
+            sim.step(np.array([0.2, -0.3]))
+    before = sims[0].state()
+    sims[0].reset(torch.tensor([False, True, False, True]))
+    after = sims[0].state()
+    for name in touch.inputs.fields:
+        found = getattr(after, name)
+        torch.testing.assert_close(found[[0, 2]], getattr(before, name)[[0, 2]], atol=0, rtol=0, msg=name)
+        torch.testing.assert_close(found[[1, 3]], getattr(start, name)[[1, 3]], atol=1e-6, rtol=1e-6, msg=name)
+    assert (before.body_pos - start.body_pos).abs().amax(dim=(1, 2)).min() > 1e-3
+    torch.testing.assert_close(sims[0].arrays["ctrl"][1], torch.tensor([0.1, -0.1]))
+    for sim in sims:
+        sim.step()
+    for name in ("qpos", "qvel"):  # and the others go on as if nothing had been
+        torch.testing.assert_close(sims[0].arrays[name][[0, 2]], sims[1].arrays[name][[0, 2]], atol=0, rtol=0)
+
+
+def test_reset_reaches_the_module_and_knows_its_environments(tmp_path):
+    text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')
+    touch = module(tmp_path, text, links=("table",), kind="contact", threshold=1e-3, release_threshold=5e-4)
+    sim = warp(touch, 3)
+    assert touch(sim.state())["touch"].all()
+    sim.reset([1])
+    bits = touch.memory.get_buffer("touch:bit")
+    assert bits[:, 0].tolist() == [1, 0, 1]
+    sim.reset(np.zeros(3, dtype=bool))
+    sim.reset([])
+    assert bits[:, 0].tolist() == [1, 0, 1]
+    sim.reset()
+    assert not bits.any()
+    for ids in ([3], [-1], [True, False], np.array([0.5])):
+        with pytest.raises(SimulationError, match=r"^env_ids: found .*, expected indices from 0 to 2, or a mask of 3$"):
+            sim.reset(ids)
+
+
+# what goes wrong
+
+
+def test_a_pool_that_is_too_small_is_named(tmp_path):
+    touch = module(tmp_path)
+    with pytest.raises(SimulationError, match=r"^MuJoCo Warp: nconmax=1 is too small: .* num_envs is 2$"):
+        warp(touch, 2, nconmax=1, njmax=64).step()
+    sim = warp(touch, 2, njmax=5)
+    with pytest.raises(SimulationError) as caught:
+        sim.step()
+    assert str(caught.value) == (
+        "MuJoCo Warp: njmax=5 is too small in environments 0, 1: constraints are left out, 12 were wanted last"
+    )
+    with pytest.raises(SimulationError, match=r"^MuJoCo Warp: njmax=5"):
+        sim.check()
+    sim.arrays["qpos"][0, 2] = 1.0
+    sim.reset([1])
+    with pytest.raises(SimulationError, match=r"^MuJoCo Warp: njmax=5 is too small in environments 0: "):
+        sim.check()
+    sim.reset()
+    sim.arrays["qpos"][:, 2] = 1.0
+    sim.step()
+    sim.check()
+
+
+def test_the_default_has_room_for_all_contacts(tmp_path):
+    touch = module(tmp_path)
+    sim = warp(touch, 2)
+    assert constraint_rows(sim.model, 4) == 4 * 3  # elliptic: one row per dimension
+    data = mujoco.MjData(sim.model)
+    mujoco.mj_forward(sim.model, data)
+    assert (data.ncon, data.nefc) == (4, constraint_rows(sim.model, 4))
+    assert sim.warp_data.njmax == constraint_rows(sim.model, 48)
+
+
+def test_a_diverging_environment_is_reported(tmp_path):
+    touch = module(tmp_path)
+    sim, twin = warp(touch, 3, keyframe="home"), warp(touch, 3, keyframe="home")
+    sim.arrays["qvel"][1, 0] = torch.nan
+    with pytest.raises(SimulationError) as caught:
+        sim.step()
+    assert str(caught.value) == "environments 1 diverged; reset them to go on"
+    sim.reset([1])
+    sim.step()
+    assert torch.isfinite(sim.arrays["qpos"]).all() and torch.isfinite(sim.state().body_linvel).all()
+    twin.step()
+    torch.testing.assert_close(sim.arrays["qpos"][1], twin.arrays["qpos"][1], atol=0, rtol=0)
+    twin.step()
+    torch.testing.assert_close(sim.arrays["qpos"][[0, 2]], twin.arrays["qpos"][[0, 2]], atol=0, rtol=0)
+
+
+def test_controls(tmp_path):
+    sim = warp(module(tmp_path), 3, keyframe="home")
+    before = sim.arrays["qpos"].clone()
+    for control in (np.zeros(3), np.zeros((2, 2)), np.zeros((3, 1)), np.zeros((1, 3, 2)), np.asarray(1.0)):
+        with pytest.raises(SimulationError) as caught:
+            sim.step(control)
+        assert str(caught.value) == f"control has shape {np.shape(control)}, expected (3, 2) or (2,)"
+    with pytest.raises(SimulationError, match=r"^control is not finite in environments 0, 2$"):
+        sim.step(torch.tensor([[0.0, torch.nan], [1, 1], [torch.inf, 0]]))
+    torch.testing.assert_close(sim.arrays["qpos"], before, atol=0, rtol=0)
+    sim.step(np.array([0.1, 0.2]))
+    torch.testing.assert_close(sim.arrays["ctrl"], torch.tensor([[0.1, 0.2]] * 3))
+    sim.step(torch.arange(6, dtype=torch.float32, requires_grad=True).reshape(3, 2))
+    sim.step()
+    assert sim.arrays["ctrl"].tolist() == [[0, 1], [2, 3], [4, 5]]
+    torch.testing.assert_close(sim.arrays["time"], torch.full((3,), 3 * 0.002))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"keyframe": "hme"}, r'^the scene has no keyframe "hme"; did you mean "home"\?$'),
+        ({"substeps": 0}, r"^num_envs is 2 and substeps 0, expected at least 1 of each$"),
+        ({"per_env": ["geom_type"]}, r"^MuJoCo Warp: Model field 'geom_type' is not a batched array field\.$"),
+        ({"device": "gpu"}, r'^there is no device "gpu" to run physics on'),
+        ({"device": "meta"}, r'^physics on "meta" is not supported, expected "cuda" or "cpu"$'),
+    ],
+)
+def test_what_cannot_be_simulated_is_refused_by_name(tmp_path, keys, message):
+    with pytest.raises(SimulationError, match=message):
+        WarpSimulation(module(tmp_path), 2, **{"device": "cpu", **keys})
+
+
+def test_a_model_of_your_own_needs_what_the_module_wants(tmp_path):
+    touch = module(tmp_path)
+    sims = warp(touch, 1), warp(touch, 1, model=mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
+    assert (sims[0].model.nsensor, sims[1].model.nsensor) == (2, 0)
+    for name in touch.inputs.fields:
+        assert torch.equal(*(getattr(sim.state(), name) for sim in sims))
+    with pytest.raises(SimulationError, match=r'^the scene has no body "cube"; did you mean "cub"\?$'):
+        warp(touch, 1, model=mujoco.MjModel.from_xml_string("<mujoco><worldbody><body name='cub'/></worldbody></mujoco>"))
+    with pytest.raises(SimulationError, match=r"^no object of this module differs between environments$"):
+        warp(touch, 1).set_objects({"cube": 0})
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ('<option integrator="RK4"/>', r"^with the integrator RK4 MuJoCo's poses and contacts are of two instants"),
+        ('<option><flag sleep="enable"/></option>', r"^bodies that sleep are not supported"),
+    ],
+)
+def test_what_would_mix_instants_is_refused(tmp_path, option, message):
+    touch = module(tmp_path, SCENE.replace("<worldbody>", option + "<worldbody>").replace(' integrator="implicitfast"', ""))
+    with pytest.raises(SimulationError, match=message):
+        warp(touch, 1)
+
+
+def test_without_mujoco_warp(tmp_path, monkeypatch):
+    touch = module(tmp_path)
+    monkeypatch.setitem(sys.modules, "mujoco_warp", None)
+    with pytest.raises(SimulationError, match=r'^physics on a GPU needs MuJoCo Warp: pip install "tgdsl\[gpu\]"$'):
+        warp(touch, 1)
+
+
+# environments that differ
+
+VARIANTS = [
+    {"type": "box", "size": [0.02, 0.015, 0.01]},
+    {"type": "sphere", "size": [0.015], "pos": [0.004, 0, 0]},
+    {"type": "box", "size": [0.01, 0.02, 0.02]},
+    {"geoms": [{"type": "sphere", "size": [0.012], "pos": [0, 0, 0.02]}, {"type": "box", "size": [0.01, 0.01, 0.015]}]},
+]
+ITEMS = """
+<mujoco>
+  <option timestep="0.002" cone="elliptic" impratio="10" integrator="implicitfast"/>
+  <worldbody>
+    <body name="table"><geom type="box" size=".2 .2 .01"/></body>
+    <geom type="plane" size="1 1 .1" pos="0 0 -.1"/>
+    <body name="first" pos="0 0 .0297"><freejoint/><geom size=".01"/></body>
+    <body name="second" pos=".005 0 .0803"><freejoint/><geom size=".01"/></body>
+    <body name="rod" pos="-.1 0 .0198"><freejoint/><geom type="box" size=".01 .02 .01"/></body>
+    <body name="post" pos="-.5 0 0" euler="0 0 30"><geom size=".01"/></body>
+    <body name="finger" pos="-.5 0 .0695"><freejoint/><geom size=".02"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def items(folder) -> TactileModule:
+    """Return a module of two objects with variants and one with a size, on a table, and a post that is not the same either."""
+    (folder / "items.xml").write_text(ITEMS)
+    points = [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.005}]
+    feels = ["first", "second", "rod"]
+    posts = [{"type": "box", "size": [0.03, 0.02, 0.05]}, {"type": "box", "size": [0.02, 0.02, 0.02], "pos": [0.005, 0, 0.03]}]
+    document = {
+        "tgdsl": 1,
+        "robot": {
+            "model": str(folder / "items.xml"),
+            "layout": {"resolutions": {"only": {link: {"method": "points", "points": points} for link in ("table", "finger")}}},
+        },
+        "objects": {
+            "first": {"body": "first", "variants": VARIANTS},
+            "second": {"body": "second", "variants": VARIANTS[::-1]},
+            "rod": {"body": "rod", "size": "per_env"},
+            "post": {"body": "post", "variants": posts},
+        },
+        "sensors": {
+            "touch": {"kind": "kinematic_taxel", "links": "table", "feels": feels},
+            "force": {"kind": "link_contact", "links": "table", "feels": feels},
+            "tip": {"kind": "link_contact", "links": "finger", "feels": ["post"]},
+        },
+    }
+    return tgdsl.compile(document)
+
+
+@pytest.mark.slow
+def test_environments_with_objects_of_their_own_are_those_of_the_cpu(tmp_path):
+    """Each environment against MuJoCo with a model compiled for it alone; geoms that it lacks must meet nothing at all."""
+    touch = items(tmp_path)
+    sim, cpu = warp(touch, 8), BatchSimulation(touch, 8)
+    sim.warp_model.opt.tolerance.fill_(sim.model.opt.tolerance)
+    rng = np.random.default_rng(2)
+    pairs = [pair.object for pair in touch.inputs.pairs]
+    num_touching = torch.zeros(8, len(pairs))
+    for attempt in range(3):
+        if attempt:
+            choice = {"first": rng.integers(4, size=4), "second": rng.integers(4, size=4)}
+            sizes = {"rod": rng.uniform(0.01, 0.03, size=(4, 3))}
+            ids = np.sort(rng.permutation(8)[:4])
+            cpu.set_objects(choice, sizes, ids)
+            sim.set_objects({k: v[::-1] for k, v in choice.items()}, {k: v[::-1] for k, v in sizes.items()}, ids[::-1].copy())
+        for name in ("body_mass", "body_inertia", "geom_size"):
+            expected = [getattr(cpu.batch.get_model(env), name) for env in range(8)]
+            np.testing.assert_allclose(sim.parameters[name], expected, rtol=1e-6, atol=1e-12, err_msg=name)
+        for _ in range(60):
+            hand_over(sim, cpu)
+            sim.step()
+            cpu.step()
+            state = sim.state()
+            assert_agree(state, cpu.state(), touch.inputs.fields, MOVING_FORCE)
+            num_touching += state.contact_found > 0
+    assert num_touching[:, [pairs.index("first"), pairs.index("rod"), pairs.index("post")]].min() > 0
+    assert num_touching[:, pairs.index("second")].any()
+
+
+@pytest.mark.slow
+def test_meshes_among_the_variants(tmp_path):
+    """MuJoCo makes hulls of meshes in use alone: all environments need those of all."""
+    trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation([0.01, 0.02, 0.02]).export(tmp_path / "ball.stl")
+    trimesh.creation.box(extents=[0.05, 0.03, 0.06]).apply_translation([0, 0.01, 0]).export(tmp_path / "brick.stl")
+    variants = [
+        {"mesh": str(tmp_path / "ball.stl")},
+        {"type": "box", "size": [0.02, 0.02, 0.02]},
+        {"mesh": str(tmp_path / "brick.stl"), "pos": [0.002, 0, 0.01]},
+        {"mesh": str(tmp_path / "ball.stl"), "scale": 0.5},
+    ]
+    text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .06"')
+    touch = module(tmp_path, text, links=("table",), target={"variants": variants, "tolerance": 2e-4})
+    sim, cpu = warp(touch, 8), BatchSimulation(touch, 8)
+    sim.warp_model.opt.tolerance.fill_(sim.model.opt.tolerance)
+    num_touching = torch.zeros(8, 1)
+    for _ in range(200):
+        hand_over(sim, cpu)
+        sim.step()
+        cpu.step()
+        state = sim.state()
+        assert_agree(state, cpu.state(), touch.inputs.fields)
+        num_touching += state.contact_found > 0
+    assert num_touching.min() > 50
+
+
+@pytest.mark.slow
+def test_fields_of_the_model_that_environments_have_of_their_own(tmp_path):
+    """Coulomb: a cube that slides on friction μ loses μ g of its speed per second."""
+    touch = module(tmp_path, SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .03"').replace('impratio="10"', 'impratio="100"'))
+    sim = warp(touch, 2, per_env=["geom_friction"], substeps=50)
+    friction = torch.tensor([0.05, 0.2])
+    sim.parameters["geom_friction"][:, :, 0] = friction[:, None]
+    sim.step()
+    sim.arrays["qvel"][:, 0] = 0.3
+    sim.step()
+    lost = 0.3 - sim.arrays["qvel"][:, 0]
+    torch.testing.assert_close(lost, friction * 9.81 * 50 * 0.002, rtol=0.02, atol=0)

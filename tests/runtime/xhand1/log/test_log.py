@@ -1,0 +1,321 @@
+"""Logs: what was written comes back bit for bit, or as an error that says what is wrong with the file."""
+
+import io
+import json
+import tracemalloc
+import zipfile
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hand_logs import assert_same_reading, random_readings, write_log
+from xhand1_hands import Stamps
+
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.identity import HandIdentity
+from tgdsl.runtime.xhand1.log.log import CHUNK, RECORD, STATE, Fault, LogError, open_log
+from tgdsl.runtime.xhand1.log.record import LogWriter, events
+from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.wire import errors
+from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandError, HandTimeoutError
+from tgdsl.runtime.xhand1.wire.payloads import STATE_SIZE
+
+IDENTITY = HandIdentity("/dev/ttyUSB7", 3, b"\x01\xff", None, b"SN-1\0\0", b"")
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """More readings than are in memory at a time, and their log."""
+    readings = random_readings(1e5 + 0.0084 * np.arange(2 * CHUNK + 7))
+    return readings, write_log(tmp_path_factory.mktemp("log") / "hand.npz", readings)
+
+
+def test_readings_come_back_bit_for_bit(logged):
+    readings, path = logged
+    log = open_log(path)
+    found = list(log.readings())
+    assert log.num_readings == len(found) == len(readings)
+    for one, other in zip(found, readings, strict=True):
+        assert_same_reading(one, other)
+    assert log.seconds == pytest.approx(0.0084 * (len(readings) - 1))
+    assert log.faults == ()
+    assert (log.identity, log.calibration) == (None, None)
+
+
+@pytest.mark.parametrize("start", [1, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 6, 2 * CHUNK + 7])
+def test_readings_from_anywhere(logged, start):
+    readings, path = logged
+    for one, other in zip(open_log(path).readings(start), readings[start:], strict=True):
+        assert_same_reading(one, other)
+
+
+def test_a_log_is_plain_numpy(logged):
+    readings, path = logged
+    with np.load(path) as archive:
+        assert set(archive.files) == {*RECORD.names, "about", "fault_time", "fault_kind", "fault_message", "fault_reading"}
+        for name in STATE:
+            assert (archive[name] == np.stack([getattr(reading.state, name) for reading in readings])).all()
+        assert archive["received_at"].tolist() == [reading.received_at for reading in readings]
+    assert (open_log(path).column("total_force") == np.stack([r.state.total_force for r in readings])).all()
+
+
+def test_a_record_holds_every_byte_of_the_wire():
+    """Forces take two bytes here and one on the wire; all else takes what it takes there."""
+    wide = sum(RECORD[name].itemsize // 2 for name in ("total_force", "taxel_force"))
+    assert sum(RECORD[name].itemsize for name in STATE) - wide == STATE_SIZE
+
+
+def test_whose_and_what_and_what_went_wrong(tmp_path):
+    rng = np.random.default_rng(1)
+    rotation = np.linalg.qr(rng.normal(size=(5, 3, 3)))[0]
+    calibration = Calibration(
+        "N", rng.uniform(0.1, 1, (5, 3)), rotation, rng.normal(size=(5, 3)), rng.normal(size=(5, 3)), "it's"
+    )
+    faults = (Fault.of(HandTimeoutError("no reply — 30 ms"), 1.05), Fault.of(errors.StaleReadingError("old"), 1.13))
+    path = write_log(
+        tmp_path / "a.npz", random_readings(np.array([1.0, 1.2])), faults, identity=IDENTITY, calibration=calibration
+    )
+    log = open_log(path)
+    assert (log.identity, log.faults) == (IDENTITY, faults)
+    assert log.fault_reading.tolist() == [1, 1]
+    assert log.calibration is not None
+    assert (log.calibration.units, log.calibration.hand) == ("N", "it's")
+    for name in ("scale", "rotation", "bias", "tare"):
+        assert (getattr(log.calibration, name) == getattr(calibration, name)).all()
+    assert [type(fault.error()) for fault in log.faults] == [HandTimeoutError, errors.StaleReadingError]
+    assert str(log.faults[0].error()) == "no reply — 30 ms"
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"), [("NewError", "NewError: x"), ("TgdslError", "TgdslError: x"), ("annotations", "annotations: x")]
+)
+def test_a_failure_of_a_class_that_is_not_known_here(kind, says):
+    found = Fault(0.0, kind, "x").error()
+    assert (type(found), str(found)) == (HandError, says)
+
+
+# writing
+
+
+def test_a_log_appears_whole_and_at_the_end(tmp_path):
+    path, readings = tmp_path / "a.npz", random_readings(np.array([1.0, 1.1]))
+    path.write_text("older")
+    with LogWriter(path) as log:
+        log.add(readings[0])
+        assert path.read_text() == "older"
+    assert open_log(path).num_readings == 1
+    with pytest.raises(LogError, match="this log is closed"):
+        log.add(readings[1])
+    log.close()
+    assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_what_came_before_a_failure_is_kept(tmp_path):
+    def fail(path, readings) -> None:
+        with LogWriter(path) as log:
+            for reading in readings:
+                log.add(reading)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail(tmp_path / "a.npz", random_readings(np.array([1.0])))
+    assert open_log(tmp_path / "a.npz").num_readings == 1
+    with pytest.raises(ZeroDivisionError):
+        fail(tmp_path / "b.npz", [])
+    assert not (tmp_path / "b.npz").exists()
+
+
+def test_an_empty_log_and_a_disk_that_fails_leave_nothing(tmp_path, monkeypatch):
+    with pytest.raises(LogError, match="not one reading came, so nothing was written"), LogWriter(tmp_path / "a.npz") as log:
+        log.add(Fault(1.0, "HandTimeoutError", "x"))
+    monkeypatch.setattr("os.fsync", lambda file: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(OSError, match="No space left"), LogWriter(tmp_path / "a.npz") as log:
+        log.add(random_readings(np.array([1.0]))[0])
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_not_newer_is_refused(tmp_path):
+    first, second = random_readings(np.array([1.0, 1.1]))
+    with LogWriter(tmp_path / "a.npz") as log:
+        log.add(second)
+        for wrong in (second, first, Reading(99, 0.9, 1.05, first.state)):
+            with pytest.raises(LogError, match=f"reading {wrong.sequence} is not newer than reading 12"):
+                log.add(wrong)
+        log.add(Fault(2.0, "HandError", "x"))
+        with pytest.raises(LogError, match=r"a failure at 1\.9 s after one at 2\.0 s"):
+            log.add(Fault(1.9, "HandError", "x"))
+        assert (log.num_readings, log.num_faults) == (1, 1)
+
+
+def test_a_long_log_takes_little_memory(tmp_path):
+    """10 MB of readings; what is in memory at a time is a few chunks of 1 MB."""
+    reading = random_readings(np.array([1.0]))[0]
+    tracemalloc.start()
+    try:
+        with LogWriter(tmp_path / "a.npz") as log:
+            for i in range(2500):
+                log.add(Reading(i, 0.01 * i, 0.01 * i, reading.state))
+        found = sum(1 for _ in open_log(tmp_path / "a.npz").readings())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert found == 2500
+    assert peak < 5e6
+
+
+# files that are not what they should be
+
+
+def small(tmp_path) -> bytes:
+    return write_log(
+        tmp_path / "small.npz", random_readings(np.array([1.0, 1.1, 1.2])), (Fault(1.15, "HandError", "x"),)
+    ).read_bytes()
+
+
+def test_a_log_that_was_cut(tmp_path):
+    whole = small(tmp_path)
+    for end in [0, 1, 10, *range(100, len(whole), 997), len(whole) - 1]:
+        (tmp_path / "cut.npz").write_bytes(whole[:end])
+        with pytest.raises(LogError, match=r"cut\.npz: this log is damaged, cut, or no \.npz file: "):
+            open_log(tmp_path / "cut.npz")
+
+
+def test_a_changed_byte_is_seen_or_means_nothing(tmp_path):
+    whole, expected, rng = bytearray(small(tmp_path)), random_readings(np.array([1.0, 1.1, 1.2])), np.random.default_rng(3)
+    refused = 0
+    for place in rng.choice(len(whole), 400, replace=False):
+        before = whole[place]
+        whole[place] ^= int(rng.integers(1, 256))
+        (tmp_path / "changed.npz").write_bytes(whole)
+        whole[place] = before
+        try:
+            found = list(open_log(tmp_path / "changed.npz").readings())
+        except LogError:
+            refused += 1
+            continue
+        for one, other in zip(found, expected, strict=True):
+            assert_same_reading(one, other)
+    assert refused > 300
+
+
+def rewritten(tmp_path, name: str, change) -> LogError:
+    """Return what is said of a log in which one array was changed."""
+    small(tmp_path)
+    with np.load(tmp_path / "small.npz") as archive:
+        arrays = dict(archive)
+    changed = change(arrays[name])
+    arrays.update({name: changed} if changed is not None else {})
+    if changed is None:
+        del arrays[name]
+    np.savez(tmp_path / "x.npz", **arrays)
+    with pytest.raises(LogError) as caught:
+        open_log(tmp_path / "x.npz")
+    return caught.value
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("about", lambda a: None, "no log of `tgdsl hand record`: this .npz file has no array `about`"),
+        ("about", lambda a: np.array(json.dumps(json.loads(str(a)) | {"format": 2})), "a log of format 2, this version of tgdsl reads format 1"),
+        ("about", lambda a: np.array("{"), "damaged, cut, or no .npz file: Expecting property name"),
+        ("about", lambda a: np.array("[]"), "damaged, cut, or no .npz file: "),
+        ("position", lambda a: None, "There is no item named 'position.npy'"),
+        ("position", lambda a: a.astype(np.float64), "position is float64 of shape (3, 12), expected float32 of shape (reading, 12,)"),
+        ("total_force", lambda a: a[:, :4], "total_force is int16 of shape (3, 4, 3), expected int16 of shape (reading, 5, 3)"),
+        ("taxel_force", lambda a: a[:2], "2 rows in taxel_force, but 3 in sequence"),
+        ("sequence", lambda a: a[::-1], "its times do not go forward"),
+        ("received_at", lambda a: np.array([1.0, 1.1, np.nan]), "its times do not go forward"),
+        ("requested_at", lambda a: a + 1, "its times do not go forward"),
+        ("fault_kind", lambda a: a[:0], "damaged"),
+        ("fault_reading", lambda a: a + 2, "its times do not go forward"),
+        ("fault_reading", lambda a: a[:0], "fault_reading is int64 of shape (0,), expected int64 of shape (1,)"),
+    ],
+)  # fmt: skip
+def test_arrays_that_are_not_a_log_s(tmp_path, name, change, says):
+    assert says in str(rewritten(tmp_path, name, change))
+
+
+def test_an_array_without_rows(tmp_path):
+    small(tmp_path)
+    with np.load(tmp_path / "small.npz") as archive:
+        np.savez(
+            tmp_path / "x.npz", **{name: archive[name][:0] if name in RECORD.names else archive[name] for name in archive.files}
+        )
+    with pytest.raises(LogError, match="this log holds no reading"):
+        open_log(tmp_path / "x.npz")
+
+
+def test_files_that_are_no_logs(tmp_path):
+    with pytest.raises(LogError, match=r"none\.npz: cannot read this log: No such file or directory"):
+        open_log(tmp_path / "none.npz")
+    with pytest.raises(LogError, match="cannot read this log: Is a directory"):
+        open_log(tmp_path)
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(LogError, match=r"damaged, cut, or no \.npz file: File is not a zip file"):
+        open_log(tmp_path / "text.npz")
+
+
+def test_a_log_that_goes_while_it_is_read(tmp_path):
+    log = open_log(write_log(tmp_path / "a.npz", random_readings(np.array([1.0]))))
+    (tmp_path / "a.npz").unlink()
+    with pytest.raises(LogError, match="cannot read this log"):
+        next(log.readings())
+    with pytest.raises(LogError, match="cannot read this log"):
+        log.column("position")
+
+
+def test_a_huge_array_is_not_believed(tmp_path):
+    """A header that promises 10^12 rows is refused before any of them is given room."""
+    small(tmp_path)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (10**12, 12)})
+    with zipfile.ZipFile(tmp_path / "small.npz") as old, zipfile.ZipFile(tmp_path / "x.npz", "w") as new:
+        for member in old.namelist():
+            new.writestr(member, header.getvalue() if member == "position.npy" else old.read(member))
+    with pytest.raises(LogError, match="1000000000000 rows in position, but 3 in sequence"):
+        open_log(tmp_path / "x.npz")
+
+
+# a hand
+
+
+def test_recording_an_emulated_hand_through_failures(tmp_path):
+    stamps = Stamps()
+    with (
+        Emulator(EmulatedHand(forces=stamps)) as emulator,
+        XHand1.open(emulator.device) as hand,
+        LogWriter(tmp_path / "a.npz") as log,
+    ):
+        num_more = 0
+        for event in events(hand, 60.0):
+            log.add(event)
+            if log.num_readings == 30 and not log.num_faults:
+                emulator.set_faults(Faults(silence=1.0))
+            if isinstance(event, Fault):
+                emulator.set_faults(Faults())
+            num_more += bool(log.num_faults) and isinstance(event, Reading)
+            if num_more == 20:
+                break
+    log = open_log(tmp_path / "a.npz")
+    found = [stamps.check(reading) for reading in log.readings()]
+    assert len(found) > 20  # a busy machine may have lost one before the thirtieth
+    assert all(one < other for one, other in pairwise(found))
+    assert log.faults
+    assert all(isinstance(fault.error(), (HandTimeoutError, errors.StaleReadingError)) for fault in log.faults)
+    assert log.received_at[0] < log.faults[0].time < log.received_at[-1]
+
+
+def test_a_closed_hand_ends_a_recording():
+    with Emulator() as emulator:
+        hand = XHand1.open(emulator.device)
+        coming = events(hand, 60.0)
+        next(coming)
+        hand.close()
+        with pytest.raises(HandClosedError):
+            for _ in coming:
+                pass

@@ -1,0 +1,151 @@
+"""The hand as a source: the speed filter against closed forms, and features against the observations of simulations."""
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from xhand1_hands import PATIENT, wait_until
+
+from tgdsl.errors import StateError
+from tgdsl.runtime.source import Source
+from tgdsl.runtime.xhand1 import pace
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.body import TipForces
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.motion import MotionLimits
+from tgdsl.runtime.xhand1.pace import RealTime
+from tgdsl.runtime.xhand1.source import XHand1Source
+from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
+
+CALM = {"timing": PATIENT, "max_age_s": 20.0}
+TIPS = np.array([[10, -20, 30], [1, 2, 3], [0, 0, 127], [127, 0, 0], [0, 0, 255]])
+
+
+def pressed(time_s, position):
+    return TipForces(TIPS.astype(np.float64), np.ones((5, 120, 3)))
+
+
+def test_an_even_motion():
+    speeds = VelocityFilter(0.05)
+    for n in range(40):
+        found = speeds.update(100 + 0.01 * n, np.array([0.3 * 0.01 * n, -2 * 0.01 * n]))
+        assert found == pytest.approx(np.array([0.3, -2]) * (1 - np.exp(-0.01 * n / 0.05)), abs=1e-9)
+
+
+def test_uneven_times_count():
+    speeds, times = VelocityFilter(0.05), np.cumsum(np.random.default_rng(0).uniform(0.001, 0.01, 30))
+    found = [speeds.update(now, np.array([1.5 * now]))[0] for now in times]
+    assert found == pytest.approx(1.5 * (1 - np.exp(-(times - times[0]) / 0.05)), abs=1e-9)
+
+
+def test_a_sine_is_damped_and_late_as_a_first_order_filter_does():
+    omega, tau, times = 20.0, 0.03, np.arange(0, 2, 1e-4)
+    speeds = VelocityFilter(tau)
+    found = np.array([speeds.update(t, np.array([np.sin(omega * t)]))[0] for t in times])
+    gain, lag = 1 / np.hypot(1, omega * tau), np.arctan(omega * tau)
+    expected = omega * gain * np.cos(omega * times - lag)
+    assert found[times > 1] == pytest.approx(expected[times > 1], abs=2e-3 * omega)
+
+
+def test_plain_differences_the_first_reading_and_one_that_is_not_later():
+    speeds = VelocityFilter(0.0)
+    assert speeds.update(1.0, np.array([5.0])) == [0.0]
+    assert speeds.update(1.5, np.array([6.0])) == [2.0]
+    assert speeds.update(1.5, np.array([9.0])) == [2.0]
+    assert speeds.update(2.0, np.array([6.0])) == [0.0]
+    speeds.reset()
+    assert speeds.update(0.0, np.array([1.0])) == [0.0]
+
+
+def test_a_sample_and_its_features():
+    newton = Calibration("N", np.full((5, 3), 0.1), np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), np.zeros((5, 3)))
+    with Emulator(EmulatedHand(forces=pressed)) as emulator, XHand1.open(emulator.device, **CALM) as hand:
+        source: Source = XHand1Source(hand, control_step=0.02, calibration=newton, read_timeout_s=20.0)
+        assert isinstance(source, XHand1Source)
+        source.step()
+        sample = source.sample()
+        with pytest.raises(StateError, match="cannot give the poses and contacts of a SceneState; its sample"):
+            source.state()
+    assert (sample.units, source.num_envs) == ("N", 1)
+    assert sample.tip_force.numpy() == pytest.approx(0.1 * TIPS[None], abs=1e-6)
+    assert sample.is_tip_saturated.tolist() == [[False, False, False, True, True]]
+    assert (sample.taxel_counts == 1).all()
+    assert (sample.joint_temperature == 25).all()
+    assert not sample.joint_error.any()
+
+
+class Clock:
+    """A clock that only sleeping, and work, move on."""
+
+    def __init__(self):
+        self.now = 50.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        assert seconds >= 0
+        self.now += seconds
+
+
+def test_steps_keep_their_time_and_late_ones_are_counted(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(pace, "time", clock)
+    steps, ends = RealTime(0.04), []
+    for work in (0.0, 0.03, 0.01, 0.0399, 0.1, 0.0, 0.2, 0.0):
+        clock.now += work
+        steps.wait(None, lambda: None)
+        ends.append(clock.now - 50.0)
+    assert ends == pytest.approx([0.04, 0.08, 0.12, 0.16, 0.26, 0.3, 0.5, 0.54])
+    assert steps.num_late_steps == 2
+    clock.now += 1.0
+    steps.restart()
+    steps.wait(None, lambda: None)
+    assert (clock.now - 50.0, steps.num_late_steps) == (pytest.approx(1.58), 2)
+
+
+def test_each_step_gives_a_new_reading_and_no_sooner():
+    with Emulator() as emulator, XHand1.open(emulator.device, **CALM) as hand:
+        start, sequences = time.monotonic(), []
+        source = XHand1Source(hand, control_step=0.04, read_timeout_s=20.0)
+        for _ in range(5):
+            source.step()
+            sequences.append(source.sample().reading.sequence)
+        assert time.monotonic() - start >= 5 * 0.04 - 0.001
+        assert np.all(np.diff(sequences) > 0)
+        before = time.monotonic()
+        source.reset()
+        assert source.sample().reading.requested_at >= before
+        assert (source.sample().joint_vel == 0).all()
+        with pytest.raises(MotionError, match="opened for reading alone"):
+            source.step(np.zeros(12))
+        with pytest.raises(HandError, match="a control step of -1 s, expected a finite time above 0"):
+            XHand1Source(hand, control_step=-1.0)
+
+
+def test_controls_are_joint_angles():
+    limits = MotionLimits((0.0,) * 12, (1.0,) * 12, (10.0,) * 12, (300,) * 12, kp=100, watchdog_s=1.0)
+    with Emulator(EmulatedHand(time_constant_s=0.01)) as emulator, XHand1.open(emulator.device, motion=limits, **CALM) as hand:
+        with pytest.raises(MotionError, match="a control step of 1000 ms, and the watchdog bites after 1000 ms"):
+            XHand1Source(hand, control_step=1.0)
+        source = XHand1Source(hand, control_step=0.02, read_timeout_s=20.0)
+        target = torch.linspace(0, 1, 12)
+
+        def is_there() -> bool:
+            try:
+                source.step(target[None])
+                source.step()
+            except WatchdogError:  # the machine stood still
+                hand.resume()
+                return False
+            return abs(source.sample().joint_pos[0] - target).max() < 0.01
+
+        assert wait_until(is_there)
+        source.reset()
+        source.step()
+        assert emulator.hand.is_passive
+        assert hand.stopped is None

@@ -1,0 +1,165 @@
+"""The XHand1's protocol: published vectors, field by field oracles, and round trips."""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from xhand1_streams import bitwise_crc16
+
+from tgdsl.runtime.xhand1.wire import payloads, protocol
+from tgdsl.runtime.xhand1.wire.errors import ProtocolError
+from tgdsl.runtime.xhand1.wire.parser import FrameParser
+from tgdsl.runtime.xhand1.wire.payloads import JointCommand, Mode
+from tgdsl.runtime.xhand1.wire.protocol import Frame
+
+BYTE = st.integers(0, 255)
+WORD = st.integers(0, 0xFFFF)
+SHORT = st.integers(-0x8000, 0x7FFF)
+
+
+def test_the_checksum_of_the_published_vector():
+    assert protocol.crc16(b"123456789") == 0x31C3
+
+
+@given(st.binary(max_size=300))
+def test_the_checksum_is_the_polynomial_division(data):
+    assert protocol.crc16(data) == bitwise_crc16(data)
+
+
+def test_a_version_request_is_the_published_one():
+    frame = Frame(protocol.HOST_ADDRESS, protocol.hand_address(0), protocol.Command.VERSION)
+    assert protocol.encode_frame(frame) == bytes.fromhex("55 aa fe 80 13 00 00 ef c3")
+    assert FrameParser().feed(bytes.fromhex("55aafe80130000efc3")) == [frame]
+
+
+def test_sizes_are_the_published_ones():
+    passive = payloads.encode_command(payloads.PASSIVE)
+    assert len(passive) == payloads.COMMAND_SIZE == 288
+    assert payloads.STATE_SIZE == 2208
+    assert len(protocol.encode_frame(Frame(0xFE, 0x80, 2, passive))) == 297
+    assert len(protocol.encode_frame(Frame(0x80, 0xFE, 2, bytes(2208)))) == 2217
+
+
+def test_the_passive_command_byte_by_byte():
+    assert payloads.encode_command(payloads.PASSIVE) == b"".join(struct.pack("<H", i) + bytes(22) for i in range(12))
+
+
+def test_a_command_byte_by_byte():
+    joints = [JointCommand(0.5 * i, 100 + i, -i, 2 * i, 300 + i, Mode.POSITION) for i in range(12)]
+    payload = payloads.encode_command(joints)
+    for i in range(12):
+        at = 24 * i
+        assert int.from_bytes(payload[at : at + 2], "little") == i
+        assert [int.from_bytes(payload[at + k : at + k + 2], "little", signed=True) for k in (2, 4, 6)] == [100 + i, -i, 2 * i]
+        assert np.frombuffer(payload[at + 8 : at + 12], "<f4")[0] == np.float32(0.5 * i)
+        assert [int.from_bytes(payload[at + k : at + k + 2], "little") for k in (12, 14, 16, 18, 20, 22)] == [
+            300 + i,
+            3,
+            0,
+            0,
+            0,
+            0,
+        ]
+
+
+def test_a_state_byte_by_byte():
+    payload = bytearray(2208)
+    payload[24 * 7 : 24 * 8] = struct.pack("<BBf9H", 7, 3, 1.25, 40, 5000, 0x1220, 1, 2, 3, 4, 5, 6)
+    tip = 288 + 384 * 2
+    payload[tip : tip + 3] = bytes([0xFF, 0x80, 0xC8])
+    payload[tip + 3 + 3 * 119 : tip + 363] = bytes([5, 0xFE, 255])
+    payload[tip + 363 : tip + 384] = bytes(range(30, 51))
+    state = payloads.decode_state(bytes(payload))
+    assert (state.joint_id[7], state.sensor_id[7], state.position[7]) == (7, 3, 1.25)
+    assert (state.current[7], state.raw_position[7], state.joint_temperature[7]) == (40, 5000, 0x1220)
+    assert state.joint_error[7].tolist() == [1, 2, 3]
+    assert state.reserved[7].tolist() == [4, 5, 6]
+    assert state.total_force[2].tolist() == [-1, -128, 200]
+    assert state.taxel_force[2, 119].tolist() == [5, -2, 255]
+    assert state.taxel_temperature[2].tolist() == list(range(30, 50))
+    assert state.total_temperature.tolist() == [0, 0, 50, 0, 0]
+    assert not state.taxel_force[2, :119].any()
+    assert state.is_total_saturated.tolist() == [[False] * 3] * 2 + [[False, True, False]] + [[False] * 3] * 2
+    assert state.is_taxel_saturated.sum() == 1
+    assert state.is_taxel_saturated[2, 119, 2]
+
+
+def test_a_state_cannot_be_written_to():
+    state = payloads.decode_state(bytes(2208))
+    for name in ("position", "total_force", "taxel_force", "joint_error"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(state, name)[...] = 0
+
+
+@pytest.mark.parametrize(
+    ("counts", "is_end"),
+    [((127, 0, 0), 0), ((-127, 0, 0), 0), ((0, -128, 0), 1), ((0, 0, 255), 2), ((126, -126, 254), None), ((0, 0, 0), None)],
+)
+def test_saturation(counts, is_end):
+    assert payloads.saturated(np.array(counts)).tolist() == [i == is_end for i in range(3)]
+
+
+def test_the_display_programs_cells_are_each_used_once():
+    cells = payloads.unverified_taxel_cells()
+    assert cells[[0, 11, 12, 119]].tolist() == [[11, 0], [0, 0], [11, 1], [0, 9]]
+    assert len({tuple(cell) for cell in cells.tolist()}) == 120
+
+
+@given(st.binary(min_size=2208, max_size=2208))
+@settings(max_examples=200, deadline=None)
+def test_any_state_comes_back_byte_for_byte(payload):
+    assert payloads.encode_state(payloads.decode_state(payload)) == payload
+
+
+JOINT = st.builds(JointCommand, st.floats(width=32, allow_nan=False, allow_infinity=False), SHORT, SHORT, SHORT, WORD, WORD)
+
+
+@given(st.lists(JOINT, min_size=12, max_size=12))
+@settings(max_examples=100, deadline=None)
+def test_any_command_comes_back(joints):
+    assert payloads.decode_command(payloads.encode_command(joints)) == tuple(joints)
+
+
+@given(BYTE, BYTE, BYTE.filter(lambda c: c not in protocol.FIRMWARE_COMMANDS), st.binary(max_size=400))
+@settings(max_examples=200, deadline=None)
+def test_any_frame_comes_back(source, destination, command, payload):
+    frame = Frame(source, destination, command, payload)
+    assert FrameParser().feed(protocol.encode_frame(frame)) == [frame]
+
+
+@pytest.mark.parametrize("command", sorted(protocol.FIRMWARE_COMMANDS))
+def test_firmware_is_never_written(command):
+    with pytest.raises(ProtocolError, match="writes firmware; it is never sent"):
+        protocol.encode_frame(Frame(0xFE, 0x80, command))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: protocol.encode_frame(Frame(256, 0, 2)), "source is 256, expected 0 to 255"),
+        (lambda: protocol.encode_frame(Frame(0, 0, 2, bytes(8225))), "the payload has 8225 bytes, expected at most 8224"),
+        (lambda: protocol.hand_address(128), "hand id 128: expected 0 to 127"),
+        (lambda: payloads.encode_command([]), "0 joint commands, expected 12"),
+        (lambda: payloads.encode_command([JointCommand(float("nan"))] * 12), "joint 0: position is nan, expected a finite"),
+        (lambda: payloads.encode_command([JointCommand(kp=40000)] * 12), "joint 0: .* does not fit the protocol's fields"),
+        (lambda: payloads.encode_command([JointCommand(1e300)] * 12), "joint 0: .* does not fit the protocol's fields"),
+        (lambda: payloads.decode_command(bytes(288)), "joint command 1 is of joint 0"),
+        (lambda: payloads.decode_command(bytes(287)), "a command of 287 bytes, expected 288"),
+        (lambda: payloads.decode_state(bytes(2207)), "a state of 2207 bytes, expected 2208"),
+        (lambda: payloads.encode_register_request(70000), "register 70000: expected 0 to 65535"),
+    ],
+)
+def test_what_does_not_fit_is_refused(wrong, message):
+    with pytest.raises(ProtocolError, match=message):
+        wrong()
+
+
+def test_a_force_beyond_its_byte_is_refused():
+    state = payloads.decode_state(bytes(2208))
+    beyond = np.zeros((5, 120, 3), dtype=np.int16)
+    beyond[0, 0, 0] = 128
+    fields = {name: getattr(state, name) for name in state.__dataclass_fields__} | {"taxel_force": beyond}
+    with pytest.raises(ProtocolError, match="taxel forces from 0 to 128: expected x, y in"):
+        payloads.encode_state(payloads.HandState(**fields))

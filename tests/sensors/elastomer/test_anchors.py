@@ -1,0 +1,238 @@
+"""Stick and slip: what the taxels' anchors remember, against the geometry and a closed form of Winkler's foundation."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tgdsl.geometry.planes import rot, vec
+from tgdsl.quantities.contact_depth.query import Distance, Felt, Frame
+from tgdsl.quantities.reference import Touch
+from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance, advance_reference
+
+LAW = Law(0.0, 1e-5, 1e-4, None)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Skin:
+    """Taxels on a link, and the same scene for `advance` and its reference, which must agree at every step."""
+
+    def __init__(self, pos, normal=UP, law=LAW):
+        self.pos = np.atleast_2d(np.asarray(pos, dtype=float))
+        self.normal = np.broadcast_to(np.asarray(normal, dtype=float), self.pos.shape)
+        self.law = law
+        self.memory = {name: np.zeros(len(self.pos)) for name in PLANES}
+
+    def step(self, *objects):
+        """Objects: (distances [m], translation [m] and rotation vector of the object in the link's frame)."""
+        num = len(self.pos)
+        phi = np.stack([np.broadcast_to(distance, num) for distance, *_ in objects], axis=1).astype(float)
+        turns = [Rotation.from_rotvec(turn).as_matrix() for _, _, turn in objects]
+        rotation = np.broadcast_to(np.stack([turn.T for turn in turns]), (num, len(objects), 3, 3))
+        offset = np.broadcast_to(
+            np.stack([-turn.T @ at for turn, (_, at, _) in zip(turns, objects, strict=True)]), (num, len(objects), 3)
+        )
+        depth = np.maximum(0.0, (self.law.reach - phi).max(axis=1))
+        none = np.zeros((num, 3))
+        touch = Touch(depth, none, none, none, phi, np.zeros((*phi.shape, 3)), rotation, offset)
+        before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
+        expected, self.memory = advance_reference(touch, self.pos, self.normal, self.law, self.memory)
+        felt = self.felt(phi, rotation, offset, depth)
+        found, after = advance(felt, self.planes(self.pos), self.planes(self.normal), self.law, before)
+        np.testing.assert_allclose(torch.stack(found, dim=-1)[0], expected, rtol=1e-12, atol=1e-16)
+        for name in PLANES:
+            np.testing.assert_allclose(after[name][0], self.memory[name], rtol=1e-12, atol=1e-16)
+        return expected
+
+    @staticmethod
+    def planes(vectors):
+        return vec(torch.from_numpy(vectors.T.copy()))
+
+    @staticmethod
+    def felt(phi, rotation, offset, depth):
+        def plane(values):
+            return torch.tensor(np.ascontiguousarray(values))[None]
+
+        zero = torch.zeros(1, len(phi), dtype=torch.float64)
+        distances = {str(k): Distance(plane(phi[:, k]), (zero, zero, zero)) for k in range(phi.shape[1])}
+        frames = {
+            str(k): Frame(
+                rot(plane(rotation[:, k].reshape(-1, 9)[:, i]) for i in range(9)), vec(plane(offset[:, k, i]) for i in range(3))
+            )
+            for k in range(phi.shape[1])
+        }
+        return Felt(plane(depth), None, None, None, distances, frames, None, {}, {}, {}, {})
+
+
+HERE = ([0.0, 0, 0], [0.0, 0, 0])
+
+
+def test_a_translation_while_pressed_is_the_displacement():
+    """From anywhere: where the object was first felt does not matter. The part along the normal is left out."""
+    skin = Skin([[1e-3, 2e-3, 0], [0, 0, 0]])
+    start = np.array([3e-3, -1e-3, 5e-3])
+    turn = [0.3, 0.8, -0.2]
+    assert not skin.step((-1e-3, start, turn)).any()
+    for way in ([4e-4, -2e-4, 1e-3], [-6e-4, 1e-4, -3e-4]):
+        found = skin.step((-1e-3, start + way, turn))
+        np.testing.assert_allclose(found, [[way[0], way[1], 0]] * 2, atol=1e-16)
+
+
+def test_a_rotation_while_pressed_turns_every_place():
+    """About the normal through the origin: t = (R − 1) x; about a tangent, the tangential part of the same."""
+    x = np.array([[1e-3, 0.5e-3, 0.0], [-2e-3, 0, 0]])
+    for turn in ([0, 0, 0.4], [0.2, 0, 0], [0.1, -0.2, 0.3]):
+        skin = Skin(x)
+        skin.step((-1e-3, *HERE))
+        found = skin.step((-1e-3, [0.0, 0, 0], turn))
+        moved = x @ Rotation.from_rotvec(turn).as_matrix().T - x
+        np.testing.assert_allclose(found, moved * [1, 1, 0], atol=1e-16)
+
+
+def test_each_taxel_has_its_own_tangent_plane():
+    normal = np.array([[0, 0, 1.0], [1.0, 0, 0], [0.6, 0, 0.8]])
+    skin = Skin(np.zeros((3, 3)), normal)
+    skin.step((-1e-3, *HERE))
+    found = skin.step((-1e-3, [1e-3, 2e-3, 0], [0.0, 0, 0]))
+    np.testing.assert_allclose(found, [[1e-3, 2e-3, 0], [0, 2e-3, 0], [1e-3 * (1 - 0.36), 2e-3, -1e-3 * 0.48]], atol=1e-16)
+
+
+def test_lifting_lets_go_and_touching_again_takes_hold_anew():
+    """Within the band between −enter and +exit nothing changes; beyond it the way so far is forgotten."""
+    skin, way = Skin([0, 0, 0]), [2e-4, 0.0, 0]
+    assert not skin.step((-0.5e-5, *HERE)).any() and skin.memory["object"][0] == 0  # not deep enough
+    skin.step((-2e-5, *HERE))
+    assert skin.memory["object"][0] == 1
+    np.testing.assert_allclose(skin.step((0.9e-4, way, [0.0, 0, 0]))[0], way, atol=1e-16)  # held on to
+    assert not skin.step((1.1e-4, way, [0.0, 0, 0])).any() and skin.memory["object"][0] == 0
+    assert not any(skin.memory[name].any() for name in PLANES)
+    skin.step((-2e-5, way, [0.0, 0, 0]))
+    np.testing.assert_allclose(skin.step((-2e-5, [5e-4, 0, 0], [0.0, 0, 0]))[0], [3e-4, 0, 0], atol=1e-16)
+    assert not skin.step((np.inf, [5e-4, 0, 0], [0.0, 0, 0])).any() and skin.memory["object"][0] == 0  # the gate closed
+
+
+def test_a_standoff_raises_both_thresholds():
+    skin = Skin([0, 0, 0], law=Law(2e-3, 1e-5, 1e-4, None))
+    skin.step((2e-3 - 0.5e-5, *HERE))
+    assert skin.memory["object"][0] == 0
+    skin.step((2e-3 - 2e-5, *HERE))
+    assert skin.memory["object"][0] == 1
+    skin.step((2e-3 + 0.9e-4, *HERE))
+    assert skin.memory["object"][0] == 1
+    skin.step((2e-3 + 1.1e-4, *HERE))
+    assert skin.memory["object"][0] == 0
+
+
+def test_one_object_holds_at_a_time():
+    """The deepest when it was taken, the first among equals (to 1e-7 m); another takes over only once that one has left."""
+    skin = Skin([0, 0, 0])
+    near, far = (-1e-3, *HERE), (-2e-3, *HERE)
+    skin.step(near, far)
+    assert skin.memory["object"][0] == 2
+    skin.step((-5e-3, *HERE), near)
+    assert skin.memory["object"][0] == 2
+    found = skin.step((-5e-3, [7e-4, 0, 0], [0.0, 0, 0]), (-1e-3, [0, 1e-4, 0], [0.0, 0, 0]))
+    np.testing.assert_allclose(found[0], [0, 1e-4, 0], atol=1e-16)
+    skin.step((-5e-3, [7e-4, 0, 0], [0.0, 0, 0]), (1.0, [0, 1e-4, 0], [0.0, 0, 0]))
+    assert skin.memory["object"][0] == 1
+    np.testing.assert_allclose(skin.step((-5e-3, [9e-4, 0, 0], [0.0, 0, 0]), (1.0, *HERE))[0], [2e-4, 0, 0], atol=1e-16)
+    equal = Skin([0, 0, 0])
+    equal.step((-1e-3, *HERE), (-1e-3 - 0.5e-7, *HERE))
+    assert equal.memory["object"][0] == 1
+
+
+@pytest.mark.parametrize("way", [[3e-3, 4e-3, 0], [-1e-3, 0.0, 0]])
+def test_the_cap_holds_exactly_and_the_anchor_is_dragged(way):
+    """Beyond μ' h the displacement keeps its direction; moving back at once unloads from there, as a slider does."""
+    slip, depth, turn = 0.5, 1e-3, [0.2, -0.1, 0.5]
+    skin, way = Skin([1e-3, 0, 0], law=LAW._replace(slip=slip)), np.array(way)
+    skin.step((-depth, np.zeros(3), turn))
+    found = skin.step((-depth, way, turn))[0]
+    np.testing.assert_allclose(found, slip * depth * way / np.linalg.norm(way), rtol=1e-12, atol=1e-18)
+    back = -0.1 * found
+    np.testing.assert_allclose(skin.step((-depth, way + back, turn))[0], 0.9 * found, rtol=1e-12, atol=1e-17)
+    held = skin.step((-depth / 2, way + back, turn))[0]  # with half the depth half is held
+    assert np.linalg.norm(held) == pytest.approx(slip * depth / 2, rel=1e-12)
+    assert not skin.step((0.5e-4, way + back, turn)).any()  # out of contact, not yet let go: nothing is held
+    assert skin.memory["object"][0] == 1
+
+
+def test_below_the_cap_nothing_slides():
+    skin = Skin([0, 0, 0], law=LAW._replace(slip=0.5))
+    skin.step((-1e-3, *HERE))
+    anchor = [skin.memory[name].copy() for name in PLANES]
+    skin.step((-1e-3, [4.9e-4, 0, 0], [0.0, 0, 0]))
+    np.testing.assert_array_equal([skin.memory[name] for name in PLANES], anchor)
+
+
+def test_a_tangential_cycle_is_the_winkler_coulomb_loop():
+    """A sphere held in a pad and moved to and fro.
+
+    Winkler: h = δ − r²/2R, dA = 2πR dh, each taxel sticks up to κ h.
+    Q = 2πR K_t ∫ min(s, κh) dh = 2πR K_t (s δ − s²/2κ), full slip at s* = κδ with μP = πR K_t κ δ²: Q/μP = 1 − (1 − s/s*)².
+    Back and forth by Masing's rule: the same curve twice as large from the turning point. The elastic half-space (Cattaneo,
+    Mindlin) has 1 − (1 − s/s*)^1.5: at most 27/256 less, at s/s* = 7/16, where √(1 − s/s*) = 3/4.
+    """
+    radius, depth, slip = 0.02, 1e-3, 0.4
+    line = np.linspace(-7e-3, 7e-3, 121)
+    x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
+    h = depth - (x * x + y * y) / (2 * radius)
+    skin = Skin(np.stack([x, y, 0 * x], axis=1), law=Law(0.0, 0.0, 1e-2, slip))
+    limit, full = slip * depth, slip * np.maximum(h, 0).sum()
+
+    def pull(s):
+        return skin.step((-h, [s, 0, 0], [0.0, 0, 0]))[:, 0].sum() / full
+
+    def curve(ratio):
+        return 1 - (1 - np.clip(ratio, 0, 1)) ** 2
+
+    assert pull(0.0) == 0
+    way = np.linspace(0, 0.8, 9)
+    loading = np.array([pull(w * limit) for w in way])
+    np.testing.assert_allclose(loading, curve(way), atol=2e-3)
+    down = np.linspace(0.8, -0.8, 9)
+    unloading = np.array([pull(w * limit) for w in down])
+    np.testing.assert_allclose(unloading, curve(np.array(0.8)) - 2 * curve((0.8 - down) / 2), atol=3e-3)
+    again = np.array([pull(w * limit) for w in -down])
+    np.testing.assert_allclose(again, -curve(np.array(0.8)) + 2 * curve((0.8 - down) / 2), atol=3e-3)
+    assert again[-1] == pytest.approx(loading[-1], abs=1e-3)  # the loop closes
+    assert pull(1.5 * limit) == pytest.approx(1.0, abs=1e-9)  # and slides at μP
+    fine = np.linspace(0, 1, 4001)
+    difference = curve(fine) - (1 - (1 - fine) ** 1.5)
+    assert difference.max() == pytest.approx(27 / 256, abs=1e-6) and fine[difference.argmax()] == pytest.approx(
+        7 / 16, abs=1e-3
+    )
+    print("loop", loading.round(4), "Mindlin", (1 - (1 - way) ** 1.5).round(4))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_at_every_corner(dtype):
+    """Nothing felt; just let go; no displacement at no depth; displacement at no depth; at the cap."""
+    num = 5
+    depth = torch.tensor([[0.0, 0.0, 0.0, 0.0, 1e-3]], dtype=dtype, requires_grad=True)
+    phi = torch.tensor([[1.0, 2e-4, 0.5e-4, 0.5e-4, -1e-3]], dtype=dtype, requires_grad=True)
+    along = torch.tensor([[0.0, 0.0, 0.0, 1e-3, 5e-4]], dtype=dtype, requires_grad=True)
+    zero, one = torch.zeros(1, num, dtype=dtype), torch.ones(1, num, dtype=dtype)
+    frame = Frame((one, zero, zero, zero, one, zero, zero, zero, one), (-along, zero, zero))
+    felt = Felt(depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame}, None, {}, {}, {}, {})
+    state = dict.fromkeys(PLANES[:3], zero) | {"object": torch.tensor([[0.0, 1, 1, 1, 1]], dtype=dtype)}
+    flat = (zero[0], zero[0], zero[0])
+    slip = torch.tensor(0.5, dtype=dtype, requires_grad=True)
+    found, after = advance(felt, flat, (zero[0], zero[0], one[0]), LAW._replace(slip=slip), state)
+    total = sum(part.sum() for part in (*found, *after.values()))
+    for gradient in torch.autograd.grad(total, [depth, phi, along, slip], allow_unused=True):
+        assert gradient is None or torch.isfinite(gradient).all()
+
+
+def test_not_a_number_comes_out_and_is_not_remembered():
+    """A broken pose reads NaN at held taxels, takes no anchor, and leaves the old ones."""
+    skin = Skin(np.zeros((2, 3)))
+    skin.step((np.array([-1e-3, 1.0]), *HERE))
+    before = {name: torch.from_numpy(value.copy())[None] for name, value in skin.memory.items()}
+    nan = np.full((2, 1, 3, 3), np.nan)
+    felt = Skin.felt(nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
+    law = LAW._replace(slip=0.5)
+    found, after = advance(felt, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), law, before)
+    assert found[0][0, 0].isnan()
+    for name in PLANES:
+        torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)

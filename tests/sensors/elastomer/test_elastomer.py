@@ -1,0 +1,304 @@
+"""The kind as a whole: the conformance suite, cases by hand, gradients, and what is refused."""
+
+import numpy as np
+import pytest
+import torch
+from scenes import module, state
+
+import tgdsl
+from tgdsl.errors import SpecError
+from tgdsl.sensors.elastomer import ELASTOMER
+from tgdsl.sensors.elastomer.half_space import half_space, patch_radius
+from tgdsl.testing import SCENE, KindConformance, assert_agrees
+
+ELASTIC = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.48, "normal_stiffness": 1e8}
+
+
+class TestElastomer(KindConformance):
+    kind = ELASTOMER
+    parameters = {"standoff": 0.003, "friction": 0.6}
+    gates = ("geometric",)
+
+
+class TestElastomerWithoutAStandoff(KindConformance):
+    kind = ELASTOMER
+    parameters = {"friction": 0.6}
+    test_compiled_equals_eager = None  # its graph is that of the one above, and a gate's of other kinds
+
+
+class TestElastomerAsInThePaper(KindConformance):
+    kind = ELASTOMER
+    parameters = {"standoff": 0.003, "model": "paper", "normalize": "peak", "compressibility": 0.4, "anchors": "taxels"}
+    gates = ("geometric",)
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+
+
+class TestHalfSpace(KindConformance):
+    kind = ELASTOMER
+    parameters = {"standoff": 0.003, **ELASTIC, "friction": 0.8, "marker_depth": 0.0005}
+    gates = ("geometric",)
+
+
+class BondedLayer(KindConformance):
+    kind = ELASTOMER
+    parameters = {"standoff": 0.003, **ELASTIC, "kernel": "bonded_layer", "thickness": 0.004}
+    num_envs = 3
+
+
+class Unsheared(KindConformance):
+    kind = ELASTOMER
+    parameters = {"standoff": 0.003, **ELASTIC, "shear_strength": 0}
+    num_envs = 4
+
+
+@pytest.mark.parametrize(("suite", "tolerance"), [(BondedLayer(), 1e-5), (Unsheared(), 1e-12)])
+def test_other_kernels_equal_their_reference(tmp_path, suite, tolerance):
+    """The layer's table against the integrals themselves; pressure without shear, which keeps no state."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE)
+    touch, reference = suite.build(suite.document(scene), torch.float64)
+    assert touch.has_state == isinstance(suite, BondedLayer)
+    for found in suite.states(touch):
+        assert_agrees(touch(found)["s"], reference, found, tolerance)
+
+
+def test_shear_is_in_what_the_suite_compares(tmp_path):
+    """In the suite's states anchors are held from one to the next, and they move markers."""
+    suite = TestElastomer()
+    scene = tmp_path / "scene.xml"
+    scene.write_text(SCENE)
+    touch, _ = suite.build(suite.document(scene), torch.float64)
+    still, _ = suite.build(suite.document(scene, friction=0), torch.float64)
+    differences = [float((touch(s)["s"] - still(s)["s"]).abs().max() / still(s)["s"].abs().max()) for s in suite.states(touch)]
+    assert differences[0] == 0 and max(differences) > 1e-2
+
+
+D = 5e-4
+BALL = '<geom type="sphere" size=".01"/>'
+PROBES = [(0.0, 0.0, 0.0), (0.004, 0.003, 0.0)]
+AREA = np.pi * 1e-4
+"""Area of a taxel of the scene, a disc of its radius of 10 mm."""
+
+
+def pressed(folder, way=(0.0, 0.0), probes=PROBES, depth=D, **sensor):
+    """A ball over the first taxel, some depth into it, then moved along the skin; the second taxel touches nothing."""
+    touch = module(folder, probes, BALL, kind="elastomer", **sensor)
+    touch(state(touch, pos=[0, 0, 0.01 - depth]))
+    return touch(state(touch, pos=[*way, 0.01 - depth]))["s"][0].numpy()
+
+
+def test_two_taxels_by_hand(tmp_path):
+    """One source, two targets, the printed formula with the paper's numbers, area weights apart."""
+    u = pressed(tmp_path)
+    a, r = AREA / 6e-6, np.array([0.004, 0.003, 0.0])
+    g = np.exp(-8000 * 25e-6)
+    np.testing.assert_allclose(u[0], [0, 0, a * 100 * D**1.2], rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(u[1], a * 100 * (r * D * g + np.array([0, 0, D**1.2 * g])), rtol=1e-12)
+
+
+def test_two_taxels_by_hand_as_printed(tmp_path):
+    """`normalize: peak` and `model: paper`: w = h (c g/ḡ + (1 − c) ρ/ρ̄), ε the spacing, which is the root of the mean area."""
+    u = pressed(tmp_path, model="paper", normalize="peak", compressibility=0.3, dilation_strength=7)
+    r, eps = np.array([0.004, 0.003, 0.0]), np.sqrt(AREA)
+    g, g_peak = np.exp(-8000 * 25e-6), np.exp(-0.5) / np.sqrt(16000)
+    w = D * (0.3 * g / g_peak + 0.7 * 2 * eps / (25e-6 + eps**2))
+    np.testing.assert_allclose(u[1], 7 * (r * w + np.array([0, 0, D**1.2 * g])), rtol=1e-12)
+
+
+def test_the_length_of_the_stretch_is_the_thickness_if_given(tmp_path):
+    u = pressed(tmp_path, compressibility=0, thickness="2 mm", dilation_strength=1)
+    peak = np.exp(-0.5) / np.sqrt(16000)
+    expected = AREA / 6e-6 * np.array([0.004, 0.003]) * D * peak * 2 * 2e-3 / (25e-6 + 4e-6)
+    np.testing.assert_allclose(u[1, :2], expected, rtol=1e-12)
+
+
+def test_shear_by_hand(tmp_path):
+    """The ball rolls nowhere but slides along by 0.1 mm: markers follow the object's motion, at the source by s_s a h t."""
+    way = (1e-4, -0.5e-4)
+    u, still = pressed(tmp_path, way), pressed(tmp_path)
+    h = 0.01 - np.hypot(0.01 - D, np.hypot(*way))
+    a, t = AREA / 6e-6, np.array([*way, 0.0])
+    g = np.exp(-8000 * 25e-6)
+    np.testing.assert_allclose(u[0] - [0, 0, a * 100 * h**1.2], a * 100 * t * h, rtol=1e-9, atol=1e-15)
+    dilation = a * 100 * (np.array([0.004, 0.003, 0]) * h * g + np.array([0, 0, h**1.2 * g]))
+    np.testing.assert_allclose(u[1] - dilation, a * 100 * t * h * np.exp(-2000 * 25e-6), rtol=1e-9, atol=1e-15)
+    assert still[0, 0] == 0
+
+
+def test_friction_caps_the_shear(tmp_path):
+    """|t| ≤ μ h (2 − ν)/(2 (1 − ν)): with ν = 1/2, 1.5 μ h."""
+    way = (3e-3, 4e-3)
+    h = 0.01 - np.hypot(0.01 - 2e-3, 5e-3)
+    u = pressed(tmp_path, way, probes=PROBES[:1], depth=2e-3, friction=0.2)
+    np.testing.assert_allclose(u[0, :2], AREA / 6e-6 * 100 * h * 1.5 * 0.2 * h * np.array([0.6, 0.8]), rtol=1e-9)
+
+
+def test_an_elastic_skin_by_hand(tmp_path):
+    """Pressure K_n h pushes markers into the skin and, for ν < 1/2, towards the load; a tangential load carries them along."""
+    way, nu = (5e-5, 0.0), 0.48
+    u = pressed(tmp_path, way, **ELASTIC)
+    h = 0.01 - np.hypot(0.01 - D, way[0])
+    pressure, pull = 1e8 * h * AREA, 1e8 * 2 * (1 - nu) / (2 - nu) * way[0] * AREA
+    g = half_space(np.array([0.0, 5e-3]), 0.0, patch_radius(AREA), 2e5 / (2 * (1 + nu)), nu)
+    e = np.array([0.8, 0.6])
+    np.testing.assert_allclose(u[0], [g.along[0] * pull, 0, -g.normal[0] * pressure], rtol=1e-9, atol=1e-15)
+    x, y = g.spread[1] * pressure * e + pull * (g.along[1] * np.array([1, 0]) + g.bend[1] * (1.6 * e - [1, 0]))
+    np.testing.assert_allclose(u[1], [x, y, -g.normal[1] * pressure - g.lift[1] * pull * 0.8], rtol=1e-9, atol=1e-15)
+    assert u[0, 2] < 0 and g.spread[1] < 0
+
+
+def test_a_standoff_is_felt_above_the_taxels(tmp_path):
+    u = pressed(tmp_path, depth=-1e-3, standoff="1.5 mm", shear_strength=0)
+    np.testing.assert_allclose(u[0, 2], AREA / 6e-6 * 100 * 5e-4**1.2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("gate", [None, "geometric"])
+def test_a_standoff_is_felt_before_the_simulator_has_a_contact(tmp_path, gate):
+    """A ball that comes down: the skin's bulge follows its depth from the first touch on, whatever the simulator finds."""
+    touch = module(tmp_path, PROBES[:1], BALL, kind="elastomer", gate=gate, standoff="1.5 mm", shear_strength=0)
+    assert touch.inputs.fields == ("body_pos", "body_quat")
+    for height in (2e-3, 1.5e-3, 1.4e-3, 7e-4, 1e-5, 0.0, -3e-4):
+        bulge = touch(state(touch, pos=[0, 0, 0.01 + height]))["s"][0, 0, 2]
+        np.testing.assert_allclose(bulge, AREA / 6e-6 * 100 * max(0.0, 1.5e-3 - height) ** 1.2, rtol=1e-9, atol=1e-12)
+
+
+def test_without_a_standoff_the_gate_stays_the_pairs(tmp_path):
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer", gate=None)
+    assert "contact_found" in touch.inputs.fields
+
+
+def test_lifting_ends_the_shear(tmp_path):
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer")
+    for x, z in ((0.0, 0.0095), (2e-4, 0.0095), (2e-4, 0.0102)):
+        touch(state(touch, pos=[x, 0, z]))
+    lifted = touch(state(touch, pos=[2e-4, 0, 0.0095]))["s"]
+    fresh = module(tmp_path, PROBES, BALL, kind="elastomer")
+    torch.testing.assert_close(lifted, fresh(state(fresh, pos=[2e-4, 0, 0.0095]))["s"], rtol=0, atol=0)
+
+
+def test_an_elastic_skin_is_not_pulled_where_nothing_presses(tmp_path):
+    """Within the band in which anchors are kept, out of contact: no traction at all; in contact again, the old anchor."""
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer", **ELASTIC)
+    before, above, after = (touch(state(touch, pos=[x, 0, z]))["s"] for x, z in ((0, 0.0095), (2e-4, 0.01005), (2e-4, 0.0095)))
+    assert not above.any()
+    assert before[0, 0, 0] == 0 and after[0, 0, 0] > 1e-6
+
+
+def test_without_shear_there_is_neither_state_nor_frame(tmp_path):
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer", shear_strength=0)
+    assert not touch.has_state and touch.plan.queries[0].answers[0].needs == ()
+    assert touch.outputs[0].channels == ("displacement_x", "displacement_y", "displacement_z")
+    assert not any(name.startswith("drag") for name in touch.plan.sensors[0].constants)
+
+
+GRID = [(x, y, 0.0) for x in np.linspace(-3e-3, 3e-3, 4) for y in np.linspace(-3e-3, 3e-3, 4)]
+
+
+def read_once(scene, touch, memory):
+    return touch.core({"body_pos": scene.body_pos, "body_quat": scene.body_quat}, memory)[0]["s"]
+
+
+@pytest.mark.parametrize("sensor", [{}, {"friction": 0.3}, ELASTIC, {**ELASTIC, "friction": 0.3}])
+def test_gradients_by_pose_with_anchors_held(tmp_path, sensor):
+    """Of the second call, while taxels stick, or some of them slide: against central differences."""
+    touch = module(tmp_path, GRID, BALL, kind="elastomer", **sensor)
+    first, second = state(touch, pos=[0, 0, 0.0085]), state(touch, pos=[3e-4, 1e-4, 0.0084], quat=[1, 0.02, 0.01, 0.03])
+    touch(first)
+    memory = {name: value.clone() for name, value in touch.memory.named_buffers()}
+    assert second.body_pos is not None and second.body_quat is not None
+    leaves = [second.body_pos.clone().requires_grad_(), second.body_quat.clone().requires_grad_()]
+
+    def read(pos, quat):
+        return touch.core({"body_pos": pos, "body_quat": quat}, memory)[0]["s"] / scale
+
+    scale = float(read_once(second, touch, memory).abs().max())
+    assert torch.autograd.gradcheck(read, leaves, eps=1e-8, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("field", "constant", "value", "sensor"),
+    [
+        ("depth_exponent", "depth_exponent", 1.2, {}),
+        ("dilation_strength", "dilation_strength", 100.0, {}),
+        ("shear_strength", "shear_strength", 100.0, {}),
+        ("friction", "slip", 0.3, {}),
+        ("friction", "slip", 0.3, ELASTIC),
+        ("normal_stiffness", ("normal_stiffness", "shear_stiffness"), 1e8, {**ELASTIC, "friction": 0.3}),
+    ],
+)
+def test_gradients_by_parameter(tmp_path, field, constant, value, sensor):
+    """Derivatives by the constants are those by the document's field, by central differences of documents."""
+    sensor = {**sensor, field: value}
+
+    def read(touch):
+        touch(state(touch, pos=[0, 0, 0.0085]))
+        return touch(state(touch, pos=[3e-4, 1e-4, 0.0084]))["s"]
+
+    step = 1e-5 * value
+    high, low = (read(module(tmp_path, GRID, BALL, kind="elastomer", **{**sensor, field: value + d})) for d in (step, -step))
+    expected = (high - low) / (2 * step)
+    touch = module(tmp_path, GRID, BALL, kind="elastomer", **sensor)
+    factor = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    for name in [constant] if isinstance(constant, str) else constant:
+        own = f"sensors/s/{name}"
+        ratio = float(touch.plan.arrays[own]) / value
+        touch.constants._buffers[own] = ratio * value * factor
+    direction = torch.randn(expected.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (found,) = torch.autograd.grad((read(touch) * direction).sum(), [factor])
+    assert float(found) / value == pytest.approx(float((expected * direction).sum()), rel=1e-6)
+
+
+@pytest.mark.parametrize("exponent", [0.7, 1.0, 1.2])
+@pytest.mark.parametrize("height", [0.0, 1e-9, 1e-4, 5.0])
+def test_gradients_are_finite_at_first_touch(tmp_path, exponent, height):
+    """At no depth at all, just above, and far away: no NaN, for α below one either."""
+    touch = module(tmp_path, PROBES, BALL, kind="elastomer", depth_exponent=exponent, friction=0.5, dtype=torch.float32)
+    for down in (0.0, 1e-7):
+        given = state(touch, pos=[0, 0, 0.01 + height - down])
+        assert given.body_pos is not None
+        given.body_pos.requires_grad_()
+        (gradient,) = torch.autograd.grad(touch(given)["s"].sum(), [given.body_pos])
+        assert torch.isfinite(gradient).all()
+
+
+REFUSED = [
+    ({"youngs_modulus": 1e5}, "`youngs_modulus` is not used by the kernel gaussian"),
+    ({"marker_depth": 1e-3}, "`marker_depth` is not used by the kernel gaussian"),
+    ({**ELASTIC, "dilation_falloff": 1}, "`dilation_falloff` is not used by the kernel half_space"),
+    ({**ELASTIC, "thickness": 1e-3}, "`thickness` is not used by the kernel half_space"),
+    ({**ELASTIC, "model": "paper"}, "`model` is not used by the kernel half_space"),
+    ({**ELASTIC, "kernel": "bonded_layer"}, "`thickness` is missing, the kernel bonded_layer needs it"),
+    ({"kernel": "half_space", "normal_stiffness": 1}, "`youngs_modulus` is missing, the kernel half_space needs it"),
+    ({**ELASTIC, "shear_strength": 5}, "`shear_strength` can only be 0"),
+    ({"shear_strength": 0, "friction": 1}, "`friction` is not used without shear"),
+    ({"model": "paper", "reference_area": 1e-6}, "`reference_area` is not used by `model: paper`"),
+    (
+        {**ELASTIC, "kernel": "bonded_layer", "thickness": 1e-3, "marker_depth": 2e-3},
+        "`marker_depth` 0.002 m is below the layer",
+    ),
+    ({"boundary": {}}, "`thickness` is missing, a clamped `boundary` needs it"),
+    ({"boundary": {}, "thickness": 1e-3, "operator": "fft"}, "`operator: fft` cannot hold a clamped `boundary`"),
+    ({"operator": "dense", "tolerance": 1e-3}, "`tolerance` is not used by `operator: dense`"),
+    ({"standoff": 1e-3, "gate": "contact_pair"}, "`gate: contact_pair` would hide what `standoff` feels"),
+    ({"poissons_ratio": 0.51}, "0.51 is out of range, expected at most 0.5"),
+    ({"compressibility": 1.5}, "1.5 is out of range, expected at most 1"),
+    ({"tolerance": 1}, "1 is out of range, expected more than 0 and less than 1"),
+]
+
+
+@pytest.mark.parametrize(("fields", "message"), REFUSED)
+def test_what_would_be_ignored_or_is_missing_is_refused(tmp_path, fields, message):
+    with pytest.raises(SpecError) as caught:
+        module(tmp_path, PROBES, BALL, kind="elastomer", **fields)
+    assert message in str(caught.value) and "sensors.s" in str(caught.value)
+
+
+def test_half_is_a_poissons_ratio_like_any_other(tmp_path):
+    """ν → 1/2 is smooth, for the half-space and the layer."""
+    for fields in ({}, {"kernel": "bonded_layer", "thickness": 3e-3}):
+        near, at = (pressed(tmp_path, (1e-4, 0), **{**ELASTIC, **fields, "poissons_ratio": nu}) for nu in (0.5 - 1e-6, 0.5))
+        np.testing.assert_allclose(near, at, rtol=0, atol=1e-4 * np.abs(at).max())
+
+
+def test_a_plan_knows_its_kind():
+    assert ELASTOMER in tgdsl.sensors.KINDS and ELASTOMER.name == "elastomer"

@@ -1,0 +1,193 @@
+"""The Triton kernel by which points take hold of links, run on the CPU by Triton's interpreter, against the torch code."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from kernels import interpreted, needs_triton
+from meetings import NUM_ENVS, made
+
+import tgdsl
+from tgdsl.geometry.grid import METHODS, one_grid
+from tgdsl.geometry.planes import rot, vec
+from tgdsl.quantities.points.points import met_points
+from tgdsl.sensors.elastomer import point_anchors
+from tgdsl.sensors.elastomer.anchors import Law
+from tgdsl.sensors.elastomer.point_anchors import PLANES, advance, gripped
+
+PALM = Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml"
+STICKS, SLIDES = Law(1e-3, 1e-5, 1e-3, None), Law(1e-3, 1e-5, 1e-3, 0.4)
+LAWS = {"sticks": STICKS, "slides": SLIDES}
+CASES = ("one link", "cubes", "many points")
+STEPS, BEFORE = 5, 7
+"""Steps of a run, and how many points of other objects stand before those that are looked at."""
+PLACE, STRENGTH = 3e-7, 3e-9
+"""Errors of places [m], and of their products with depths [m²], in float32."""
+
+
+def moved(meeting, step):
+    """Return a meeting whose object has moved on; at the third step links that were felt no longer are."""
+    pairs = meeting.pairs
+    angle = torch.tensor(0.02 * step, dtype=pairs.offset[0].dtype)
+    x, y, z = pairs.offset
+    turn = [part.clone() for part in pairs.rotation]
+    for first, second in ((0, 3), (1, 4), (2, 5)):
+        a, b = turn[first].clone(), turn[second].clone()
+        turn[first], turn[second] = angle.cos() * a - angle.sin() * b, angle.sin() * a + angle.cos() * b
+    gate = pairs.gate
+    if gate is not None and step == 2:
+        gate = torch.where(torch.arange(gate.shape[1]) % 2 == 1, -torch.inf, gate)
+    offset = vec((x + 2e-4 * step, y - 1e-4 * step, z + 3e-4 * step))
+    return meeting._replace(pairs=pairs._replace(rotation=rot(turn), offset=offset, gate=gate))
+
+
+def of(law, dtype):
+    """Return a law's numbers as a module has them."""
+    return Law(*(None if part is None else torch.tensor(part, dtype=torch.float32).to(dtype) for part in law))
+
+
+def nothing_held(meeting):
+    """Return the state of points that hold nothing, those of other objects before them."""
+    num = meeting.source.pair.shape[0] * meeting.source.points[0].shape[2]
+    return {name: torch.cat([torch.full((NUM_ENVS, BEFORE), 9.0), torch.zeros(NUM_ENVS, num)], dim=1) for name in PLANES}
+
+
+def by_kernel(meeting, law, state):
+    """Return what pulls, and change the state in place, as `gripped` has the kernel do on a GPU."""
+    from tgdsl.quantities.points.skin_kernel import grid_tables
+    from tgdsl.sensors.elastomer.grip_kernel import grip_kernel, launch
+
+    (rotation, offset, _, gate), source = meeting
+    places, numbers = torch.stack(source.points)[:, :, 0], [part for part in law if part is not None]
+    how = (*grid_tables(source.links, 0), source.links.shapes[0] == "tricubic")
+    held = [state[name] for name in PLANES]
+    return launch(grip_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
+
+
+def first_ones(count, num_points):
+    """Return which columns of (env, link, point) hold a point that pulls."""
+    return torch.arange(num_points) < count[..., None]
+
+
+def check(case, law):
+    """Make some steps, and compare each with the torch code in float64 from the same anchors.
+
+    Returns how many points took hold, let go, slid and pulled.
+    """
+    exact, meeting = made(case, torch.float64), made(case, torch.float32)
+    state, seen = nothing_held(meeting), torch.zeros(4)
+    for step in range(STEPS):
+        before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
+        (pull,), expected = advance([met_points(moved(exact, step))], of(law, torch.float64), before)
+        found, count = by_kernel(moved(meeting, step), of(law, torch.float32), state)
+        for name, plane in state.items():
+            assert (plane[:, :BEFORE] == 9).all()
+            torch.testing.assert_close(plane[:, BEFORE:].double(), expected[name], rtol=0, atol=PLACE)
+        pulls = torch.stack(pull.strength).ne(0).any(dim=0)
+        assert torch.equal(count, pulls.sum(dim=-1)), (case, step)
+        apart = (
+            found[:, first_ones(count, pulls.shape[2])].double() - torch.stack([*pull.pos, *pull.strength])[:, pulls]
+        ).abs()
+        assert not apart.numel() or (apart[:3].max() <= PLACE and apart[3:].max() <= STRENGTH), (case, step)
+        held, after = before["held"] > 0, expected["held"] > 0
+        dragged = held & after & (expected["anchor_x"] != before["anchor_x"])
+        seen += torch.stack([part.sum() for part in (after & ~held, held & ~after, dragged, pulls)])
+    return seen
+
+
+def check_strange_poses():
+    """A pose that is not a number comes out, gated or not, is not remembered, and is in no other link or environment."""
+    meeting, law = made("cubes", torch.float32), of(SLIDES, torch.float32)
+    state = nothing_held(meeting)
+    for step in range(2):
+        by_kernel(moved(meeting, step), law, state)
+    num_points = meeting.source.points[0].shape[2]
+    clean, count = by_kernel(moved(meeting, 1), law, {name: plane.clone() for name, plane in state.items()})
+    own, others = slice(BEFORE, BEFORE + num_points), torch.ones(count.shape, dtype=torch.bool)
+    others[2, 0] = False
+    for gate in (0.0, -torch.inf, torch.nan):
+        broken, after = moved(meeting, 1), {name: plane.clone() for name, plane in state.items()}
+        pair = int(broken.source.pair[0])
+        broken.pairs.offset[1][2, pair], broken.pairs.gate[2, pair] = torch.nan, gate
+        found, told = by_kernel(broken, law, after)
+        assert told[2, 0] == num_points and found[0, 2, 0].isnan().all()
+        for name, plane in after.items():
+            expected = state[name][2, own] if gate != -torch.inf else torch.zeros(num_points)
+            assert torch.equal(plane[2, own], expected) or name != "held"
+        assert torch.equal(told[others], count[others])
+        pulls = first_ones(told, num_points) & others[..., None]
+        assert torch.equal(found[:, pulls], clean[:, pulls])
+
+
+def check_sums():
+    """A module's own way by both kernels moves the markers as the torch code does."""
+    from tgdsl.sensors.elastomer import grip_kernel, point_sum_kernel
+
+    grip_kernel.grip = partial(grip_kernel.launch, grip_kernel.grip_kernel)
+    point_sum_kernel.point_sum = partial(point_sum_kernel.launch, point_sum_kernel.point_sum_kernel)
+    meeting, exact = made("cubes", torch.float32), made("cubes", torch.float64)
+    state = {name: plane[:, BEFORE:].contiguous() for name, plane in nothing_held(meeting).items()}
+    places = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]], dtype=torch.float64)
+    numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
+    for step in range(3):
+        before = {name: plane.double() for name, plane in state.items()}
+        pulls, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
+        markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
+        expected = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
+        point_anchors.takes_kernel = lambda *_: True
+        point_anchors.are_for_kernel = lambda _: True
+        pulls, after = gripped([moved(meeting, step)], of(SLIDES, torch.float32), state)
+        markers = point_anchors.Markers(vec(0.003 * places.T.float()), vec(places.T.float()), *numbers.float())
+        found = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
+        point_anchors.takes_kernel = lambda *_: False
+        point_anchors.are_for_kernel = lambda _: False
+        assert after == {} and (step != 1 or expected.abs().max() > 1e-9)
+        torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
+
+
+def compare() -> None:
+    """Make all comparisons: run where `TRITON_INTERPRET` is set."""
+    for law in LAWS.values():
+        seen = torch.stack([check(case, law) for case in CASES]).sum(dim=0)
+        assert (seen[[0, 1, 3]] > 10).all() and (seen[2] > 10) == (law.slip is not None), seen
+    check_strange_poses()
+    check_sums()
+
+
+@needs_triton
+def test_the_kernel_is_the_torch_code():
+    interpreted(__file__)
+
+
+def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
+    """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
+    sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
+    touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
+    (shape,), below = touch.plan.skin.shapes, []
+    random = torch.Generator().manual_seed(0)
+    nums, firsts, cells, values = (touch.constants[f"links/0/{name}"] for name in ("num", "first", "cell", "values"))
+    for num, first, cell in zip(nums, firsts, cells.double(), strict=True):
+        nodes = values[first : first + num.prod()].double().view(*num)
+        at = torch.rand((100_000, 3), generator=random, dtype=torch.float64) * (num - 1)
+        grid = one_grid(nodes, torch.zeros(3, dtype=torch.float64), cell)
+        distance, _ = METHODS[shape](vec((cell * at).T), grid)
+        below.append(float((nodes[tuple((at + 0.5).long().T)] - distance).max() / cell))
+    assert 0.5 < max(below) < 0.95
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_without_a_kernel_all_objects_are_advanced_by_torch(law):
+    """Of links with several meshes too."""
+    for case in ("cubes", "several meshes"):
+        meeting = made(case, torch.float64)
+        state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
+        (pull,), after = gripped([meeting], of(LAWS[law], torch.float64), state)
+        (expected,), wanted = advance([met_points(meeting)], of(LAWS[law], torch.float64), state)
+        assert pull.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
+        assert torch.equal(torch.stack(pull.strength), torch.stack(expected.strength))
+
+
+if __name__ == "__main__":
+    compare()

@@ -1,0 +1,350 @@
+"""The shares of contacts, without a scene: against loops in NumPy, against scipy's minimiser, and against what they promise."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from tgdsl.sensors.force_taxel.footprint import LEVENBERG, footprint, reference
+
+RADIUS = 0.01
+TOLERANCE = 1e-12
+"""Both are float64 and take the same steps; where the moment is out of reach a step's system has a condition of 1e4."""
+
+
+def pad(spacing=0.005, num=8):
+    line = (np.arange(num) - (num - 1) / 2) * spacing
+    x, y = np.meshgrid(line, line, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(num * num)])
+
+
+def contacts(rng, num, half=0.012, height=0.0, shear=0.4):
+    """Contacts on the pad, which push it down."""
+    point = np.column_stack([rng.uniform(-half, half, (num, 2)), np.full(num, height)])
+    force = rng.uniform(0.2, 1.0, (num, 1)) * np.column_stack([shear * rng.uniform(-1, 1, (num, 2)), -np.ones(num)])
+    return point, force, np.zeros((num, 3))
+
+
+def up(pos):
+    """Normals of taxels on a flat pad."""
+    return np.tile([0.0, 0.0, 1.0], (len(pos), 1))
+
+
+def shared(
+    pos,
+    point,
+    force,
+    torque,
+    depth=None,
+    steps=4,
+    is_active=None,
+    dtype=torch.float64,
+    radius=RADIUS,
+    outward=None,
+    normal=None,
+):
+    """Return the shares (contact, taxel) and the residual of one environment; of contacts from above, if nothing is said."""
+    outward, normal = up(pos) if outward is None else outward, -up(point) if normal is None else normal
+    depth = np.full(len(pos), 0.5) if depth is None else depth
+    is_active = np.ones(len(pos), dtype=bool) if is_active is None else is_active
+    vectors = [tuple(torch.tensor(v.T[:, None], dtype=dtype)) for v in (point, force, torque, normal)]
+    result = footprint(
+        tuple(torch.tensor(pos.T, dtype=dtype)),
+        torch.tensor(is_active),
+        torch.tensor(depth[None], dtype=dtype),
+        tuple(torch.tensor(-2.0 * outward.T, dtype=dtype)),
+        *vectors,
+        torch.tensor(radius, dtype=dtype),
+        torch.full((steps,), LEVENBERG, dtype=dtype),
+    )
+    return result.share[0].numpy(), np.array([float(part[0]) for part in result.residual])
+
+
+def left_over(pos, point, force, torque, share):
+    """Return Σ_c Σ_j share_cj ((x_c − x_j) × f_c + τ_c): what the residual is by definition."""
+    arms = point[:, None] - pos[None]
+    couple = np.cross(arms, force[:, None]) + torque[:, None]
+    return (share[..., None] * couple).sum(axis=(0, 1))
+
+
+@pytest.mark.parametrize("steps", [0, 1, 4, 12])
+@pytest.mark.parametrize("half", [0.012, 0.03])
+def test_shares_are_those_of_the_loops(steps, half):
+    """In reach and out of it, with inactive taxels, with torques, with contacts of no force."""
+    rng = np.random.default_rng(steps)
+    pos, is_active, worst = pad(), rng.random(64) > 0.1, 0.0
+    for _ in range(10):
+        point, force, torque = contacts(rng, 3, half)
+        torque = 1e-4 * rng.normal(size=(3, 3))
+        force[2] = 0
+        depth = rng.uniform(0, 1, 64)
+        sides = rng.normal([0, 0, 1], 0.5, (64, 3)), rng.normal([0, 0, -1], 0.5, (3, 3))
+        outward, normal = (side / np.linalg.norm(side, axis=1)[:, None] for side in sides)
+        share, residual = shared(pos, point, force, torque, depth, steps, is_active, outward=outward, normal=normal)
+        contact = point, force, torque, normal
+        expected, left = reference(pos, is_active, depth, outward, *contact, RADIUS, (LEVENBERG,) * steps)
+        np.testing.assert_allclose(share, expected, atol=TOLERANCE)
+        np.testing.assert_allclose(residual, left, atol=TOLERANCE * RADIUS)
+        np.testing.assert_allclose(residual, left_over(pos, point, force, torque, share), atol=1e-15)
+        assert not share[:, ~is_active].any()
+        worst = max(worst, np.abs(share).max())
+    assert worst > 0.05
+
+
+def test_the_shares_are_those_of_least_relative_entropy():
+    """Scipy minimises Σ_c |f_c| Σ_j λ_cj ln(λ_cj/λ⁰_cj) over all shares that have the contacts' moment, and knows no dual."""
+    rng = np.random.default_rng(5)
+    pos = pad(0.006, 5)
+    point, force, torque = contacts(rng, 2, 0.006, shear=0.3)
+    point[1] = point[0] + [0.003, -0.002, 0]
+    depth = rng.uniform(0.2, 1, 25)
+    prior, _ = shared(pos, point, force, torque, depth, steps=0)
+    found, residual = shared(pos, point, force, torque, depth, steps=20)
+    assert np.abs(residual).max() < 1e-15
+    at = np.argwhere(prior > 0)
+    weight, first = np.linalg.norm(force, axis=1)[at[:, 0]], prior[at[:, 0], at[:, 1]]
+    moment = np.cross(pos[at[:, 1]] - point[at[:, 0]], force[at[:, 0]]).T / RADIUS
+    member = np.array([at[:, 0] == c for c in range(2)], dtype=float)
+    rows = np.concatenate([member, moment])
+
+    def entropy(share):
+        return float(np.sum(weight * share * np.log(share / first)))
+
+    result = minimize(
+        entropy,
+        first,
+        jac=lambda share: weight * (np.log(share / first) + 1),
+        method="SLSQP",
+        bounds=[(1e-9, 1)] * len(first),
+        constraints={"type": "eq", "fun": lambda s: rows @ s - [1, 1, 0, 0, 0], "jac": lambda s: rows},
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    ours = found[at[:, 0], at[:, 1]]
+    assert np.abs(ours - first).max() > 0.01  # the moment does ask for something
+    np.testing.assert_allclose(rows @ ours, [1, 1, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(ours, result.x, atol=2e-5)
+    assert entropy(ours) <= result.fun + 1e-9
+
+
+def test_a_small_correction_is_the_least_norm_one():
+    """To first order in the moment: λ = λ⁰ (1 + β · (g − ḡ)), β from the covariance of g under λ⁰."""
+    pos = pad()
+    point, force, torque = np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, -1.0]]), np.zeros((1, 3))
+    prior, _ = shared(pos, point, force, torque, steps=0)
+    g = np.cross(pos - point, force) / RADIUS
+    covariance = (prior[0, :, None, None] * g[:, :, None] * g[:, None]).sum(axis=0)[:2, :2]
+    for size in (1e-3, 1e-4):  # the error is of second order
+        torque = np.array([[size, -0.5 * size, 0]]) * RADIUS
+        beta = np.linalg.solve(covariance, [size, -0.5 * size])
+        share, _ = shared(pos, point, force, torque, steps=8)
+        linear = prior[0] * (1 + g[:, :2] @ beta)
+        np.testing.assert_allclose(share[0], linear, atol=10 * size**2)
+
+
+def test_four_steps_suffice_where_the_moment_is_in_reach():
+    """Contacts anywhere in the middle of the pad: four steps leave little of force times footprint, and twelve leave less.
+
+    Where contacts' forces differ in direction, one direction of β has hardly any effect, and is the last to be found.
+    """
+    rng = np.random.default_rng(7)
+    left = []
+    for _ in range(100):
+        point, force, torque = contacts(rng, 1 + rng.integers(4), 0.008)
+        depth, scale = rng.uniform(0.1, 1, 64), np.linalg.norm(force, axis=1).sum() * RADIUS
+        left.append([np.linalg.norm(shared(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 12)])
+    none, four, twelve = np.array(left).T
+    assert np.median(none) > 0.02
+    assert np.median(four) < 1e-4
+    assert four.max() < 5e-3
+    assert np.median(twelve) < 1e-8
+    assert (twelve <= 1.01 * four + 1e-15).all()
+
+
+def test_more_steps_never_leave_more():
+    """Also where the moment is out of reach, and with depths that span three decades: no step makes the residual grow for good."""
+    rng = np.random.default_rng(8)
+    for _ in range(40):
+        point, force, torque = contacts(rng, 2, 0.025, height=rng.uniform(-0.003, 0.003), shear=1.0)
+        depth, scale = 10 ** rng.uniform(-3, 0, 64) * (rng.random(64) > 0.5), np.linalg.norm(force, axis=1).sum() * RADIUS
+        left = [np.linalg.norm(shared(pad(), point, force, torque, depth, steps)[1]) / scale for steps in (0, 4, 16, 48)]
+        assert np.all(np.isfinite(left))
+        assert left[1] <= left[0] + 1e-3
+        assert left[2] <= left[1] + 1e-3
+        assert left[3] <= left[2] + 1e-9
+
+
+def test_a_single_row_has_no_moment_about_itself():
+    """A force beside a row of taxels: along the row the place is met, across it the couple is left and is named."""
+    pos = pad()[3::8]  # a row along x, at y of −2.5 mm
+    assert np.ptp(pos[:, 1]) == 0
+    point, force = np.array([[0.0012, pos[0, 1] + 0.002, 0.0]]), np.array([[0.0, 0.0, -2.0]])
+    share, residual = shared(pos, point, force, np.zeros((1, 3)), steps=12)
+    assert share.sum() == pytest.approx(1, abs=1e-14)
+    np.testing.assert_allclose(share[0] @ pos[:, 0], 0.0012, atol=1e-12)
+    np.testing.assert_allclose(residual, [-2.0 * 0.002, 0, 0], atol=1e-12)
+
+
+def test_a_split_contact_counts_as_one():
+    """The same place and direction in unequal parts, beside another contact: the taxels' forces are the same."""
+    rng = np.random.default_rng(9)
+    point, force, torque = contacts(rng, 2, 0.02)
+    torque = 1e-3 * rng.normal(size=(2, 3))
+    depth = rng.uniform(0, 1, 64)
+    share, residual = shared(pad(), point, force, torque, depth)
+    split = [np.concatenate([v[:1] * part, v[:1] * (1 - part), v[1:]]) for v, part in ((force, 0.3), (torque, 0.3))]
+    parts, left = shared(pad(), point[[0, 0, 1]], *split, depth)
+    np.testing.assert_allclose(parts.T @ split[0], share.T @ force, atol=TOLERANCE)
+    np.testing.assert_allclose(left, residual, atol=TOLERANCE * RADIUS)
+
+
+def test_what_is_captured_fades_with_distance():
+    """All of a contact up to half a footprint from the outermost taxel, nothing from a whole one, by the smooth step between."""
+    pos, force = np.zeros((1, 3)), np.array([[0.1, 0.0, -1.0]])
+    for distance, expected in ((0.0, 1), (0.5, 1), (0.5 + 1e-9, 1), (np.sqrt(0.625), 0.5), (1.0, 0), (1.5, 0), (100.0, 0)):
+        point = np.array([[distance * RADIUS, 0, 0]])
+        share, _ = shared(pos, point, force, np.zeros((1, 3)))
+        assert share.sum() == pytest.approx(expected, abs=1e-12), distance
+
+
+def turned(cosine):
+    """A contact's normal that has an angle of this cosine to straight down."""
+    return np.array([[np.sqrt(1 - cosine**2), 0.0, -cosine]])
+
+
+@pytest.mark.parametrize(
+    ("cosine", "expected"), [(1, 1), (0.5, 1), (0.375, 1), (0.1875, 0.5), (0.09375, 0.15625), (0, 0), (-0.2, 0), (-1, 0)]
+)
+def test_a_contact_is_captured_by_taxels_on_its_side(cosine, expected):
+    """At a taxel, κ is twice the cosine up to 1 and t is 4/3 of that: γ = t²(3 − 2t), whatever way the force points."""
+    for force in ([[0.0, 0.0, -1.0]], [[0.3, 0.2, 1.0]]):
+        share, _ = shared(np.zeros((1, 3)), np.zeros((1, 3)), np.array(force), np.zeros((1, 3)), normal=turned(cosine))
+        assert share.sum() == pytest.approx(expected, abs=1e-12)
+
+
+def test_taxels_that_face_a_contact_more_carry_more():
+    """Two taxels as near and as deep, one at right angles to the other: κ of 1 and 1/2 by a contact at 60° and near 30°."""
+    pos, outward = np.array([[0.003, 0, 0], [-0.003, 0, 0]]), np.array([[0.0, 0, 1], [1.0, 0, 0]])
+    for cosine, expected in ((np.sqrt(15) / 4, [0.8, 0.2]), (1.0, [1, 0]), (0.0, [0, 1])):
+        normal = -turned(cosine) * [[1, 1, -1]]
+        share, _ = shared(
+            pos, np.zeros((1, 3)), np.array([[0, 0, -1.0]]), np.zeros((1, 3)), steps=0, outward=outward, normal=normal
+        )
+        np.testing.assert_allclose(share[0], expected, atol=1e-12)
+
+
+def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
+    """A ball rolls around a round finger of 8 mm whose front has taxels: to the back all is handed over, without a jump.
+
+    The back is 16 mm from the front, nearer than the footprint reaches.
+    """
+    angle = np.radians(np.linspace(-80, 80, 9))
+    outward = np.array([[np.sin(a), 0, np.cos(a)] for a in angle for _ in range(3)])
+    pos = 0.008 * outward + [[0, y, 0] for _ in angle for y in (-0.004, 0, 0.004)]
+    depth = np.random.default_rng(4).uniform(0, 1, len(pos))
+
+    def roll(num):
+        found = []
+        for a in np.linspace(0, np.pi, num):
+            out = np.array([[np.sin(a), 0, np.cos(a)]])
+            force = -out + [[0, 0.3, 0]]
+            share, left = shared(pos, 0.008 * out, force, np.zeros((1, 3)), depth, outward=outward, normal=-out, radius=0.02)
+            found.append(np.concatenate([(share.T @ force).ravel(), left / 0.02, [share.sum()]]))
+        return np.array(found)
+
+    coarse, fine = roll(401), roll(801)
+    np.testing.assert_array_equal(coarse[-1], 0)
+    assert coarse[0, -1] == pytest.approx(1, abs=1e-12)
+    change = np.abs(np.diff(coarse, axis=0)).max()
+    assert change < 12 * np.pi / 400  # some times the force per radian
+    assert np.abs(np.diff(fine, axis=0)).max() == pytest.approx(change / 2, rel=0.2)
+
+
+def test_forces_are_continuous_as_a_contact_slides_off():
+    """Over the pad's edge and beyond, no force jumps, and halving the step halves the change."""
+    pos, force = pad(), np.array([[0.3, -0.2, -1.0], [0, 0, -0.5]])
+    depth = np.random.default_rng(3).uniform(0, 1, 64)
+
+    def slide(num):
+        point = np.tile([[0.0, 0.013, 0.001], [0.01, 0, 0]], (num, 1, 1))
+        point[:, 0, 0] = np.linspace(0.016, 0.0285, num)
+        tiled = (np.tile(each, (num, 1, 1)) for each in (force, np.zeros((2, 3)), -up(force)))
+        vectors = [torch.tensor(v) for v in (point, *tiled)]
+        result = footprint(
+            tuple(torch.tensor(pos.T)),
+            torch.ones(64, dtype=torch.bool),
+            torch.tensor(np.tile(depth, (num, 1))),
+            tuple(torch.tensor(-2.0 * up(pos).T)),
+            *(v.unbind(-1) for v in vectors),
+            torch.tensor(RADIUS, dtype=torch.float64),
+            torch.full((4,), LEVENBERG, dtype=torch.float64),
+        )
+        forces = torch.einsum("ecj,ck->ejk", result.share, torch.tensor(force)).flatten(1)
+        path = torch.cat([forces, torch.stack(result.residual, dim=1) / RADIUS], dim=1).numpy()
+        return path, np.abs(np.diff(path, axis=0)).max()
+
+    path, coarse = slide(401)
+    _, fine = slide(801)
+    reach = 0.0125
+    assert np.abs(path[0] - path[-1]).max() > 0.1
+    assert coarse < 10 * reach / 400 / RADIUS  # at most ten times the force per footprint
+    assert fine == pytest.approx(coarse / 2, rel=0.2)
+
+
+def test_a_contact_that_appears_begins_with_nothing():
+    """A second contact of force ε, in reach and at the edge of it, changes every taxel's force by no more than some ε."""
+    rng = np.random.default_rng(12)
+    for x in (0.004, 0.024, 0.0268):
+        point, force, _ = contacts(rng, 2)
+        point[1] = [x, 0.002, 0.0]
+        depth = rng.uniform(0, 1, 64)
+        alone, left = shared(pad(), point[:1], force[:1], np.zeros((1, 3)), depth)
+        for size in (1e-3, 1e-6, 1e-9):
+            both, rest = shared(pad(), point, force * [[1], [size]], np.zeros((2, 3)), depth)
+            np.testing.assert_allclose(both.T @ (force * [[1], [size]]), alone.T @ force[:1], atol=20 * size)
+            np.testing.assert_allclose(rest, left, atol=20 * size * RADIUS)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_derivatives_are_finite_without_a_force(dtype):
+    """Unused slots at the origin, a contact at a taxel, contacts of no force, contacts beyond reach: no infinity, no NaN."""
+    pos = torch.tensor(pad().T, dtype=dtype)
+    point = torch.tensor([[0, 0, 0], [0.0025, 0.0025, 0], [1.0, 1.0, 0], [0.0275, 0.0175, 0]], dtype=dtype).T[:, None]
+    for force in (torch.zeros(3, 1, 4, dtype=dtype), torch.tensor([0.0, 0, -1], dtype=dtype)[:, None, None].repeat(1, 1, 4)):
+        down = torch.tensor([0.0, 0, -1], dtype=dtype)[:, None, None] * (force != 0).any(dim=0)
+        inputs = [point.clone(), force.clone(), torch.zeros_like(force), down, torch.zeros(1, 64, dtype=dtype)]
+        point_, force_, torque_, normal_, depth = (value.requires_grad_() for value in inputs)
+        result = footprint(
+            (pos[0], pos[1], pos[2]),
+            torch.ones(64, dtype=torch.bool),
+            depth,
+            tuple(torch.tensor(-2.0 * up(pad()).T, dtype=dtype)),
+            (point_[0], point_[1], point_[2]),
+            (force_[0], force_[1], force_[2]),
+            (torque_[0], torque_[1], torque_[2]),
+            (normal_[0], normal_[1], normal_[2]),
+            torch.tensor(RADIUS, dtype=dtype),
+            torch.full((4,), LEVENBERG, dtype=dtype),
+        )
+        total = sum(result.residual, (result.share[..., None] * force_[:, 0].T[None, :, None]).square().sum()).sum()
+        for gradient in torch.autograd.grad(total, [point_, force_, torque_, normal_, depth]):
+            assert torch.isfinite(gradient).all()
+
+
+def test_shares_are_differentiable():
+    rng = np.random.default_rng(11)
+    point, force, torque = contacts(rng, 3, 0.02)
+    pos = tuple(torch.tensor(pad(0.006, 4).T))
+    normal = np.array([[0.0, 0.0, -1.0], [0.6, 0.6, -0.4], [-0.8, 0.5, -0.3]])
+    inputs = [torch.tensor(v.T[:, None], requires_grad=True) for v in (point, force, torque + 1e-4, normal)]
+    inward = tuple(torch.tensor(-2.0 * up(pad(0.006, 4)).T))
+    depth = torch.tensor(rng.uniform(0.1, 1, (1, 16)), requires_grad=True)
+
+    def forces(point, force, torque, normal, depth):
+        planes = [(v[0], v[1], v[2]) for v in (point, force, torque, normal)]
+        radius, steps = torch.tensor(RADIUS, dtype=torch.float64), torch.full((3,), LEVENBERG, dtype=torch.float64)
+        result = footprint(pos, torch.ones(16, dtype=torch.bool), depth, inward, *planes, radius, steps)
+        return torch.cat(
+            [*((result.share * part[..., None]).sum(dim=1) for part in planes[1]), torch.stack(result.residual, 1)], 1
+        )
+
+    assert torch.autograd.gradcheck(forces, [*inputs, depth], eps=1e-7, atol=1e-5, rtol=1e-4)

@@ -1,0 +1,383 @@
+"""Force taxels against their reference, and contacts made by hand: no force is lost, made up, or pushed where none can be."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from cube_on_pad import FOOTPRINT, TAXELS, pad, settled
+
+import tgdsl
+from tgdsl.errors import LowerError
+from tgdsl.layout.layout import Layout, Link
+from tgdsl.module.state import SceneState
+from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL, ForceTaxelSpec, lower, reference_reports
+from tgdsl.testing import KindConformance
+from tgdsl.testing.reference import assert_agrees
+
+G = 9.81
+ROUNDING = 1e-12
+"""Sums of float64 forces of about 1 N."""
+
+
+class TestForceTaxel(KindConformance):
+    kind = FORCE_TAXEL
+    float64_tolerance = 1e-11  # a step towards the moment solves a system of condition up to 1e3, and there are four
+
+    def test_what_is_missed_and_left_over_are_the_references(self, scene):
+        module, reference = self.build(self.document(scene), torch.float64)
+        for state in self.states(module):
+            readings = module(state)
+            for env in range(self.num_envs):
+                felt = reference._touch(state, env, np.zeros(3))
+                _, missed, residual = reference_reports(reference.spec, reference.layout, felt)
+                np.testing.assert_allclose(readings["s/missed"][env], missed, atol=1e-11)
+                np.testing.assert_allclose(readings["s/residual"][env], residual, atol=1e-12)
+            assert readings["s/missed"].abs().max() > 0.1
+            assert readings["s/residual"].abs().max() > 1e-4
+
+    @pytest.mark.filterwarnings("ignore:contacts of")
+    def test_what_slots_lack_is_shared_out_as_in_the_reference(self, scene):
+        """Pairs whose net force is that of more contacts than are shown: the definition adds it up one contact at a time."""
+        module, reference = self.build(self.document(scene), torch.float64)
+        for state in self.states(module):
+            lacking = torch.randn(state.contact_netforce.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+            state = dataclasses.replace(state, contact_netforce=state.contact_netforce + lacking)
+            assert_agrees(module(state)["s"], reference, state, self.float64_tolerance)
+
+
+class TestForceTaxelWithPressure(KindConformance):
+    kind = FORCE_TAXEL
+    parameters = {"outputs": ["pressure", "force"], "footprint": 0.02, "moment_iterations": 2, "slots": 2}
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+    float64_tolerance = 1e-11
+
+
+# Contacts made by hand
+
+
+def state_of(touch, pos, force, torque=None, net=None, depth=0.001, normal=(0, 0, -1)):
+    """Return a state with given contacts on the pad [m], [N]; the cube is `depth` above its surface."""
+    num, slots = len(pos), touch.inputs.slots
+    fields = {name: torch.zeros(1, 1, slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")}
+    fields["pos"][0, 0, :num] = torch.tensor(np.array(pos))
+    fields["force"][0, 0, :num] = torch.tensor(np.array(force))
+    fields["normal"][0, 0, :num] = torch.tensor(np.array(normal, dtype=float))
+    if torque is not None:
+        fields["torque"][0, 0, :num] = torch.tensor(np.array(torque))
+    net = np.sum(force, axis=0) if net is None else net
+    rows = [[0.0, 0, 0.03 + depth] if body == "cube" else [0.0, 0, 0] for body in touch.inputs.bodies]
+    return SceneState(
+        body_pos=torch.tensor([rows], dtype=torch.float64),
+        body_quat=torch.tensor([[[1.0, 0, 0, 0]] * len(rows)], dtype=torch.float64),
+        contact_found=torch.ones(1, 1),
+        contact_netforce=torch.tensor(np.array([[net]])),
+        **{f"contact_{name}": value for name, value in fields.items()},
+    )
+
+
+@pytest.mark.filterwarnings("ignore:contacts of pad – cube are more than `slots")
+def test_every_newton_is_somewhere(tmp_path):
+    """Random contacts on, beside and far from the pad, more of them than slots, in float32: Σ f + missed = net to rounding."""
+    rng = np.random.default_rng(0)
+    touch = pad(tmp_path, dtype=torch.float32, slots=3)
+    for _ in range(50):
+        pos, force = rng.normal(size=(3, 3)) * [0.03, 0.03, 0.005] + [0, 0, 0.01], rng.normal(size=(3, 3))
+        net = force.sum(axis=0) + rng.normal(size=3)
+        readings = touch(state_of(touch, pos, force, net=net))
+        total = readings["s"][0].double().sum(dim=0) + readings["s/missed"][0, 0].double()
+        np.testing.assert_allclose(total, net, atol=1e-6 * max(1.0, np.abs(force).sum()))
+
+
+def test_a_contact_far_from_all_taxels_is_missed(tmp_path):
+    touch = pad(tmp_path)
+    readings = touch(state_of(touch, [[0.0, 0.055, 0.01]], [[0.3, 0.1, -2.0]]))
+    assert not readings["s"].any()
+    np.testing.assert_array_equal(readings["s/missed"][0, 0], [0.3, 0.1, -2.0])
+    np.testing.assert_array_equal(readings["s/residual"][0, 0], [0, 0, 0])
+
+
+@pytest.mark.filterwarnings("ignore:contacts of pad – cube are more than `slots")
+def test_contacts_beyond_the_slots_act_where_the_others_do(tmp_path):
+    """A cube rests on four points; with one slot the taxels around that one carry them all, and none of it is lost."""
+    touch = pad(tmp_path, slots=1)
+    state = settled(touch)
+    assert state.contact_found[0, 0] == 4
+    assert abs(state.contact_force[0, 0, 0, 2]) < 0.5 * 0.25 * G
+    readings = touch(state)
+    np.testing.assert_allclose(readings["s"][0].sum(dim=0), state.contact_netforce[0, 0], atol=ROUNDING)
+    np.testing.assert_allclose(readings["s/missed"][0, 0], 0, atol=ROUNDING)
+    away = np.array(TAXELS) - state.contact_pos[0, 0, 0].numpy()
+    assert not readings["s"][0][np.linalg.norm(away, axis=1) > FOOTPRINT].any()
+
+
+def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
+    """From the pad's middle to beyond its reach: force and missed always sum to the contact's, and neither ever jumps."""
+    touch = pad(tmp_path)
+    force = np.array([0.4, 0.0, -1.0])
+    captured = []
+    for y in np.linspace(0.0, 0.045, 151):
+        readings = touch(state_of(touch, [[0.002, y, 0.01]], [force]))
+        total = readings["s"][0].sum(dim=0).numpy()
+        np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), force, atol=1e-15)
+        captured.append(total[2])
+    captured = -np.array(captured)
+    assert captured[0] == pytest.approx(1, abs=1e-12)
+    assert captured[-1] == 0
+    # The smooth step over the squared distance: slope at most 3/2 · 2 y/(r_f² 3/4) = 4/r_f, in steps of 0.3 mm.
+    assert np.abs(np.diff(captured)).max() <= 12e-4 / FOOTPRINT
+    assert ((captured > 0.01) & (captured < 0.99)).sum() > 10
+
+
+def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
+    """A ball rolls over the edge of the pad at the outermost taxels: the normal turns, and by a right angle all is missed."""
+    touch = pad(tmp_path)
+    forces = []
+    for angle in np.linspace(0, np.pi / 2, 151):
+        normal = np.array([-np.sin(angle), 0, -np.cos(angle)])
+        readings = touch(state_of(touch, [[0.025, 0.005, 0.01]], [normal], normal=normal))
+        forces.append(readings["s"][0].numpy())
+        total = forces[-1].sum(axis=0)
+        np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), normal, atol=1e-15)
+        assert (forces[-1] @ normal >= 0).all()
+        t = min(1, 2 * np.cos(angle) / 0.75)
+        np.testing.assert_allclose(total @ normal, t**2 * (3 - 2 * t), atol=1e-12)
+    # Slope of the smooth step at most 3/2 · 2/0.75, that of the force's direction 1.
+    assert np.abs(np.diff(forces, axis=0)).max() <= 5 * np.pi / 2 / 150
+
+
+HANDS = {"xhand1": "*_link2", "sharpa": "*_elastomer"}
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("hand", HANDS)
+def test_the_nail_is_not_the_pad(hand, side):
+    """What presses on the back of a fingertip is missed, though within the footprint of the pad's taxels; what presses there is not.
+
+    The back is the farthest triangle of the link's mesh behind the taxel in the pad's middle.
+    """
+    folder = Path(__file__).parents[3] / "robots" / hand
+    model = folder / f"{hand}_{side}.xml"
+    tips = {"include": [HANDS[hand]], "exclude": ["*back*"]}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(model), "layout": str(folder / ("layout.yaml" if side == "right" else "layout_left.yaml"))},
+            "resolution": "low",
+            "objects": {"ball": {"geom": {"type": "sphere", "size": [0.005]}}},
+            "sensors": {"s": {"kind": "force_taxel", "links": tips, "feels": ["ball"], "footprint": 0.03}},
+        },
+        dtype=torch.float64,
+    )
+    taxels, compiled = touch.taxels["s"], mujoco.MjModel.from_xml_path(str(model))
+    bodies = touch.outputs[0].bodies
+    assert len(bodies) == 5
+    for row, body in enumerate(bodies):
+        own = taxels[taxels["body"] == body]
+        middle = own[np.linalg.norm(own["pos"] - own["pos"].mean(axis=0), axis=1).argmin()]
+        back, outward = behind(compiled, body, middle["pos"], middle["normal"])
+        assert 0.008 < np.linalg.norm(back - middle["pos"]) < 0.025
+        for pos, normal, missed in ((middle["pos"], middle["normal"], 0.0), (back, outward, 1.0)):
+            state = touch.example_state(1)
+            fields = [getattr(state, f"contact_{name}") for name in ("pos", "force", "torque", "normal", "netforce")]
+            for field in (state.body_pos, *fields):
+                field[:] = 0
+            state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
+            pair = [pair.link for pair in touch.inputs.pairs].index(body)
+            fields[0][0, pair, 0] = torch.tensor(pos)
+            fields[1][0, pair, 0] = fields[3][0, pair, 0] = fields[4][0, pair] = -torch.tensor(normal)
+            readings = touch(state)
+            np.testing.assert_allclose(readings["s/missed"][0, row], -missed * normal, atol=ROUNDING)
+            np.testing.assert_allclose(readings["s"][0].sum(dim=0), (missed - 1) * normal, atol=ROUNDING)
+
+
+def behind(model, body, start, normal):
+    """Return where the line from a place into a body leaves its meshes, and the outward normal there."""
+    corners = []
+    for geom in np.flatnonzero(model.geom_bodyid == model.body(body).id):
+        mesh, rotation = model.geom_dataid[geom], np.zeros(9)
+        first, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+        mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+        vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+        corners.append(vertices[model.mesh_face[face : face + model.mesh_facenum[mesh]]])
+    a, b, c = np.concatenate(corners).transpose(1, 0, 2)
+    out = np.cross(b - a, c - a)
+    across = out @ -normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = np.sum(out * (a - start), axis=1) / across
+        at = start - along[:, None] * normal
+        inside = [np.sum(np.cross(q - p, at - p) * out, axis=1) >= 0 for p, q in ((a, b), (b, c), (c, a))]
+    hit = np.flatnonzero(np.all(inside, axis=0) & (across > 0))
+    last = hit[along[hit].argmax()]
+    return at[last], out[last] / np.linalg.norm(out[last])
+
+
+def test_no_taxel_leaves_the_contacts_cone(tmp_path):
+    """Any contacts of one normal whose forces lie in a friction cone: so does every taxel's, whatever moment they must meet."""
+    rng = np.random.default_rng(2)
+    touch, friction = pad(tmp_path, moment_iterations=8), 0.6
+    num_sheared = 0
+    for _ in range(50):
+        pos = np.column_stack([rng.uniform(-0.03, 0.03, (5, 2)), rng.uniform(0.008, 0.012, 5)])
+        load, angle, part = rng.uniform(0.1, 2, 5), rng.uniform(0, 2 * np.pi, 5), rng.uniform(0, 1, 5)
+        shear = friction * load * part * np.array([np.cos(angle), np.sin(angle)])
+        readings = touch(state_of(touch, pos, np.column_stack([*shear, -load]), 1e-3 * rng.normal(size=(5, 3))))
+        x, y, z = readings["s"][0].numpy().T
+        assert (z <= 0).all()
+        assert (np.hypot(x, y) <= -friction * z + 1e-14).all()
+        num_sheared += int((np.hypot(x, y) > 1e-3).sum())
+    assert num_sheared > 300
+
+
+def test_splitting_a_contact_changes_nothing(tmp_path):
+    touch = pad(tmp_path)
+    pos, force = [[0.004, 0.003, 0.01], [-0.012, 0.008, 0.01]], [[0.2, -0.1, -1.0], [0.0, 0.3, -0.7]]
+    whole = touch(state_of(touch, pos, force))
+    split = touch(state_of(touch, [pos[0], *pos], [0.35 * np.array(force[0]), 0.65 * np.array(force[0]), force[1]]))
+    for name, reading in whole.items():
+        torch.testing.assert_close(split[name], reading, rtol=0, atol=ROUNDING)
+
+
+def test_contacts_come_in_any_order(tmp_path):
+    touch, rng = pad(tmp_path), np.random.default_rng(4)
+    pos = np.column_stack([rng.uniform(-0.03, 0.03, (6, 2)), np.full(6, 0.01)])
+    force, order = rng.normal(size=(6, 3)), rng.permutation(6)
+    expected = touch(state_of(touch, pos, force))
+    found = touch(state_of(touch, pos[order], force[order]))
+    for name, reading in expected.items():
+        torch.testing.assert_close(found[name], reading, rtol=0, atol=ROUNDING)
+
+
+def test_a_torque_is_carried_as_far_as_the_footprint_reaches(tmp_path):
+    """A torsional torque of a contact without shear cannot be carried by pushing and is left whole; a tilting one can."""
+    touch = pad(tmp_path, moment_iterations=12)
+    readings = touch(state_of(touch, [[0.0, 0.0, 0.01]], [[0, 0, -1.0]], [[1e-3, -5e-4, 2e-3]]))
+    moment = np.cross(np.array(TAXELS), readings["s"][0].numpy()).sum(axis=0)
+    np.testing.assert_allclose(moment, [1e-3, -5e-4, 0], atol=1e-9)
+    np.testing.assert_allclose(readings["s/residual"][0, 0], [0, 0, 2e-3], atol=1e-9)
+
+
+def test_the_two_bodies_of_a_sensor_are_told_apart(tmp_path):
+    """Each body's contacts go to its own taxels, however near those of the other are."""
+    text = (
+        "<mujoco><worldbody><body name='a'><geom size='.02'/></body><body name='b'><geom size='.02'/></body>"
+        "<body name='cube'><freejoint/><geom size='.02'/></body></worldbody></mujoco>"
+    )
+    (tmp_path / "scene.xml").write_text(text)
+    points = [{"pos": [x, 0, 0.02], "normal": [0, 0, 1], "radius": 0.004} for x in (0.0, 0.005)]
+    layout = {"a": {"method": "points", "points": points}, "b": {"method": "points", "points": points[:1]}}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": layout}}},
+            "objects": {"cube": {"body": "cube"}},
+            "sensors": {"s": {"kind": "force_taxel", "links": ["a", "b"], "feels": ["cube"]}},
+        },
+        dtype=torch.float64,
+    )
+    state = touch.example_state(1)
+    state.body_pos[:], state.body_quat[:] = 0, torch.tensor([1.0, 0, 0, 0])
+    for field in (state.contact_pos, state.contact_force, state.contact_torque, state.contact_netforce):
+        field[:] = 0
+    b = [pair.link for pair in touch.inputs.pairs].index("b")
+    state.contact_pos[0, b, 0] = torch.tensor([0.001, 0, 0.02])
+    state.contact_normal[0, b, 0] = torch.tensor([0, 0, -1.0])
+    state.contact_force[0, b, 0] = state.contact_netforce[0, b] = torch.tensor([0, 0, -1.0])
+    readings = touch(state)
+    np.testing.assert_array_equal(readings["s"][0], [[0, 0, 0], [0, 0, 0], [0, 0, -1]])
+    np.testing.assert_allclose(readings["s/residual"][0], [[0, 0, 0], [0, 0.001, 0]], atol=1e-18)
+    assert not readings["s/missed"].any()
+
+
+def test_pressure_is_the_force_inwards_over_the_area(tmp_path):
+    """π R² for a taxel that is given no area; what pulls has no pressure."""
+    touch = pad(tmp_path, outputs=["pressure", "force"])
+    for sign in (1, -1):
+        reading = touch(state_of(touch, [[0.003, 0.002, 0.01]], [[0.1, 0.2, -sign * 1.5]]))["s"][0].numpy()
+        expected = np.maximum(0, -reading[:, 2]) / (np.pi * 0.004**2)
+        np.testing.assert_allclose(reading[:, 3], expected, rtol=1e-12)
+        assert reading[:, 3].any() == (sign > 0)
+    assert touch.outputs[0].channels == ("force_x", "force_y", "force_z", "pressure")
+    assert touch.outputs[0].units == ("N", "N", "N", "Pa")
+
+
+def test_a_taxel_without_area_has_no_pressure():
+    one = np.array([[0.0, 0.0, 1.0]])
+    layout = Layout(
+        (Link("pad", "pad"),),
+        {},
+        np.zeros(1, dtype=np.int64),
+        one,
+        one,
+        one,
+        np.ones(1),
+        np.zeros(1),
+        -np.ones((1, 2), dtype=np.int64),
+    )
+    spec = ForceTaxelSpec(kind="force_taxel", links={"include": ("pad",)}, feels=("cube",), outputs=("pressure",))
+    with pytest.raises(LowerError, match=r"^a taxel of no area has no pressure; leave pressure out, or give its area$"):
+        lower(spec, layout, lambda name, parts: pytest.fail("no surface is needed"))
+    assert lower(spec, dataclasses.replace(layout, area=np.ones(1)), lambda name, parts: pytest.fail("none")).slots == 8
+
+
+THREADS = Path("/proc/self/task")
+READ_IN_ONE_ENVIRONMENT = """
+import os, pathlib, time, torch, tgdsl
+
+def of_others():
+    threads = [each for each in pathlib.Path("/proc/self/task").iterdir() if int(each.name) != os.getpid()]
+    return sum(int((each / "schedstat").read_text().split()[0]) for each in threads)
+
+torch.set_num_threads(2)
+touch = tgdsl.compile({document!r})
+assert len(touch.taxels["s"]) == 2256
+state = touch.example_state(1)
+with torch.no_grad():
+    touch(state)
+    time.sleep(0.5)
+    times = [of_others()]
+    for _ in range(3):
+        touch(state)
+    times.append(of_others())
+    torch.exp(torch.ones(1, 8, 2256))
+    times.append(of_others())
+print(times[1] - times[0], times[2] - times[1])
+"""
+
+
+@pytest.mark.skipif(not (THREADS.parent / "schedstat").exists(), reason="how long each thread ran is not known here")
+def test_one_environment_is_read_by_one_thread(tmp_path):
+    """Some of torch's operations hand a few thousand numbers to a second thread and wait for it, which may be long in coming.
+
+    What is looked at is for how long other threads ran, not how long anything took.
+    """
+    (tmp_path / "scene.xml").write_text(
+        "<mujoco><worldbody><body name='pad'><geom type='box' size='.05 .05 .01'/></body>"
+        "<body name='cube' pos='0 0 .03'><freejoint/><geom type='box' size='.02 .02 .02'/></body></worldbody></mujoco>"
+    )
+    grid = {"method": "grid", "rows": 47, "columns": 48, "direction": [0, 0, -1], "radius": 0.004}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": grid}}}},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"s": {"kind": "force_taxel", "links": "pad", "feels": ["cube"]}},
+    }
+    script = READ_IN_ONE_ENVIRONMENT.format(document=document)
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    reads, exponential = map(int, run.stdout.split())
+    assert exponential > 0  # a second thread there is
+    assert reads == 0
+
+
+def test_deeper_taxels_carry_more(tmp_path):
+    """Two taxels at the same distance from a contact, one three times as deep: three times the share, without the moment."""
+    pair = [(-0.004, 0, 0.01), (0.004, 0, 0.012)]
+    touch = pad(tmp_path, taxels=pair, moment_iterations=0)
+    forces = touch(state_of(touch, [[0.0, 0.0, 0.011]], [[0, 0, -1.0]], depth=0.003))["s"][0, :, 2]
+    # The cube's face is at 13 mm: spheres of 4 mm reach into it by 1 and 3 mm, a quarter and three quarters of their radius.
+    np.testing.assert_allclose(forces, [-0.251 / 1.002, -0.751 / 1.002], rtol=1e-12)

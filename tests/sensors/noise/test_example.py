@@ -1,0 +1,138 @@
+"""The example of a noisy hand: it runs from the command line, and each line of it does what its comment says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.observations.observations import ObservationSpec
+from tgdsl.runtime.rollout import rollout, scripted_controls
+from tgdsl.view.table import table
+from tgdsl.view.view import picture
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "noisy_hand.yaml"
+NUM_STEPS, NUM_ENVS = 12, 2
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+  <body name="cube" pos="0 0 .0295"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+</worldbody></mujoco>
+"""
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def touch():
+    return tgdsl.compile(EXAMPLE)
+
+
+@pytest.fixture(scope="module")
+def readings(touch):
+    """Readings of the squeeze, every 10 ms: by name (step, env, …)."""
+    sim = tgdsl.simulate(touch, NUM_ENVS, substeps=5, keyframe="squeeze")
+    controls = scripted_controls(sim.model, ("squeeze",), 0.01 * NUM_STEPS, sim.control_step)
+    steps = [{name: value.clone() for name, value in step.readings.items()} for step in rollout(touch, sim, controls)]
+    return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
+
+
+def test_it_runs_from_the_command_line(here, tmp_path):
+    code, out, err = here(tmp_path, "run", str(EXAMPLE), "--keyframes", "squeeze", "--seconds", "0.05")
+    assert code == 0, err
+    assert "readings.npz" in out
+    with np.load(tmp_path / "out" / "readings.npz") as archive:
+        assert archive["worn"].shape == (5, 1, 3, 199, 6)
+
+
+def test_every_observation_type_of_the_paper_is_there(touch):
+    types = {term.type for term in touch.plan.observations}
+    known = {part.model_fields["type"].annotation.__args__[0] for part in ObservationSpec.__origin__.__args__}
+    of_the_hand = {"taxel_counts", "taxel_saturated", "joint_pos", "joint_vel", "joint_effort", "last_action"}
+    assert types == known - {"none", "link_bool", "link_force", "reading"} - of_the_hand
+
+
+def test_the_clean_reading_is_that_of_a_clean_sensor(touch, readings):
+    """`touch/clean` is what the same document reads with `readout: clean`; the measured one differs where something is felt."""
+    clean = tgdsl.compile(EXAMPLE, overrides={"sensors": CLEAN, "observations": "{}"})
+    sim = tgdsl.simulate(clean, NUM_ENVS, substeps=5, keyframe="squeeze")
+    controls = scripted_controls(sim.model, ("squeeze",), 0.01 * NUM_STEPS, sim.control_step)
+    for i, step in enumerate(rollout(clean, sim, controls)):
+        torch.testing.assert_close(readings["touch/clean"][i], step.readings["touch"], rtol=0, atol=0)
+    is_felt = readings["touch/clean"][..., :3].norm(dim=-1) > 0.1
+    assert is_felt.any()
+    assert (readings["touch"] != readings["touch/clean"])[is_felt].any(dim=-1).all()
+
+
+CLEAN = "{touch: {kind: kinematic_taxel, links: hand, feels: [cube], noise: noisy, readout: clean}}"
+
+
+def test_readings_are_of_the_quantisers_steps(touch, readings):
+    """Steps of the paper's table: 0.1 mm, 0.01 N and 0.1 mm; where `worn` says so, none on the palm."""
+    for name, step in {"depth": 1e-4, "touch": 1e-2, "near": 1e-2, "skin": 1e-4}.items():
+        share = readings[name].double() / step
+        assert (share - share.round()).abs().max() < 1e-3, name
+    share = readings["worn"].double() / 1e-2
+    is_palm = torch.from_numpy(np.isin(touch.taxels["worn"]["link"], touch.plan.groups["palm"]))
+    assert 0 < is_palm.sum() < len(is_palm)
+    assert (share - share.round())[..., ~is_palm, :].abs().max() < 1e-3
+    assert ((share - share.round()).abs() > 1e-2)[..., is_palm, :].float().mean() > 0.8
+
+
+def test_the_skin_takes_a_sample_at_every_second_call(readings):
+    """50 Hz read every 10 ms: each value stands twice, and then changes."""
+    skin = readings["skin"]
+    torch.testing.assert_close(skin[1::2], skin[0::2], rtol=0, atol=0)
+    assert (skin[2::2] != skin[1:-1:2]).flatten(1).any(dim=1).all()
+
+
+def test_the_history_is_the_last_three_readings(readings):
+    worn = readings["worn"]
+    torch.testing.assert_close(worn[2:, :, 0], worn[:-2, :, 2], rtol=0, atol=0)
+    torch.testing.assert_close(worn[1:, :, 1], worn[:-1, :, 2], rtol=0, atol=0)
+
+
+@pytest.fixture
+def stacked(tmp_path):
+    """A pad whose sensor stacks three calls, its scene, and a reading."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    grid = {"method": "grid", "rows": 2, "columns": 3, "direction": [0, 0, -1], "radius": 0.004}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": grid}}}},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"touch": {"kind": "kinematic_taxel", "links": "pad", "feels": ["cube"], "history": 3}},
+    }
+    module = tgdsl.compile(document)
+    sim = tgdsl.simulate(module, 1)
+    sim.step()
+    return module, sim, module(sim.state())
+
+
+def test_a_table_of_stacked_readings_shows_the_last_one(stacked):
+    module, _, readings = stacked
+    last = readings["touch"][0, -1, :, :3].double().numpy().sum(axis=0)
+    assert table(module, readings)[-1].split() == ["pad", f"{np.linalg.norm(last):.3f}"]
+
+
+def test_a_picture_of_stacked_readings_can_be_drawn(stacked, tmp_path):
+    module, sim, readings = stacked
+    assert picture(module, sim, readings, tmp_path / "picture.png").exists()
+
+
+def test_a_quantity_is_an_objects_own_even_if_its_name_ends_like_an_axis(tmp_path):
+    """`distance_cube` is not what is read of the object `cube_x`, and `distance_cube_x` is."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
+    sensor = {"kind": "surface_distance", "links": "pad", "feels": ["cube_x"], "max_range": 0.1, "readout": "both"}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": points}}}},
+        "objects": {"cube_x": {"body": "cube"}},
+        "sensors": {"s": {**sensor, "noise": {"bias": {"distance_cube_x": 0.5}}}},
+    }
+    module = tgdsl.compile(document, dtype=torch.float64)
+    readings = module(module.example_state(2))
+    torch.testing.assert_close(readings["s"], readings["s/clean"] + 0.5)

@@ -1,0 +1,265 @@
+"""What a million samples of each stage look like. Bounds are of theory: 5 standard errors, or as unlikely (`KOLMOGOROV`)."""
+
+from typing import Any
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+from noise_cases import KOLMOGOROV, MM, Noise, correlation, normal_distance, one, standard_errors, uniform_distance
+from torch import Tensor
+
+from tgdsl.sensors.noise import random, stages
+
+N, SIDE = 10**6, 1000
+"""Samples: of 1000 environments with 1000 rows."""
+DT = 2e-3
+
+
+def million(knobs: dict[str, Any], **more: Any) -> Noise:
+    return Noise(knobs, SIDE, num_envs=SIDE, **{"dtype": torch.float32, **more})
+
+
+def reading(noise: Noise, signal: Any = 0.0) -> np.ndarray:
+    return noise.read(signal, DT)[..., 0].double().numpy()
+
+
+def variance_error(sample: np.ndarray, expected: float, kurtosis: float = 3.0) -> float:
+    """Return how many standard errors the variance of a sample of mean 0 is off."""
+    return standard_errors((sample**2).mean(), expected, expected * np.sqrt((kurtosis - 1) / sample.size))
+
+
+def test_white_noise_is_normal():
+    sigma = 5e-3
+    found = reading(million({"white_noise": sigma}), 1.0) - 1
+    assert standard_errors(found.mean(), 0, sigma / np.sqrt(N)) < 5
+    assert variance_error(found, sigma**2) < 5
+    assert normal_distance(found, sigma) < KOLMOGOROV
+
+
+def test_white_noise_is_white():
+    noise, other = million({"white_noise": 1.0}), million({"white_noise": 1.0}, name="grip")
+    first, second, third = (reading(noise) for _ in range(3))
+    noise.reset()
+    found = {
+        "taxels": correlation(first[:, :-1], first[:, 1:]),
+        "environments": correlation(first[:-1], first[1:]),
+        "steps": correlation(first, second),
+        "two steps": correlation(first, third),
+        "episodes": correlation(first, reading(noise)),
+        "sensors": correlation(first, reading(other)),
+        "channels": correlation(*Noise({"white_noise": 1.0}, SIDE, ("a", "b"), num_envs=SIDE).read(0.0).numpy().T),
+    }
+    assert max(map(abs, found.values())) < 5, found
+
+
+def test_drift_is_a_random_walk():
+    """Its variance grows by σ² at each reading, its steps are normal, independent of one another, and of the white noise."""
+    sigma = 1e-3
+    noise, white = million({"drift": sigma}), million({"white_noise": 1.0})
+    walk, steps, noises = np.zeros((SIDE, SIDE)), [], []
+    for n in range(1, 17):
+        found = reading(noise)
+        steps.append(found - walk)
+        noises.append(reading(white))
+        walk = found
+        if n in (1, 2, 4, 8, 16):
+            assert variance_error(walk, n * sigma**2) < 5
+            assert standard_errors(walk.mean(), 0, sigma * np.sqrt(n / N)) < 5
+    assert normal_distance(walk, 4 * sigma) < KOLMOGOROV
+    assert normal_distance(steps[-1], sigma) < KOLMOGOROV
+    for apart in (1, 2, 15):
+        assert abs(correlation(steps[0], steps[apart])) < 5
+    assert abs(correlation(steps[-1], walk - steps[-1])) < 5
+    assert abs(correlation(steps[-1][:, :-1], steps[-1][:, 1:])) < 5
+    assert abs(correlation(steps[-1], noises[-1])) < 5
+    assert abs(correlation(steps[-1] ** 2, noises[-1] ** 2)) < 5
+    noise.reset(np.arange(0, SIDE, 2))
+    found = reading(noise)
+    assert variance_error(found[::2], sigma**2) < 5
+    assert variance_error(found[1::2], 17 * sigma**2) < 5
+
+
+def test_the_quantisers_error_is_uniform():
+    step = 0.01
+    t = np.linspace(0, 1, N).reshape(SIDE, SIDE, 1)
+    signal = 3 * np.sin(7 * t) + t
+    noise = million({"quantization": step}, dtype=torch.float64)
+    found = reading(noise, signal)
+    error = found - signal[..., 0]
+    assert np.abs(error).max() <= step / 2 * (1 + 1e-12)
+    np.testing.assert_allclose(found / step, np.round(found / step), atol=1e-9)
+    assert standard_errors(error.mean(), 0, step / np.sqrt(12 * N)) < 5
+    assert variance_error(error, step**2 / 12, kurtosis=1.8) < 5
+
+
+def test_dead_taxels():
+    share, low, high = 0.05, -1.0, 3.0
+    knobs = {"dead_probability": share, "dead_range": [low, high]}
+    noise = Noise(knobs, SIDE, ("a", "b"), num_envs=SIDE, dtype=torch.float32)
+    first = noise.read(100.0).double().numpy()
+    is_dead = first[..., 0] != 100
+    assert (is_dead == (first[..., 1] != 100)).all()
+    assert standard_errors(is_dead.mean(), share, np.sqrt(share * (1 - share) / N)) < 5
+    counts, spread = is_dead.sum(axis=1), SIDE * share * (1 - share)
+    assert standard_errors(counts.var(), spread, spread * np.sqrt(2 / SIDE)) < 5
+    stuck = first[is_dead]
+    assert stuck.min() >= low and stuck.max() <= high
+    for own in stuck.T:
+        assert uniform_distance(own, low, high) < KOLMOGOROV
+    assert (stuck[:, 0] == stuck[:, 1]).all()  # one number per taxel, as in the paper
+    for signal in (100.0, 7.0):
+        later = noise.read(signal).double().numpy()
+        assert (later[is_dead] == stuck).all() and (later[~is_dead] == signal).all()
+    noise.reset(slice(SIDE // 2))
+    new = noise.read(100.0).double().numpy()
+    assert (new[SIDE // 2 :] == first[SIDE // 2 :]).all()
+    here, before = new[: SIDE // 2, :, 0] != 100, is_dead[: SIDE // 2]
+    assert standard_errors(here.mean(), share, np.sqrt(share * (1 - share) / here.size)) < 5
+    assert standard_errors((here & before).mean(), share**2, share / np.sqrt(here.size)) < 5
+    both = here & before
+    assert (new[: SIDE // 2][both] != first[: SIDE // 2][both]).all()
+
+
+def test_gains_are_uniform_and_held_until_the_reset():
+    noise = million({"gain": [0.85, 1.15]}, dtype=torch.float64)
+    first = reading(noise, 1.0)
+    assert first.min() > 0.85 and first.max() < 1.15
+    assert uniform_distance(first, 0.85, 1.15) < KOLMOGOROV
+    np.testing.assert_allclose(reading(noise, -2.0), -2 * first, rtol=1e-15)
+    noise.reset(np.arange(SIDE) < 500)
+    second = reading(noise, 1.0)
+    assert (second[500:] == first[500:]).all() and abs(correlation(second[:500], first[:500])) < 5
+    assert uniform_distance(second[:500], 0.85, 1.15) < KOLMOGOROV
+    assert abs(correlation(first[:, 1:], first[:, :-1])) < 5
+    assert abs(correlation(first[1:], first[:-1])) < 5
+
+
+def test_radii_are_uniform_at_each_step():
+    noise, like = million({"radius_noise": 0.3 * MM}), torch.zeros(SIDE, SIDE)
+    found = []
+    for _ in range(2):
+        now = noise.now()
+        found.append(stages.radius_shift(stages.knob_values(noise.constants, now)["radius_noise"], now, like).double().numpy())
+        noise.read(0.0)
+    for shift in found:
+        assert np.abs(shift).max() <= 0.3 * MM
+        assert uniform_distance(shift, -0.3 * MM, 0.3 * MM) < KOLMOGOROV
+    assert abs(correlation(*found)) < 5
+    assert abs(correlation(found[0][:, 1:], found[0][:, :-1])) < 5
+
+
+@pytest.mark.parametrize("parts", [0.1, 1, 2, 10])
+@pytest.mark.parametrize("delay", [0.0, 0.5e-3, 4e-3, 5.3e-3])
+def test_a_reading_is_exactly_as_old_as_its_delay(delay, parts):
+    """A clock that is read late: also with calls further apart than the delay."""
+    dt = DT / parts
+    noise = Noise({"read_delay": delay, "bias": 1.0}, 2, dt=dt)
+    clock = dt * np.arange(200)
+    found = one(noise, clock, dt) - 1
+    np.testing.assert_allclose(found, np.maximum(clock - delay, 0)[:, None].repeat(2, 1), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("parts", [0.1, 1, 2, 10])
+def test_ages_are_uniform(parts):
+    dt, low, high, num_envs = DT / parts, 10e-3, 18e-3, 5000
+    noise = Noise({"read_delay": low, "jitter": high - low}, 2, num_envs=num_envs, dt=dt)
+    ages, first = [], int(np.ceil(high / dt))
+    for call in range(first + 200):
+        found = noise.read(call * dt, dt)
+        if call >= first:
+            assert torch.equal(found[:, 0], found[:, 1])
+            ages.append(call * dt - found[:, 0, 0].numpy())
+    sample = np.stack(ages)
+    assert sample.min() > low - 1e-12 and sample.max() < high + 1e-12
+    assert uniform_distance(sample, low, high) < KOLMOGOROV
+    assert abs(correlation(sample[1:], sample[:-1])) < 5
+    assert abs(correlation(sample[:, 1:], sample[:, :-1])) < 5
+
+
+def test_an_age_never_reaches_before_the_first_call():
+    noise = Noise({"read_delay": 10e-3, "jitter": 8e-3}, 1, num_envs=1000, dt=DT)
+    for episode in range(3):
+        for call in range(20):
+            found = noise.read(100.0 * episode + call * DT, DT)
+            assert (found >= 100 * episode).all()
+            assert call > 4 or (found == 100 * episode).all()
+        noise.reset()
+
+
+def test_ranges_are_uniform_over_environments():
+    knobs = {
+        "bias": [-1, 1], "white_noise": [0, 2], "drift": [3, 4], "quantization": [0.1, 0.2], "read_delay": [0, 0.1], "jitter": [0, 1],
+        "dead_probability": [0.2, 0.4], "gain": [[0.5, 0.6], [1, 2]], "radius_noise": [0, 1e-3], "dead_range": [[-1, 0], [2, 3]],
+        "hysteresis": {"strength": [0, 1], "time_constant": [0.1, 0.2]}, "crosstalk": {"strength": [0, 0.5], "sigma": [1e-3, 2e-3]},
+    }  # fmt: skip
+    noise = Noise(knobs, 1, num_envs=N, dt=2.0)
+    drawn = {name for name, value in noise.constants.items() if stages.is_drawn(name, value.ndim)}
+    assert drawn == set(stages.PARAMETERS) - {"release_threshold"}
+    before = stages.knob_values(noise.constants, noise.now())
+    noise.reset()
+    after = stages.knob_values(noise.constants, noise.now())
+    samples = {name: before[name].numpy().ravel() for name in sorted(drawn)}
+    for name, sample in samples.items():
+        low, high = noise.constants[name].flatten().tolist()
+        assert sample.shape == (N,)
+        assert uniform_distance(sample, low, high) < KOLMOGOROV, name
+        assert abs(correlation(sample[1:], sample[:-1])) < 5, name
+        assert abs(correlation(sample, after[name].numpy().ravel())) < 5, name
+    names = list(samples)
+    found = {(a, b): correlation(samples[a], samples[b]) for i, a in enumerate(names) for b in names[:i]}
+    assert max(map(abs, found.values())) < 5, found
+
+
+def advanced(
+    noise: Noise, signal: Tensor, dt: Tensor, step: Tensor, memory: dict[str, Tensor]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """One call of all environments, as a pure function of (env, row), of which a compiler makes one kernel."""
+    signal, dt = signal.to(noise.dtype), dt.to(noise.dtype)
+    (streams,) = random.streams(
+        torch.tensor([noise.key], dtype=torch.int32), noise.env, step.expand(noise.num_envs), noise.episode
+    )
+    ages = memory["ages"] + dt
+    steps = step.expand(noise.num_envs)[:, None]
+    now = stages.Now(dt, steps, steps, ages, None, None, streams)
+    values, past = stages.knob_values(noise.constants, now), {key: memory[key] for key in noise.memory}
+    found, new = stages.disturb(signal[:, None], noise.lowered.terms, values, past, now)
+    place = (step % memory["ring"].shape[1])[None]
+    ring = memory["ring"].index_copy(1, place, new["ring"][:, None])
+    ages = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1]], dim=1)
+    return found[:, 0].double(), {**new, "ring": ring, "ages": ages}
+
+
+@pytest.mark.slow
+def test_a_million_steps_in_float32_stay_near_those_in_float64(monkeypatch):
+    """Drift, hysteresis and delay of an input, and at a dt, that vary; four calls in one graph, for speed."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    knobs = {
+        "drift": 1e-3, "hysteresis": {"strength": 0.8, "time_constant": 0.05}, "read_delay": 9e-3, "jitter": 4e-3,
+    }  # fmt: skip
+    pair = [Noise(knobs, 2, num_envs=2, dt=1e-3, dtype=dtype) for dtype in (torch.float32, torch.float64)]
+    parts, rng = 4, np.random.default_rng(0)
+    dt = rng.uniform(1e-3, 3e-3, (N // parts, parts))
+    time = np.cumsum(dt).reshape(*dt.shape, 1, 1)
+    press = np.clip(3 * np.sin(time * [[1.0, 3.1], [0.2, 17.0]]), -1, 1) + rng.normal(0, 0.02, (*dt.shape, 2, 2))
+
+    def several(signal: Tensor, dt: Tensor, step: Tensor, memory: list[dict[str, Tensor]]) -> tuple[Tensor, Any]:
+        found = []
+        for k in range(parts):
+            made = [advanced(*of, step + k, own) for of, own in zip([(n, signal[k], dt[k]) for n in pair], memory, strict=True)]
+            memory = [new for _, new in made]
+            found.append(torch.stack([reading for reading, _ in made]))
+        return torch.stack(found, dim=1), memory
+
+    torch.compiler.reset()
+    run = torch.compile(several, fullgraph=True, dynamic=False, options={"cpp.simdlen": 1, "cpp.threads": 1})
+    memory = [{**{key: held.nan_to_num() for key, held in n.memory.items()}, "ages": n.ages} for n in pair]
+    signals, dts = torch.from_numpy(press), torch.from_numpy(dt)
+    error = largest = torch.zeros((), dtype=torch.float64)
+    with torch.no_grad():
+        for i in range(N // parts):
+            found, memory = run(signals[i], dts[i], torch.tensor(parts * i), memory)
+            error = torch.maximum(error, (found[0] - found[1]).abs().max())
+            largest = torch.maximum(largest, found[1].abs().max())
+    assert 1 < largest < 20
+    assert error < 1e-3 * largest

@@ -1,0 +1,39 @@
+"""When a Triton kernel stands in for torch's operations."""
+
+import pytest
+import torch
+
+from tgdsl.tensors import fusion
+
+
+class OnGpu(torch.Tensor):
+    """A tensor that says it is on a GPU."""
+
+    is_cuda = property(lambda self: True)  # type: ignore[assignment]
+
+
+def on_gpu(dtype=torch.float32, requires_grad=False):
+    return torch.zeros(2, dtype=dtype).as_subclass(OnGpu).requires_grad_(requires_grad)
+
+
+@pytest.fixture(autouse=True)
+def triton(monkeypatch):
+    monkeypatch.setattr(fusion, "HAS_TRITON", True)
+
+
+def test_a_kernel_takes_float32_on_a_gpu():
+    assert fusion.takes_kernel(on_gpu(), on_gpu())
+
+
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("other", [torch.zeros(2), on_gpu(torch.float64), on_gpu(requires_grad=True)])
+def test_one_tensor_that_it_cannot_take_is_enough(place, other):
+    """Whichever it is: on the host, of another dtype, or one whose derivatives are asked for."""
+    tensors = [on_gpu() for _ in range(3)]
+    tensors[place] = other
+    assert not fusion.takes_kernel(*tensors)
+
+
+def test_derivatives_that_nobody_asks_for_are_no_hindrance():
+    with torch.no_grad():
+        assert fusion.takes_kernel(on_gpu(requires_grad=True), on_gpu())

@@ -1,0 +1,224 @@
+"""From where a hand is seen, what counts as touched there, and what is summed: against MuJoCo's rays and sums by hand."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.rollout import held_controls, rollout
+from tgdsl.view.cameras import VIEWS, ViewError, angles_of, best_camera, camera_of
+from tgdsl.view.dots import Dots, Pose, dots_of, touched
+from tgdsl.view.shot import Camera, camera_for, solid_of
+from tgdsl.view.table import table
+from tgdsl.view.view import picture
+
+FINGER = """
+<mujoco>
+  <worldbody>
+    <body name="palm">
+      <geom name="palm" type="box" size=".005 .04 .05"/>
+      <body name="tip" pos=".03 0 .02">
+        <joint axis="0 1 0"/>
+        <geom name="tip" type="box" size=".005 .01 .02"/>
+      </body>
+    </body>
+    <body name="ball" pos=".022 0 .02"><freejoint/><geom type="sphere" size=".004"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""A fingertip whose taxels look at the palm behind which they are hidden."""
+
+
+def finger(folder: Path, side: list[float]) -> tuple[tgdsl.TactileModule, BatchSimulation]:
+    (folder / "finger.xml").write_text(FINGER)
+    grid = {"method": "grid", "rows": 4, "columns": 3, "direction": side, "radius": 0.004}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(folder / "finger.xml"), "layout": {"resolutions": {"o": {"tip": grid}}}},
+            "objects": {"ball": {"body": "ball"}},
+            "sensors": {"depth": {"kind": "contact_depth", "links": "tip", "feels": ["ball"], "gate": "geometric"}},
+        }
+    )
+    return touch, tgdsl.simulate(touch, 1)
+
+
+def in_view(sim: BatchSimulation, dots: Dots, camera: Camera) -> int:
+    """Return how many taxels MuJoCo's rays to the camera reach; the ball hides nothing."""
+    state = mujoco.MjData(sim.model)
+    mujoco.mj_forward(sim.model, state)
+    ball, count = sim.model.body("ball").id, 0
+    for start, normal in zip(dots.pos + 1e-6 * dots.normal, dots.normal, strict=True):
+        hit = mujoco.mj_ray(sim.model, state, start, camera.toward, None, 1, ball, np.zeros(1, dtype=np.int32))
+        count += hit < 0 and normal @ camera.toward > 0
+    return count
+
+
+def cameras(touch, sim) -> tuple[Dots, Camera, Camera]:
+    """Return the taxels, the camera that these face, and the one that is chosen."""
+    state = sim.state()
+    dots = dots_of(touch, sim, touch.outputs[0], touch(state)["depth"], 0)
+    pose, palm = Pose(*sim.body_poses(0)), sim.model.body("palm").id
+    hand = solid_of(sim.model, pose, {palm, sim.model.body("tip").id})
+    chosen = best_camera(dots, hand, sim.model, touch.plan.layout(), pose, palm)
+    return dots, camera_for(dots, pose.pos[palm]), chosen
+
+
+def test_a_fingertip_is_not_drawn_from_behind(tmp_path):
+    touch, sim = finger(tmp_path, [1, 0, 0])
+    sim.batch.qpos[:, 1] += 0.5  # nothing is touched: all taxels count
+    sim.step()
+    dots, first, chosen = cameras(touch, sim)
+    assert in_view(sim, dots, first) == 0
+    layout, pose = touch.plan.layout(), Pose(*sim.body_poses(0))
+    most = max(in_view(sim, dots, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
+    assert in_view(sim, dots, chosen) >= max(most, 1)
+
+
+def test_a_view_that_shows_enough_is_kept(tmp_path):
+    touch, sim = finger(tmp_path, [-1, 0, 0])
+    dots, first, chosen = cameras(touch, sim)
+    assert in_view(sim, dots, first) == len(dots.pos)
+    for part, expected in zip(chosen, first, strict=True):
+        np.testing.assert_array_equal(part, expected)
+
+
+def test_taxels_that_are_touched_count_first(tmp_path):
+    touch, sim = finger(tmp_path, [1, 0, 0])
+    sim.step()
+    dots, _, chosen = cameras(touch, sim)
+    assert 0 < dots.is_read.sum() < len(dots.pos)
+    own = Dots(*(getattr(dots, name)[dots.is_read] for name in ("pos", "normal", "size", "value")), "depth", "mm")
+    assert in_view(sim, own, chosen) == dots.is_read.sum()
+
+
+@pytest.mark.parametrize(
+    ("view", "angles"), [*VIEWS.items(), ("30,20", (30, 20)), ("-90, -90", (-90, -90)), ("1e2,0", (100, 0))]
+)
+def test_angles(view, angles):
+    assert angles_of(view) == angles
+
+
+@pytest.mark.parametrize(
+    ("view", "message"),
+    [
+        ("frnt", 'there is no view "frnt"; did you mean "front"?'),
+        ("30", 'there is no view "30"; known views: '),
+        ("30,", 'there is no view "30,"; expected azimuth and elevation in degrees, the latter from -90 to 90'),
+        ("0,91", 'there is no view "0,91"; expected azimuth and elevation in degrees, '),
+        ("nan,0", 'there is no view "nan,0"; expected azimuth and elevation in degrees, '),
+        ("1,2,3", 'there is no view "1,2,3"; expected azimuth and elevation in degrees, '),
+    ],
+)
+def test_views_that_are_none(view, message):
+    with pytest.raises(ViewError) as caught:
+        angles_of(view)
+    assert str(caught.value).startswith(message)
+
+
+def test_angles_turn_about_the_hand(tmp_path):
+    """By the definition: round the up axis from the mean normal, then up."""
+    touch, sim = finger(tmp_path, [-1, 0, 0])
+    layout, pose = touch.plan.layout(), Pose(*sim.body_poses(0))
+    for around, rise in ((0, 0), (90, 0), (0, 90), (35, 20), (200, -40)):
+        toward = camera_of(f"{around},{rise}", sim.model, [layout], pose, 1).toward
+        a, r = np.radians([around, rise])
+        np.testing.assert_allclose(toward, [np.cos(r) * np.cos(a), np.cos(r) * np.sin(a), np.sin(r)], atol=1e-9)
+
+
+# What is touched, and what is summed
+
+PAD = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="pad"><geom name="pad" type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos=".012 0 .029"><freejoint/><geom type="box" size=".02 .02 .02" mass=".25"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+SENSOR = {"kind": "kinematic_taxel", "outputs": ["force"], "normal_stiffness": 500}
+
+
+def pad(folder: Path, sensor: dict[str, object] = SENSOR, **more: object) -> tuple[tgdsl.TactileModule, BatchSimulation]:
+    (folder / "pad.xml").write_text(PAD)
+    grid = {"method": "grid", "rows": 6, "columns": 6, "direction": [0, 0, -1], "radius": 0.004}
+    module = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(folder / "pad.xml"), "layout": {"resolutions": {"o": {"pad": grid}}}},
+            "objects": {"cube": {"body": "cube"}},
+            "sensors": {"touch": {**sensor, "links": "pad", "feels": ["cube"], **more}},
+        }
+    )
+    return module, tgdsl.simulate(module, 2)
+
+
+NOISE = {"white_noise": 0.05}
+BIT = {"kind": "contact", "noise": {"white_noise": 0.001}}
+
+
+@pytest.mark.parametrize("more", [{}, {"readout": "both"}, {"rate": "100 Hz"}, {"history": 3}, {"sensor": BIT}])
+@pytest.mark.parametrize("env", [0, 1])
+def test_noise_is_not_touched(tmp_path, more, env):
+    """The cube's footprint by hand, in one environment; in the other one it hangs far above."""
+    touch, sim = pad(tmp_path, **({} if "sensor" in more else {"noise": NOISE}), **more)
+    sim.batch.qpos[1, 2] += 0.5
+    *_, last = rollout(touch, sim, held_controls(sim.model, 0.02, sim.control_step))
+    output = touch.outputs[0]
+    before = {name: value.clone() for name, value in touch.state_dict().items()}
+    found = touched(touch, sim, output, last.readings, env)
+    torch.testing.assert_close(dict(touch.state_dict()), before, rtol=0, atol=0)
+    pos = touch.taxels["touch"]["pos"]
+    # A probe's sphere of 4 mm reaches beyond the cube's sides by less than the distance to the next taxel.
+    under = (np.abs(pos[:, 0] - 0.012) < 0.02) & (np.abs(pos[:, 1]) < 0.02)
+    near = (np.abs(pos[:, 0] - 0.012) < 0.024) & (np.abs(pos[:, 1]) < 0.024)
+    assert found is not None
+    assert (found | ~under).all() if env == 0 else not found.any()
+    assert not (found & ~near).any()
+    assert dots_of(touch, sim, output, last.readings["touch"], env).is_read.sum() > found.sum()
+
+
+def test_without_noise_what_reads_is_touched(tmp_path):
+    touch, sim = pad(tmp_path)
+    sim.step()
+    readings = touch(sim.state())
+    assert touched(touch, sim, touch.outputs[0], readings, 0) is None
+    assert dots_of(touch, sim, touch.outputs[0], readings["touch"], 0).is_touched.any()
+
+
+def test_table_and_picture_sum_alike(tmp_path):
+    """Both say the length of the summed force, here with shear that cancels in part."""
+    touch, sim = pad(tmp_path)
+    sim.step()
+    force = torch.randn(2, 36, 3, generator=torch.Generator().manual_seed(1)).double() + torch.tensor([0, 0, -1.0])
+    dots = dots_of(touch, sim, touch.outputs[0], force, 0)
+    expected = force[0].sum(dim=0).norm().item()
+    assert dots.summary() == f"|Σ| {expected:.3g} N · max {force[0].norm(dim=-1).max().item():.2g} N"
+    assert dots.headline.startswith(f"|Σ force| {expected:.3g} N")
+    assert table(touch, {"touch": force})[2].split()[1] == f"{expected:.3f}"
+    small = dots_of(touch, sim, touch.outputs[0], 1e-4 * force, 0)
+    assert small.summary().startswith(f"|Σ| {0.1 * expected:.3g} mN")
+
+
+@pytest.mark.parametrize("view", ["top", "-60,25"])
+def test_run_draws_from_where_it_is_told(tmp_path, here, view):
+    touch, sim = pad(tmp_path, noise=NOISE)
+    sim.step()
+    readings = touch(sim.state())
+    whole = [picture(touch, sim, readings, tmp_path / f"{i}.png", view=own).read_bytes() for i, own in enumerate((None, view))]
+    assert whole[0] != whole[1]
+    tgdsl.save(touch, tmp_path / "pad.safetensors")
+    code, _, error = here(tmp_path, "run", "pad.safetensors", "--seconds", "0.01", "--view", view)
+    assert code == 0, error
+
+
+def test_run_looks_at_the_view_first(tmp_path, here):
+    code, _, error = here(tmp_path, "run", "none.yaml", "--view", "bak")
+    assert (code, error) == (2, 'tgdsl: there is no view "bak"; did you mean "back"?\n')

@@ -1,0 +1,69 @@
+"""The overview: a panel per reading, arrows along the vectors that were read, bodies amid their taxels."""
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.quiver import Quiver
+from scipy.spatial.transform import Rotation
+
+import tgdsl
+from tgdsl.view.dots import dots_of
+from tgdsl.view.overview import drawing, overview
+from tgdsl.view.view import ViewError
+
+SCENE = """
+<mujoco><worldbody>
+  <body name="pad" pos=".1 .2 .3" euler="20 30 40"><joint/><geom type="box" size=".02 .02 .01"/></body>
+  <body name="ball" pos="0 0 1"><freejoint/><geom type="sphere" size=".03"/></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    layout = {"pad": {"method": "grid", "rows": 2, "columns": 3, "direction": [0, 0, -1], "radius": 0.004}}
+    sensor = {"links": "pad", "feels": ["ball"]}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": layout}}},
+            "objects": {"ball": {"body": "ball"}},
+            "sensors": {
+                "force": {"kind": "kinematic_taxel", "outputs": ["force"], **sensor},
+                "depth": {"kind": "contact_depth", **sensor},
+            },
+        }
+    )
+    return touch, tgdsl.simulate(touch, 2)
+
+
+def test_arrows_are_the_vectors_in_the_plane_of_the_picture(scene):
+    touch, sim = scene
+    rng = np.random.default_rng(0)
+    force = rng.normal(size=(2, 6, 3)) * [1, 1, 0]  # in the plane of the pad
+    force[:, 4] = 0
+    readings = {"force": torch.tensor(force), "depth": torch.zeros(2, 6, 1)}
+    figure = drawing(touch, sim, readings, env=1, title="both")
+    assert [axes.get_title("left").split()[0] for axes in figure.axes] == ["force", "depth"]
+    (arrows,) = [part for part in figure.axes[0].collections if isinstance(part, Quiver)]
+    assert not any(isinstance(part, Quiver) for part in figure.axes[1].collections)
+    dots = dots_of(touch, sim, touch.outputs[0], readings["force"], 1)
+    world = Rotation.from_euler("XYZ", [20, 30, 40], degrees=True).apply(force[1])
+    np.testing.assert_allclose(dots.vector, world, atol=1e-12)
+    # Pixels are a linear map of the plane of the pad: fit it to the taxels' places, and apply it to the vectors.
+    read = np.arange(6) != 4
+    at, drawn = np.column_stack([arrows.X, arrows.Y]), np.column_stack([arrows.U, arrows.V])
+    to_pixels = np.linalg.lstsq(np.column_stack([dots.pos[read], np.ones(5)]), at, rcond=None)[0][:3]
+    expected = world[read] @ to_pixels
+    np.testing.assert_allclose(drawn / np.linalg.norm(drawn), expected / np.linalg.norm(expected), atol=1e-9)
+
+
+def test_what_cannot_be_drawn(scene, tmp_path):
+    touch, sim = scene
+    with pytest.raises(ViewError, match="environment 2 does not exist, expected 0 to 1"):
+        overview(touch, sim, touch(sim.state()), tmp_path / "a.png", env=2)
+    with pytest.raises(ViewError, match="there is nothing to draw"):
+        overview(touch, sim, {}, tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
+    assert overview(touch, sim, touch(sim.state()), tmp_path / "new" / "a.png").stat().st_size > 5000

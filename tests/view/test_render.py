@@ -1,0 +1,373 @@
+"""Pictures of hands: where the discs land, which are in view, what the legend counts, and what is said of a mistake."""
+
+from pathlib import Path
+
+import matplotlib.image
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+
+import tgdsl
+from tgdsl.compiler.pipeline import layouts
+from tgdsl.errors import SpecError, TgdslError
+from tgdsl.layout.layout import Layout, Link
+from tgdsl.view.cameras import VIEWS, camera_of, pose_of
+from tgdsl.view.discs import discs, group_of, legend, radii, taxels_of
+from tgdsl.view.dots import Pose
+from tgdsl.view.render import FEWEST, HEIGHT, drawing, render
+
+TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
+
+# A palm whose taxels look along +x, a finger above it that can bend toward them, and a lid in front of the palm's lower half.
+ROBOT = """
+<mujoco model="hand"><worldbody>
+<body name="palm" pos="0.3 0 0.1" quat="1 0 0 0.4">
+  <geom type="box" size=".005 .03 .04" pos="0 0 .04"/>
+  <body name="lid"><geom type="box" size=".005 .03 .02" pos=".03 0 .02"/></body>
+  <body name="finger" pos="0 0 .085">
+    <joint name="bend" axis="0 1 0" range="0 3"/><geom type="box" size=".004 .01 .02" pos="0 0 .02"/>
+  </body>
+</body>
+</worldbody>
+<keyframe><key name="open" qpos="0"/><key name="bent" qpos="1.2"/></keyframe></mujoco>
+"""
+LAYOUT = """
+tgdsl: 1
+groups: {all: [palm, finger], tips: [finger]}
+resolutions:
+  few:
+    palm: {method: grid, rows: 2, columns: 2, direction: [-1, 0, 0], radius: 4 mm}
+    finger: {method: grid, rows: 3, columns: 2, direction: [-1, 0, 0], radius: 4 mm}
+  many:
+    palm: {method: grid, rows: 6, columns: 6, direction: [-1, 0, 0], radius: 4 mm}
+    finger:
+      method: points
+      points:
+        - {pos: [0.004, 0, 0.02], normal: [1, 0, 0], radius: 4 mm}
+        - {pos: [-0.004, 0, 0.02], normal: [-1, 0, 0], radius: 4 mm}
+        - {pos: [0.004, 0, 0.03], normal: [1, 0, 0], radius: 0 mm}
+"""
+SMALL = (600, 300)
+Drawn = tuple[mujoco.MjModel, dict[str, Layout]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hand")
+    (folder / "hand.xml").write_text(ROBOT)
+    (folder / "layout.yaml").write_text(LAYOUT)
+    (folder / "bare.yaml").write_text("tgdsl: 1\nrobot: {model: hand.xml, layout: layout.yaml}\n")
+    sensors = "objects: {lid: {body: lid}}\nsensors: {touch: {kind: surface_distance, links: tips, feels: [lid]}}\n"
+    (folder / "hand.yaml").write_text((folder / "bare.yaml").read_text() + f"resolution: many\n{sensors}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def hand(folder: Path) -> Drawn:
+    return layouts(folder / "bare.yaml")
+
+
+def marks(axes: Axes, which: str) -> np.ndarray:
+    """Return the middle of each disc, or the two ends of each tick, in pixels of the panel."""
+    found = next(part for part in axes.collections if part.get_gid() == which)
+    paths = [path.vertices[:24] if which != "normals" else path.vertices for path in found.get_paths()]
+    return np.array([np.asarray(path).mean(axis=0) if which != "normals" else path for path in paths])
+
+
+def one_link(pos: list[list[float]], normal: list[list[float]], **more) -> Layout:
+    count = len(pos)
+    values = {"radius": np.full(count, 0.004), "area": np.full(count, 1e-4), "groups": {}} | more
+    at, out = np.array(pos, dtype=float), np.array(normal, dtype=float)
+    same = {"link_id": np.zeros(count, dtype=np.int64), "tangent": out[:, [1, 2, 0]], "cell": np.full((count, 2), -1)}
+    return Layout(links=(Link("palm", "palm"),), pos=at, normal=out, **same, **values)
+
+
+# Where taxels are drawn ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("keyframe", [None, "bent"])
+def test_discs_are_where_the_taxels_are(hand: Drawn, view: str, keyframe: str | None) -> None:
+    """Positions by MuJoCo's own matrices; the hand's corners, which fill the panel with a margin, give the scale."""
+    model, layouts = hand
+    figure = drawing(model, layouts, view=view, keyframe=keyframe, size=SMALL)
+    state = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, state, 1 if keyframe else 0)
+    mujoco.mj_forward(model, state)
+    camera = camera_of(view, model, list(layouts.values()), Pose(state.xpos, state.xquat), model.body("palm").id)
+    signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    corners = [state.geom_xpos[i] + (signs * model.geom_size[i]) @ state.geom_xmat[i].reshape(3, 3).T for i in range(3)]
+    image = np.concatenate(corners) @ np.stack([camera.right, camera.up], axis=1)
+    low, high = image.min(axis=0), image.max(axis=0)
+    for axes, layout in zip(figure.axes, layouts.values(), strict=True):
+        body = [model.body(layout.links[i].body).id for i in layout.link_id]
+        pos = np.array([state.xpos[b] + state.xmat[b].reshape(3, 3) @ p for b, p in zip(body, layout.pos, strict=True)])
+        place = (pos[layout.radius > 0] @ np.stack([camera.right, camera.up], axis=1) - (low + high) / 2).round(12)
+        found = np.concatenate([marks(axes, name).reshape(-1, 2) for name in ("shown", "hidden")])
+        bounds = np.array([axes.get_xlim(), axes.get_ylim()]) + 0.5
+        scale = (bounds[:, 1] / ((high - low) + 0.03 * (high - low).max())).min()
+        expected = bounds.mean(axis=1) + scale * place
+        order, other = (np.lexsort(points.round(3).T) for points in (found, expected))
+        np.testing.assert_allclose(found[order], expected[other], atol=1e-6)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_what_is_in_view_is_what_a_ray_to_the_camera_leaves(hand: Drawn, view: str) -> None:
+    """MuJoCo's rays know neither pixels nor triangles."""
+    model, layouts = hand
+    pose = pose_of(model, "bent")
+    camera = camera_of(view, model, list(layouts.values()), pose, model.body("palm").id)
+    state = mujoco.MjData(model)
+    state.qpos[:] = 1.2
+    mujoco.mj_forward(model, state)
+    figure, total = drawing(model, layouts, view=view, keyframe="bent", size=(1000, 600)), 0
+    for axes, layout in zip(figure.axes, layouts.values(), strict=True):
+        taxels = taxels_of(model, pose, layout)
+        clear = np.zeros(len(taxels.pos), dtype=bool)
+        for i, start in enumerate(taxels.pos + 1e-6 * taxels.normal):
+            hit = mujoco.mj_ray(model, state, start, camera.toward, None, 1, -1, np.zeros(1, dtype=np.int32))
+            clear[i] = hit < 0 and taxels.normal[i] @ camera.toward > 0
+        active = layout.radius > 0
+        assert len(marks(axes, "shown")) == len(marks(axes, "normals")) == (clear & active).sum()
+        assert len(marks(axes, "hidden")) == (~clear & active).sum()
+        total += (clear & active).sum()
+    assert total > 0 or view == "back"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["xhand1_right", "xhand1_left", "sharpa_right"])
+def test_real_hands_show_their_taxels(name: str) -> None:
+    """From the front hardly any taxel is hidden (some look away, round a tip or on the thumb); from the back most are."""
+    model, found = layouts({"tgdsl": 1, "robot": {"model": name}})
+    front, back = (drawing(model, found, view=view, size=(1500, 500)) for view in ("front", "back"))
+    for axes, behind, layout in zip(front.axes, back.axes, found.values(), strict=True):
+        assert len(marks(axes, "shown")) + len(marks(axes, "hidden")) == layout.num_taxels
+        assert len(marks(axes, "shown")) > 0.9 * layout.num_taxels
+        assert len(marks(behind, "shown")) < 0.2 * layout.num_taxels
+        counts = {group: len(layout.taxels_of(members)) for group, members in layout.groups.items()}
+        other = counts["fingers"] - counts["tips"]
+        words = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert words == [f"palm {counts['palm']}", f"other fingers {other}", f"tips {counts['tips']}"]
+        assert counts["palm"] + other + counts["tips"] == counts["hand"] == layout.num_taxels
+
+
+def test_ticks_start_at_the_discs_and_show_a_wrong_normal(hand: Drawn) -> None:
+    model, _ = hand
+    right = one_link([[0.005, 0, 0.06], [0.005, 0.02, 0.06]], [[1, 0, 0], [1, 0, 0]])
+    wrong = one_link([[0.005, 0, 0.06], [0.005, 0.02, 0.06]], [[1, 0, 0], [0.6, 0, 0.8]])
+    ends = [marks(drawing(model, {"x": layout}, size=SMALL).axes[0], "normals") for layout in (right, wrong)]
+    lengths = [np.linalg.norm(np.diff(each, axis=1), axis=-1).ravel() for each in ends]
+    np.testing.assert_allclose(*lengths[0])
+    assert lengths[1].max() > 2 * lengths[0].max()
+    np.testing.assert_allclose(ends[0][:, 0], marks(drawing(model, {"x": right}, size=SMALL).axes[0], "shown"), atol=1e-6)
+
+
+def test_discs_lie_in_tangent_planes(hand: Drawn) -> None:
+    model, layouts = hand
+    layout = layouts["few"]
+    taxels, radius = taxels_of(model, pose_of(model, "bent"), layout), radii(layout, layout.pos)
+    out = discs(taxels, radius) - taxels.pos[:, None]
+    np.testing.assert_allclose(np.einsum("tcx,tx->tc", out, taxels.normal), 0, atol=TOLERANCE)
+    np.testing.assert_allclose(np.linalg.norm(out, axis=-1), np.broadcast_to(radius[:, None], out.shape[:2]), atol=TOLERANCE)
+
+
+def test_discs_do_not_overlap(hand: Drawn) -> None:
+    layout = hand[1]["many"]
+    apart = np.linalg.norm(layout.pos[:36, None] - layout.pos[None, :36], axis=-1) + np.eye(36)
+    assert 2 * radii(layout, layout.pos)[:36].max() < apart.min()
+
+
+# The camera ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_front_faces_the_mean_normal_with_the_fingers_up(hand: Drawn) -> None:
+    model, layouts = hand
+    pose = pose_of(model, None)
+    axes = mujoco.MjData(model)
+    mujoco.mj_forward(model, axes)
+    palm = axes.xmat[model.body("palm").id].reshape(3, 3)
+    for view, (around, rise) in VIEWS.items():
+        camera = camera_of(view, model, [layouts["few"]], pose, model.body("palm").id)
+        frame = np.stack([camera.right, camera.up, camera.toward])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=TOLERANCE)
+        assert np.linalg.det(frame) == pytest.approx(1)
+        assert camera.toward @ palm[:, 0] == pytest.approx(np.cos(np.radians(around)) * np.cos(np.radians(rise)))
+        assert camera.up @ palm[:, 2] == pytest.approx(np.cos(np.radians(rise)))
+    assert camera_of("right", model, [layouts["few"]], pose, 1).toward @ palm[:, 1] > 0.9  # the picture's right, seen from +x
+
+
+def test_the_camera_stays_with_the_palm(hand: Drawn) -> None:
+    model, layouts = hand
+    straight, bent = (camera_of("iso", model, [layouts["few"]], pose_of(model, name), 1) for name in ("open", "bent"))
+    np.testing.assert_allclose(straight, bent, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("normal", [[1, 0, 0], [0, 0, 1], [0, 0, -1], [0, -1, 0], [0.6, 0, 0.8]])
+def test_the_front_faces_a_pad_that_looks_anywhere(hand: Drawn, normal: list[float]) -> None:
+    model, _ = hand
+    layout = one_link([[0, 0, 0.04]], [normal])
+    pose = pose_of(model, None)
+    taxels = taxels_of(model, pose, layout)
+    assert camera_of("front", model, [layout], pose, 1).toward @ taxels.normal[0] > 0.65
+
+
+# Groups and words ----------------------------------------------------------------------------------------------------
+
+
+def test_a_link_has_the_colour_of_its_smallest_group(hand: Drawn) -> None:
+    _, layouts = hand
+    assert group_of(layouts["few"]) == ["all", "tips"]
+    assert legend(layouts["few"]) == {"other all": 4, "tips": 6}
+    assert legend(layouts["many"]) == {"other all": 36, "tips": 2}  # a filler is no taxel
+
+
+def test_legend_without_groups() -> None:
+    layout = one_link([[0, 0, 0]] * 3, [[0, 0, 1]] * 3)
+    assert legend(layout) == {"taxels": 3}
+    named = one_link([[0, 0, 0]] * 3, [[0, 0, 1]] * 3, groups={"palm": ("palm",)})
+    assert legend(named) == {"palm": 3}
+
+
+def test_titles(hand: Drawn) -> None:
+    figure = drawing(*hand, size=SMALL)
+    assert [axes.get_label() for axes in figure.axes] == ["few", "many"]
+    titles = [[part.get_text() for part in axes.artists[0].get_child().get_children()] for axes in figure.axes]
+    assert titles == [["few", "10 taxels"], ["many", "38 taxels and 1 inactive"]]
+
+
+# The file ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_same_bytes_twice(hand: Drawn, tmp_path: Path) -> None:
+    model, layouts = hand
+    first = render(model, layouts, tmp_path / "new" / "first.png")
+    assert first == tmp_path / "new" / "first.png"
+    assert render(model, layouts, tmp_path / "second.png").read_bytes() == first.read_bytes()
+    assert render(model, layouts, tmp_path / "bent.png", keyframe="bent", size=SMALL).read_bytes() != first.read_bytes()
+    assert matplotlib.image.imread(first).shape[0] == HEIGHT
+
+
+def test_size_and_frame(hand: Drawn, tmp_path: Path) -> None:
+    """The hand fills its panel: in the middle, there is ink within two pixels of the margins that are meant."""
+    model, layouts = hand
+    path = render(model, {"few": layouts["few"]}, tmp_path / "x.png", size=(640, 500))
+    image = matplotlib.image.imread(path)[..., :3]
+    assert image.shape == (500, 640, 3)
+    ink = np.flatnonzero((image[43:457, 20:-20] < 0.995).any(axis=(1, 2)))
+    np.testing.assert_allclose([ink[0], ink[-1]], [0.0146 * 415, 415 - 0.0146 * 415], atol=2.5)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ({"view": "frnt"}, r'^there is no view "frnt"; did you mean "front"\?$'),
+        ({"view": "x"}, r'^there is no view "x"; known views: back, bottom, front, iso, left, right, top$'),
+        ({"keyframe": "bend"}, r'^the scene has no keyframe "bend"; did you mean "bent"\?$'),
+        ({"size": (500, 20)}, rf"^a picture of 500 × 20 pixels is too small, expected at least {FEWEST} of each$"),
+    ],
+)
+def test_bad_choices(hand: Drawn, tmp_path: Path, chosen: dict, message: str) -> None:
+    with pytest.raises(TgdslError, match=message):
+        render(*hand, tmp_path / "x.png", **chosen)
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_nothing_to_draw(hand: Drawn, tmp_path: Path) -> None:
+    for empty in ({}, {"x": one_link([[0, 0, 0]], [[0, 0, 1]], radius=np.zeros(1))}):
+        with pytest.raises(TgdslError, match=r"^there is nothing to draw: no layout has a taxel$"):
+            render(hand[0], empty, tmp_path / "x.png")
+
+
+def test_a_file_that_cannot_be_written(hand: Drawn, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file" / "x.png", tmp_path):
+        with pytest.raises(TgdslError, match=f"^cannot write {out}: "):
+            render(hand[0], {"few": hand[1]["few"]}, out)
+
+
+# What a document draws -----------------------------------------------------------------------------------------------
+
+
+def test_a_document_without_sensors_has_all_taxels_at_all_resolutions(hand: Drawn) -> None:
+    assert {name: layout.num_taxels for name, layout in hand[1].items()} == {"few": 10, "many": 39}
+
+
+def test_a_document_has_the_taxels_of_its_sensors_at_its_resolution(folder: Path) -> None:
+    _, found = layouts(folder / "hand.yaml")
+    assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3}
+    _, found = layouts(folder / "hand.yaml", resolutions=("many", "few"))
+    assert {name: layout.num_taxels for name, layout in found.items()} == {"many": 3, "few": 6}
+    _, found = layouts(folder / "hand.yaml", {"sensors.touch.links": "all", "resolution": "few"})
+    assert {name: layout.num_taxels for name, layout in found.items()} == {"few": 10}
+
+
+def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
+    plan = tgdsl.compile(folder / "hand.yaml").plan
+    drawn = layouts(folder / "hand.yaml")[1]["many"]
+    assert drawn.links == plan.layout().links
+    for name in ("link_id", "pos", "normal", "tangent", "radius", "area", "cell"):
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(plan.layout(), name))
+
+
+def test_mistakes_of_documents(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(TgdslError, match=r'^the layout has no resolution "man"; did you mean "many"\?$'):
+        layouts(folder / "bare.yaml", resolutions=("man",))
+    with pytest.raises(SpecError, match=r'--set resolution=fw: resolution: unknown resolution "fw"; did you mean "few"\?$'):
+        layouts(folder / "bare.yaml", {"resolution": "fw"})
+    (tmp_path / "x.yaml").write_text("tgdsl: 1\nrobot: {model: none.xml, layout: none.yaml}\nobjekts: {}\n")
+    with pytest.raises(SpecError) as caught:
+        layouts(tmp_path / "x.yaml")
+    assert len(caught.value.problems) == 3  # the robot, the layout and the key: all in one run
+    with pytest.raises(SpecError, match='missing key "sensors"'):
+        tgdsl.compile(folder / "bare.yaml")
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def command(here, folder: Path):
+    """Run `tgdsl render` in the folder of the hand; return exit code, output and errors."""
+    return lambda *arguments: here(folder, "render", *arguments)
+
+
+def test_command_draws_a_robot_a_document_and_an_artefact(command, folder: Path, tmp_path: Path) -> None:
+    out = str(tmp_path / "x.png")
+    assert command("hand.xml", "--out", out) == (0, f"few: 10 taxels, many: 39 taxels\npicture: {out}\n", "")
+    assert command("bare.yaml", "--resolutions", "few", "-o", out)[1] == f"few: 10 taxels\npicture: {out}\n"
+    assert command("hand.xml", "--keyframe", "bent", "--view", "iso", "--size", "600", "400")[1].endswith("picture: hand.png\n")
+    assert (folder / "hand.png").is_file()
+    assert command("hand.yaml", "-o", out, "--set", "sensors.touch.links=all")[1].startswith("many: 39 taxels\n")
+    drawn = Path(out).read_bytes()
+    tgdsl.save(tgdsl.compile("hand.yaml", overrides={"sensors.touch.links": "all"}), folder / "hand.safetensors")
+    assert command("hand.safetensors", "-o", out)[0] == 0
+    assert Path(out).read_bytes() == drawn
+
+
+def test_command_draws_a_robot_by_name(command, tmp_path: Path) -> None:
+    out = str(tmp_path / "x.png")
+    assert command("xhand1", "--resolutions", "low", "-o", out) == (0, f"low: 90 taxels\npicture: {out}\n", "")
+
+
+def test_mistakes_of_the_command(command, folder: Path, tmp_path: Path) -> None:
+    tgdsl.save(tgdsl.compile(folder / "hand.yaml"), folder / "hand.safetensors")
+    (tmp_path / "lone.xml").write_text(ROBOT)
+    only = 'tgdsl: an artefact has the layout and resolution it was compiled with, "many", and no other\n'
+    cases = {
+        ("xhand",): 'tgdsl: there is no document, artefact or robot "xhand"; did you mean "xhand1"?\n',
+        ("none.yaml",): "none.yaml: cannot read this file: No such file or directory\n1 mistake\n",
+        (
+            f"{tmp_path}/lone.xml",
+        ): f"tgdsl: {tmp_path}/lone.xml: there is no layout.yaml beside this robot; name its layout with --layout\n",
+        (
+            "bare.yaml",
+            "--layout",
+            "x.yaml",
+        ): "tgdsl: --layout x.yaml: a document names its layout itself; try --set robot.layout=x.yaml\n",
+        ("hand.safetensors", "--resolutions", "few"): only,
+        ("hand.safetensors", "--set", "resolution=few"): only,
+        ("hand.xml", "--view", "bak"): 'tgdsl: there is no view "bak"; did you mean "back"?\n',
+    }
+    for arguments, message in cases.items():
+        assert command(*arguments) == (2, "", message)

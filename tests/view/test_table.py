@@ -1,0 +1,100 @@
+"""The table's numbers against sums by hand, and how it is drawn."""
+
+import io
+
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.view import table as tables
+from tgdsl.view.table import LiveTable, table
+
+SCENE = """
+<mujoco>
+  <worldbody>
+    <body name="palm"><geom type="box" size=".03 .03 .01"/></body>
+    <body name="tip" pos="0 0 1"><geom size=".01"/></body>
+    <body name="cube" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def touch(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "scene.xml"
+    path.write_text(SCENE)
+
+    def points(num: int) -> dict:
+        return {"method": "points", "points": [{"pos": [i, 0, 0], "normal": [0, 0, 1]} for i in range(num)], "radius": 0.01}
+
+    return tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(path), "layout": {"resolutions": {"only": {"palm": points(3), "tip": points(2)}}}},
+            "objects": {"cube": {"body": "cube"}},
+            "sensors": {
+                "touch": {"kind": "kinematic_taxel", "links": "*", "feels": ["cube"], "outputs": ["force", "torque"]},
+                "depth": {"kind": "contact_depth", "links": "palm", "feels": ["cube"], "readout": "both"},
+                "bit": {"kind": "contact", "links": "tip", "feels": ["cube"]},
+                "twist": {"kind": "kinematic_taxel", "links": "tip", "feels": ["cube"], "outputs": ["torque"]},
+            },
+        }
+    )
+
+
+def readings() -> dict[str, torch.Tensor]:
+    force = torch.tensor([[3.0, 0, 1], [0, 4, 2], [0, 0, 9], [-6, 0, 0], [0, 8, 0]])
+    reading = torch.cat([force, torch.full((5, 3), 100.0)], dim=1)
+    depth = torch.tensor([[1e-3], [2.5e-3], [0.0]])
+    bit, torque = torch.tensor([[1.0], [0.0]]), torch.tensor([[-0.3, 0, 0.4], [0.1, 0, 0]])
+    first = {"touch": reading, "depth": depth, "depth/clean": 2 * depth, "bit": bit, "twist": torque}
+    return {name: torch.stack([0 * value, value]).requires_grad_() for name, value in first.items()}
+
+
+def test_numbers(touch):
+    # palm: |(3, 4, 12)| = 13; largest depth 2.5 mm. tip: |(-6, 8, 0)| = 10; one of two taxels; largest |torque| 0.5
+    assert table(touch, readings(), env=1) == [
+        "link  touch [N]  depth [m]  depth/clean [m]  bit [taxels]  twist [N·m]",
+        "────  ─────────  ─────────  ───────────────  ────────────  ───────────",
+        "palm     13.000   2.50e-03         5.00e-03             –            –",
+        "tip      10.000          –                –           1/2     5.00e-01",
+    ]
+
+
+def test_the_first_environment_is_the_default(touch):
+    assert table(touch, readings()) == table(touch, readings(), env=0)
+    assert table(touch, readings())[2].split() == ["palm", "0.000", "0.00e+00", "0.00e+00", "–", "–"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_pipe_gets_the_last_table_only(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr("sys.stdout", stream)
+    live = LiveTable()
+    live.show(["a", "b"])
+    assert stream.getvalue() == ""
+    live.show(["c", "d"], is_last=True)
+    assert stream.getvalue() == "c\nd\n"
+
+
+def test_a_terminal_is_drawn_over_at_most_once_per_period(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(tables.time, "monotonic", lambda: now)
+    stream = Terminal()
+    monkeypatch.setattr("sys.stdout", stream)
+    live = LiveTable(period=0.1)
+    live.show(["a", "b"])
+    assert stream.getvalue() == "a\nb\n"
+    now = 100.05
+    live.show(["too soon"])
+    assert stream.getvalue() == "a\nb\n"
+    now = 100.11
+    live.show(["c", "d", "e"])
+    assert stream.getvalue() == "a\nb\n\x1b[2A\x1b[Jc\nd\ne\n"
+    live.show(["last"], is_last=True)
+    assert stream.getvalue().endswith("\x1b[3A\x1b[Jlast\n")

@@ -1,0 +1,232 @@
+"""Pictures: what is coloured, where it lands on the picture, and what is said when it cannot be drawn."""
+
+import struct
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.errors import TgdslError
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.view.dots import Dots, Pose, dots_of
+from tgdsl.view.shot import Camera, camera_for, is_seen, rasterise, solid_of
+from tgdsl.view.view import picture, short_names
+
+TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
+
+SCENE = """
+<mujoco model="pad"><worldbody>
+<geom name="floor" type="plane" size="1 1 .1"/>
+<body name="pad" pos="0 0 0.05"><geom name="pad" type="box" size=".03 .03 .005"/></body>
+<body name="side" pos="0.1 0 0.05"><geom name="side" type="cylinder" size=".02 .005"/></body>
+<body name="cube" pos=".01 0 .0749"><freejoint/><geom name="cube" type="box" size=".02 .02 .02" mass="0.25"/></body>
+</worldbody></mujoco>
+"""
+DOCUMENT = """
+tgdsl: 1
+robot:
+  model: pad.xml
+  layout:
+    groups: {all: [pad, side]}
+    resolutions:
+      med:
+        pad: {method: grid, rows: 6, columns: 6, direction: [0, 0, -1], radius: 4 mm}
+        side:
+          method: points
+          points:
+            - {pos: [0, 0, 0.005], normal: [0, 0, 1], radius: 4 mm}
+            - {pos: [0.01, 0, 0.005], normal: [0, 0, 1], radius: 4 mm}
+            - {pos: [0, 0, -0.005], normal: [0, 0, -1], radius: 0 mm}
+objects: {cube: {body: cube}}
+sensors:
+  depth: {kind: contact_depth, links: pad, feels: [cube]}
+  touch: {kind: kinematic_taxel, links: all, feels: [cube]}
+"""
+
+
+@pytest.fixture(scope="module")
+def touch(tmp_path_factory: pytest.TempPathFactory) -> TactileModule:
+    folder = tmp_path_factory.mktemp("pad")
+    (folder / "pad.xml").write_text(SCENE)
+    (folder / "pad.yaml").write_text(DOCUMENT)
+    return tgdsl.compile(folder / "pad.yaml")
+
+
+@pytest.fixture(scope="module")
+def sim(touch: TactileModule) -> BatchSimulation:
+    sim = tgdsl.simulate(touch, num_envs=2)
+    sim.batch.qpos[1, 2] += 0.5  # in the second environment the cube is far above
+    for _ in range(3):
+        sim.step()
+    return sim
+
+
+@pytest.fixture(scope="module")
+def readings(touch: TactileModule, sim: BatchSimulation) -> dict[str, torch.Tensor]:
+    return touch(sim.state())
+
+
+def dots(touch: TactileModule, sim: BatchSimulation, readings: dict[str, torch.Tensor], name: str, env: int = 0) -> Dots:
+    output = next(output for output in touch.outputs if output.name == name)
+    return dots_of(touch, sim, output, readings[name], env)
+
+
+def some_dots(pos: list[list[float]], normal: list[list[float]], value: list[float]) -> Dots:
+    columns = (np.array(column, dtype=float) for column in (pos, normal, [0.001] * len(pos), value))
+    return Dots(*columns, "depth", "mm")
+
+
+# What is coloured ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env", [0, 1])
+def test_colours_exactly_the_taxels_that_read(touch, sim, readings, env: int) -> None:
+    for name, reading in readings.items():
+        expected = (reading[env, :, :3] != 0).any(dim=-1).numpy()
+        np.testing.assert_array_equal(dots(touch, sim, readings, name, env).is_read, expected)
+    assert dots(touch, sim, readings, "depth", 0).is_read.any()
+    assert not dots(touch, sim, readings, "depth", 1).is_read.any()
+
+
+def test_magnitude_is_the_norm_over_channels_of_one_unit(touch, sim, readings) -> None:
+    shown = dots(touch, sim, readings, "touch")
+    assert shown.label == "|force| [N]"
+    np.testing.assert_allclose(shown.value, readings["touch"][0, :, :3].norm(dim=-1), rtol=1e-6)
+
+
+def test_small_values_get_a_prefix(touch, sim, readings) -> None:
+    shown = dots(touch, sim, readings, "depth")
+    assert shown.label == "depth [mm]"
+    np.testing.assert_allclose(shown.value, 1e3 * readings["depth"][0, :, 0].double(), rtol=1e-6)
+
+
+def test_dots_are_where_the_taxels_are(touch, sim, readings) -> None:
+    shown, table = dots(touch, sim, readings, "touch"), touch.taxels["touch"]
+    origin = np.where((table["body"] == "pad")[:, None], [0, 0, 0.05], [0.1, 0, 0.05])
+    np.testing.assert_allclose(shown.pos, table["pos"] + origin, atol=TOLERANCE)
+    np.testing.assert_array_equal(shown.size == 0, table["radius"] == 0)
+
+
+def test_summary_adds_forces_but_not_depths() -> None:
+    depth = some_dots([[0, 0, 0]] * 3, [[0, 0, 1]] * 3, [1.0, 2.0, 0.0])
+    assert depth.summary() == "max 2 mm"
+    assert depth.summary(np.array([2])) == "0 mm"
+    force = Dots(depth.pos, depth.normal, depth.size, depth.value, "|force|", "N")
+    assert force.summary() == "Σ 3 N · max 2 N"
+    contact = Dots(depth.pos, depth.normal, depth.size, np.sign(depth.value), "contact", "")
+    assert contact.summary() == "Σ 2"
+
+
+# Camera and pixels ---------------------------------------------------------------------------------------------------
+
+
+def test_projection_by_hand() -> None:
+    """Seen along −x with z up: y runs to the right, and nearness is x."""
+    camera = Camera(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(camera.project(np.array([0.5, 0.25, 0.1])), [0.05, -0.2, 0.4], atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("normal", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [0, -1, 0]])
+def test_read_taxels_face_the_camera(normal: list[float]) -> None:
+    away = [-part for part in normal]
+    camera = camera_for(some_dots([[0, 0, 0.1], [0, 0.1, 0]], [normal, away], [3.0, 1.0]), np.zeros(3))
+    axes = np.stack([camera.right, camera.up, camera.toward])
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=TOLERANCE)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert camera.toward @ normal > 0.85
+
+
+def test_the_nearer_triangle_wins() -> None:
+    """A square of 4 × 4 pixels at nearness 1 behind a triangle at nearness 2 that covers its lower left half."""
+    square = [[[0, 0, 1], [3, 0, 1], [3, 3, 1]], [[0, 0, 1], [3, 3, 1], [0, 3, 1]]]
+    shot = rasterise(np.array([*square, [[0, 0, 2], [3, 0, 2], [0, 3, 2]]], dtype=float), 6, 5)
+    column, row = np.meshgrid(np.arange(6), np.arange(5))
+    expected = np.where((column < 4) & (row < 4), np.where(column + row <= 3, 2.0, 1.0), -np.inf)
+    np.testing.assert_allclose(shot.near, expected, atol=TOLERANCE)
+    np.testing.assert_array_equal(shot.face == 2, expected == 2)
+
+
+def test_nearness_is_interpolated() -> None:
+    corners = np.array([[[-2.0, -2, 0], [20, -2, 22], [-2, 20, 44]]])
+    shot = rasterise(corners, 5, 4)
+    column, row = np.meshgrid(np.arange(5), np.arange(4))
+    np.testing.assert_allclose(shot.near, (column + 2) + 2 * (row + 2), atol=TOLERANCE)
+
+
+def test_hidden_taxels_are_not_seen() -> None:
+    shot = rasterise(np.array([[[0.0, 0, 0.01], [9, 0, 0.01], [0, 9, 0.01]]]), 10, 10)
+    camera = Camera(*np.eye(3), np.zeros(3))
+    shown = some_dots([[0, 0, 0]] * 4, [[0, 0, 1]] * 3 + [[0, 0, -1]], [1.0] * 4)
+    at = np.array([[2, 2, 0.01], [2, 2, 0.0], [8, 8, 0.0], [2, 2, 0.01]])  # on it, behind it, beside it, turned away
+    np.testing.assert_array_equal(is_seen(shown, at, shot, camera), [True, False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "half"),
+    [
+        ("box", ".01 .02 .03", [0.01, 0.02, 0.03]),
+        ("sphere", ".02", [0.02, 0.02, 0.02]),
+        ("capsule", ".01 .02", [0.01, 0.01, 0.03]),
+        ("cylinder", ".01 .02", [0.01, 0.01, 0.02]),
+        ("ellipsoid", ".01 .02 .03", [0.01, 0.02, 0.03]),
+    ],
+)
+def test_shapes_are_where_mujoco_has_them(touch, shape: str, size: str, half: list[float]) -> None:
+    geom = f'<geom type="{shape}" size="{size}" pos="0.1 0 0" quat="1 0 1 0"/>'  # z of the geom is x of the body
+    scene = SCENE.replace("</worldbody>", f'<body name="it" pos="0 0 1" quat="1 0 0 1">{geom}</body></worldbody>')
+    spec = tgdsl.instrument(mujoco.MjSpec.from_string(scene), touch.inputs)
+    sim = BatchSimulation(touch, 1, model=spec.compile())
+    pose = Pose(sim.batch.xpos[0], sim.batch.xquat[0])
+    solid = solid_of(sim.batch.get_model(0), pose, {sim.model.body("it").id})
+    points = solid.corners.reshape(-1, 3)
+    expected = np.array([half[1], half[2], half[0]])  # x of the body is y of the world
+    centre = np.array([0, 0.1, 1])
+    np.testing.assert_allclose(points.min(axis=0), centre - expected, atol=1e-4)
+    np.testing.assert_allclose(points.max(axis=0), centre + expected, atol=1e-4)
+    outward = solid.corners.mean(axis=1) - centre
+    assert ((solid.normals.mean(axis=1) * outward).sum(axis=1) > 0).all()
+
+
+def test_short_names_drop_what_all_share() -> None:
+    names = short_names(["right_hand_link", "right_hand_mid_link2", "right_hand_thumb_rota_link1"])
+    assert list(names.values()) == ["hand_link", "mid_link2", "thumb_rota_link1"]
+    assert short_names(["pad"]) == {"pad": "pad"}
+    assert short_names(["pad", "side"]) == {"pad": "pad", "side": "side"}
+
+
+# The file ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("env", "reading"), [(0, None), (1, None), (0, "depth")])
+def test_writes_a_png(touch, sim, readings, tmp_path: Path, env: int, reading: str | None) -> None:
+    path = picture(touch, sim, readings, tmp_path / "new" / "touch.png", env=env, reading=reading, title="A pad")
+    header = path.read_bytes()[:24]
+    assert path == tmp_path / "new" / "touch.png"
+    assert header[:8] == b"\x89PNG\r\n\x1a\n"
+    assert struct.unpack(">II", header[16:]) == (1600, 900)
+
+
+def test_default_is_the_kinematic_taxel(touch, sim, readings, tmp_path: Path) -> None:
+    chosen = picture(touch, sim, readings, tmp_path / "chosen.png", reading="touch").read_bytes()
+    assert picture(touch, sim, readings, tmp_path / "default.png").read_bytes() == chosen
+    assert picture(touch, sim, readings, tmp_path / "other.png", reading="depth").read_bytes() != chosen
+
+
+def test_unknown_reading(touch, sim, readings, tmp_path: Path) -> None:
+    with pytest.raises(TgdslError, match=r'^there is no reading "dept"; did you mean "depth"\?$'):
+        picture(touch, sim, readings, tmp_path / "x.png", reading="dept")
+
+
+@pytest.mark.parametrize("env", [-1, 2])
+def test_environment_out_of_range(touch, sim, readings, tmp_path: Path, env: int) -> None:
+    with pytest.raises(TgdslError, match=rf"^environment {env} does not exist, expected 0 to 1$"):
+        picture(touch, sim, readings, tmp_path / "x.png", env=env)
+
+
+def test_readings_of_another_module(touch, sim, tmp_path: Path) -> None:
+    with pytest.raises(TgdslError, match=r"^there is nothing to draw: the readings given hold none of this module's taxels$"):
+        picture(touch, sim, {}, tmp_path / "x.png")

@@ -1,0 +1,71 @@
+"""What commands take: documents and artefacts, robots, and values to override."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from tgdsl.console.progress import Progress
+from tgdsl.errors import TgdslError, did_you_mean
+
+if TYPE_CHECKING:
+    from tgdsl.module.module import TactileModule
+
+Overrides = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
+Document = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+
+
+def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
+    """Return the document that an argument names, or one of just a robot and its layout.
+
+    Raises:
+        TgdslError: If it names nothing, or a robot that comes without a layout.
+    """
+    from tgdsl.files.files import is_file, layout_file, robot_names
+
+    path, names = Path(hand), robot_names()
+    if path.suffix in (".yaml", ".yml"):
+        if layout is not None:
+            raise TgdslError(f"--layout {layout}: a document names its layout itself; try --set robot.layout={layout}")
+        return path
+    if hand not in names and not is_file(path):
+        raise TgdslError(f'there is no document, artefact or robot "{hand}"; {did_you_mean(hand, names, "robots")}')
+    own = layout or layout_file(names.get(hand, path))
+    if own is None:
+        raise TgdslError(f"{hand}: there is no layout.yaml beside this robot; name its layout with --layout")
+    return {"tgdsl": 1, "robot": {"model": hand, "layout": str(own)}}
+
+
+def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
+    """Return `KEY=VALUE` arguments as a mapping.
+
+    Raises:
+        TgdslError: If one has no equals sign.
+    """
+    for pair in pairs:
+        if "=" not in pair:
+            raise TgdslError(f'--set {pair}: expected KEY=VALUE, such as "resolution=high"')
+    return {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
+
+
+def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progress | None = None) -> TactileModule:
+    """Return the module of a document, or of an artefact.
+
+    Args:
+        document: The file.
+        overrides: `KEY=VALUE` arguments.
+        progress: Is told what is being done.
+
+    Raises:
+        TgdslError: If an artefact shall be overridden, or what is wrong with the document or artefact.
+    """
+    from tgdsl.compiler.pipeline import compile
+    from tgdsl.module.artifact import load
+
+    if document.suffix == ".safetensors":
+        if overrides:
+            raise TgdslError("an artefact cannot be overridden; compile the document with --set instead")
+        return load(document)
+    return compile(document, overrides=parsed_overrides(overrides), progress=progress)

@@ -1,0 +1,1 @@
+"""What users see in a console: tables, and notes on long work."""

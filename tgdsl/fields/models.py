@@ -1,0 +1,164 @@
+"""Field types shared by every part of the document: quantities, vectors, selections, and the base of all models."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from tgdsl.fields import units
+
+
+class SpecModel(BaseModel):
+    """Base of all document models: frozen, unknown keys forbidden, field docstrings become the schema's descriptions."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _note_model(cls, value: object, info: Any) -> object:
+        """Note which model a mapping was read as, so that an error can name the keys that it knows."""
+        if isinstance(info.context, dict):
+            info.context[id(value)] = cls
+        return value
+
+
+PATTERN = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*(%s)?\s*$"
+"""A number and one of some units, as a pattern of JSON Schema."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Marks a float that may also be written with a unit, bounded in SI units.
+
+    Attributes:
+        dimension: A key of `units.UNITS`.
+        ge: Least value.
+        gt: Bound that the value must exceed.
+    """
+
+    dimension: str
+    ge: float | None = None
+    gt: float | None = None
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        """Read a number or a string, then look at the bounds."""
+        return core_schema.no_info_plain_validator_function(self._read)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        """Return a number, or a string that ends in a unit."""
+        number: dict[str, Any] = {"type": "number"}
+        if self.gt is not None:
+            number["exclusiveMinimum"] = self.gt
+        if self.ge is not None:
+            number["minimum"] = self.ge
+        names = "|".join(name.replace("*", r"\*") for name in units.UNITS[self.dimension])
+        return {"anyOf": [number, {"type": "string", "pattern": PATTERN % names}]} if names else number
+
+    def _read(self, found: object) -> float:
+        value = units.parse(found, self.dimension)
+        if self.gt is not None and not value > self.gt:
+            raise ValueError(f"{value:g} is out of range, expected more than {self.gt:g}")
+        if self.ge is not None and not value >= self.ge:
+            raise ValueError(f"{value:g} is out of range, expected at least {self.ge:g}")
+        return value
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so.
+
+    Attributes:
+        dimension: A key of `units.UNITS`.
+        low: Least usual magnitude, in SI units; 0 is usual too.
+        high: Largest usual magnitude.
+    """
+
+    dimension: str
+    low: float = 0.0
+    high: float = math.inf
+
+    def doubt(self, value: float) -> tuple[str, str] | None:
+        """Return what is unusual about a value, and a hint; None if nothing is."""
+        return units.doubt(value, self.dimension, self.low, self.high)
+
+
+Text = Annotated[str, Tag("text")]
+TEXT_OR_OTHER = Discriminator(lambda value: "text" if isinstance(value, str) else "other")
+"""Tells `Text` from a type tagged "other" by what is found, so that errors speak of one of them only."""
+
+Length = Annotated[float, Quantity("length")]
+PositiveLength = Annotated[float, Quantity("length", gt=0.0)]
+Radius = Annotated[float, Quantity("length", ge=0.0)]
+Area = Annotated[float, Quantity("area", gt=0.0)]
+Angle = Annotated[float, Quantity("angle", gt=0.0)]
+Frequency = Annotated[float, Quantity("frequency", gt=0.0)]
+Pressure = Annotated[float, Quantity("pressure", gt=0.0)]
+Number = Annotated[float, Quantity("number")]
+NonNegative = Annotated[float, Quantity("number", ge=0.0)]
+Positive = Annotated[float, Quantity("number", gt=0.0)]
+Position = tuple[Length, Length, Length]
+
+
+def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(vector):
+        raise ValueError("[0, 0, 0] has no direction, expected a vector of non-zero length")
+    return vector
+
+
+Direction = Annotated[tuple[Number, Number, Number], AfterValidator(_not_zero)]
+
+
+class Selection(SpecModel):
+    """Names to take: shell wildcards or group names; what `exclude` matches is left out."""
+
+    include: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Names, shell wildcards (`*_link2`) or group names, of which at least one must match."""
+    exclude: tuple[str, ...] = ()
+    """Names, wildcards or groups to leave out again."""
+
+
+def _as_selection(value: object) -> object:
+    if isinstance(value, str):
+        return {"include": (value,)}
+    if isinstance(value, (list, tuple)):
+        return {"include": value}
+    if not isinstance(value, (dict, Selection)):
+        raise ValueError("not a selection, expected a name, a list of names, or {include: [...], exclude: [...]}")
+    return value
+
+
+_NAMES = {"type": "array", "items": {"type": "string"}}
+Selector = Annotated[
+    Selection,
+    BeforeValidator(_as_selection),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "string"},
+                {**_NAMES, "minItems": 1},
+                {
+                    "type": "object",
+                    "properties": {"include": {**_NAMES, "minItems": 1}, "exclude": _NAMES},
+                    "required": ["include"],
+                    "additionalProperties": False,
+                },
+            ],
+            "description": "A name, group or shell wildcard, a list of them, or {include: [...], exclude: [...]}.",
+        }
+    ),
+]
+"""What a user may write for a selection: `hand`, `[tips, "*_link1"]` or `{include: [...], exclude: [...]}`."""

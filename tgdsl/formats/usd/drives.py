@@ -1,0 +1,89 @@
+"""Drives of a USD stage's joints, each as one servo, in SI and radians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from tgdsl.formats.usd.notes import read_note
+from tgdsl.formats.usd.stage import Prim, Stage
+
+ENDLESS = 1e30
+"""From this magnitude on a limit is none: the largest float32 is often written for infinity."""
+ROUNDED = 1e-6
+"""A damping that is less than this part of the joint's own, which was taken off it, is rounding of float32."""
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A spring and damper that pulls a joint towards a target.
+
+    Attributes:
+        stiffness: [N·m/rad or N/m].
+        damping: [N·m·s/rad or N·s/m].
+        max_force: [N·m or N], or infinity.
+        target: Target position [rad or m].
+        target_velocity: [rad/s or m/s].
+        actuator: Name of its actuator, or empty: the joint's.
+        control: Range of the target, or None if it is free.
+        gear: The actuator's control is the target times this; it enters its gains twice, its force once.
+        order: Place of its actuator among those that say so; the others come after them.
+    """
+
+    stiffness: float
+    damping: float
+    max_force: float
+    target: float
+    target_velocity: float
+    actuator: str = ""
+    control: Range | None = None
+    gear: float = 1.0
+    order: float = math.inf
+
+
+def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -> tuple[Drive | None, float]:
+    """Return a joint's drive, if it has one that can exert a force, and the joint's own damping.
+
+    Args:
+        stage: The stage.
+        prim: The joint.
+        instance: Which drive is along its degree of freedom.
+        kind: `hinge` or `slide`.
+        own: The joint's own damping [N·m·s/rad or N·s/m], which is part of the drive's.
+    """
+    if not prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, instance):
+        return None, own
+    stiffness, damping, most, target, velocity = (
+        stage.number(prim, f"drive:{instance}:physics:{name}")
+        for name in ("stiffness", "damping", "maxForce", "targetPosition", "targetVelocity")
+    )
+    if not stiffness and not damping:
+        return None, own  # it never exerts a force
+    if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
+        stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
+        return None, own
+    is_angular = kind == "hinge"
+    gain = stage.kilograms * (stage.metres**2 * math.degrees(1) if is_angular else 1.0)
+    force = stage.kilograms * (stage.metres**2 if is_angular else stage.metres)
+    unit = math.radians(1) if is_angular else stage.metres
+    most = math.inf if most >= ENDLESS else most * force
+    own = min(own, damping * gain)
+    rest = damping * gain - own
+    rest = 0.0 if rest < ROUNDED * own else rest
+    if not stiffness and not rest:
+        return None, own
+    control = read_note(stage, prim, "ctrlrange")
+    order = read_note(stage, prim, "order")
+    drive = Drive(
+        stiffness * gain,
+        rest,
+        most,
+        target * unit,
+        velocity * unit,
+        str(read_note(stage, prim, "actuator") or ""),
+        None if control is None else (float(control[0]), float(control[1])),
+        float(read_note(stage, prim, "gear") or 1.0),
+        math.inf if order is None else float(order),
+    )
+    return drive, own

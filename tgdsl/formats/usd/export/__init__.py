@@ -1,0 +1,1 @@
+"""Robots out, as USD."""

@@ -1,0 +1,175 @@
+"""MuJoCo's geoms as USD's shapes, with colours, colliders and the friction of their surfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.errors import RobotError
+from tgdsl.formats.robot import SHAPE_NAMES
+from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
+from tgdsl.formats.usd.notes import GEOM, MESH, SITE, Notes, notable, plain
+
+MESH_GEOM = int(mujoco.mjtGeom.mjGEOM_MESH)
+MASKS = ("contype", "conaffinity")
+"""What is noted of visuals too."""
+AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+"""How the importer takes meshes, unless it is noted otherwise."""
+PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
+"""MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
+
+
+def add_geoms(draft: Draft, body: int, materials: str) -> None:
+    """Write the geoms of a body below its prim.
+
+    Args:
+        draft: The stage.
+        body: MuJoCo's index.
+        materials: Path of the scope that holds the physics materials.
+
+    Raises:
+        RobotError: If USD has no such shape.
+    """
+    model = draft.model
+    first = int(model.body_geomadr[body])
+    for geom in range(first, first + int(model.body_geomnum[body])):
+        shape, scale = _define(draft, geom)
+        prim = shape.GetPrim()
+        place(prim, *_pose(draft, geom), scale)
+        note(prim, "name", model.geom(geom).name)
+        _colour(draft, geom, shape)
+        is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+        for key, value in _notes(draft, GEOM, geom).items():
+            if is_colliding or key in MASKS:
+                note(prim, key, value)
+        if is_colliding:
+            _collide(draft, geom, prim, materials)
+
+
+def _notes(draft: Draft, table: Notes, index: int) -> dict[str, Any]:
+    return notable(table, lambda name: getattr(draft.model, name)[index], lambda name: getattr(plain(), name)[0])
+
+
+def _pose(draft: Draft, geom: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a geom's pose in its body's frame; of a mesh, that of the frame which its file is in."""
+    model, mesh = draft.model, int(draft.model.geom_dataid[geom])
+    pos, quat = model.geom_pos[geom], model.geom_quat[geom]
+    if model.geom_type[geom] != MESH_GEOM:
+        return pos, quat
+    turn = Rotation.from_quat(quat, scalar_first=True) * Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).inv()
+    quat = turn.as_quat(canonical=True, scalar_first=True)
+    return pos - turn.apply(model.mesh_pos[mesh]), quat
+
+
+def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
+    """Define a geom's prim without its pose; return its schema, and the scale that it wants."""
+    model, shapes = draft.model, usd().UsdGeom
+    kind, size = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown"), model.geom_size[geom]
+    name = model.geom(geom).name
+    mesh = model.mesh(model.geom_dataid[geom]).name if kind == "mesh" else ""
+    schemas = {"box": "Cube", "sphere": "Sphere", "ellipsoid": "Sphere", "capsule": "Capsule", "cylinder": "Cylinder"}
+    schema = (schemas | {"plane": "Plane", "mesh": "Mesh"}).get(kind)
+    body = int(model.geom_bodyid[geom])
+    if schema is None:
+        shown = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
+        raise RobotError(f"{draft.file}: {shown} of body {draft.body_name(body)} is of type {kind}, which USD does not have")
+    shape = getattr(shapes, schema).Define(draft.stage, draft.path(draft.bodies[body], name or mesh or kind))
+    scale = size if kind in ("box", "ellipsoid") else None
+    if kind == "box":
+        shape.CreateSizeAttr(2.0)
+    elif kind == "ellipsoid":
+        shape.CreateRadiusAttr(1.0)
+    elif kind == "mesh":
+        _fill(draft, geom, shape)
+    elif kind == "plane":
+        shape.CreateAxisAttr("Z")
+        for create, half in ((shape.CreateWidthAttr, size[0]), (shape.CreateLengthAttr, size[1])):
+            if half > 0:  # MuJoCo draws a half size of 0 without end, and collides every plane so, as UsdPhysics does
+                create(2.0 * float(half))
+    else:
+        shape.CreateRadiusAttr(float(size[0]))
+    if kind in ("capsule", "cylinder"):
+        shape.CreateAxisAttr("Z")
+        shape.CreateHeightAttr(2.0 * float(size[1]))
+    shape.CreateExtentAttr(shapes.Boundable.ComputeExtentFromPlugins(shape, usd().Usd.TimeCode.Default()))
+    return shape, scale
+
+
+def _fill(draft: Draft, geom: int, shape: Any) -> None:
+    """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
+    model, mesh, u = draft.model, int(draft.model.geom_dataid[geom]), usd()
+    shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(_file_vertices(model, mesh)))
+    first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+    shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
+    shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
+    shape.CreateSubdivisionSchemeAttr("none")
+    note(shape.GetPrim(), "mesh", model.mesh(mesh).name)
+    own, usual = draft.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
+    for key, value in notable(MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name)).items():
+        note(shape.GetPrim(), key, value)
+
+
+def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
+    """Return a mesh's vertices in the frame of its file [m], in float32 and in MuJoCo's order.
+
+    MuJoCo moves them to the mesh's principal axes, which costs a last bit here and there; its hull of a symmetric mesh depends
+    on that bit. So where all coordinates are, to that bit, of few decimals, these are what the file had.
+    """
+    first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+    moved = model.mesh_vert[first : first + count].astype(np.float64)
+    found = Rotation.from_quat(model.mesh_quat[mesh], scalar_first=True).apply(moved) + model.mesh_pos[mesh]
+    bit = np.finfo(np.float32).eps * max(np.abs(found).max(), np.abs(moved).max())
+    for decimals in range(8):
+        if np.abs(np.round(found, decimals) - found).max() <= bit:
+            found = np.round(found, decimals)
+            break
+    return np.ascontiguousarray(found + 0.0, dtype=np.float32)
+
+
+def _colour(draft: Draft, geom: int, shape: Any) -> None:
+    model = draft.model
+    rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
+    if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
+        rgba = model.mat_rgba[material]
+    *colour, opacity = rgba.tolist()
+    shape.CreateDisplayColorAttr([usd().Gf.Vec3f(*colour)])
+    if opacity != 1.0:
+        shape.CreateDisplayOpacityAttr([opacity])
+
+
+def _collide(draft: Draft, geom: int, prim: Any, materials: str) -> None:
+    u = usd()
+    u.UsdPhysics.CollisionAPI.Apply(prim)
+    if prim.IsA(u.UsdGeom.Mesh):
+        u.UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")  # as MuJoCo collides it
+    friction = float(draft.model.geom_friction[geom, 0])
+    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(draft, friction, materials), materialPurpose="physics")
+
+
+def _material(draft: Draft, friction: float, scope: str) -> Any:
+    """Return the physics material of a sliding friction; geoms of the same friction share it."""
+    u = usd()
+    if friction not in draft.frictions:
+        material = u.UsdShade.Material.Define(draft.stage, draft.path(scope, f"friction_{friction!r}"))
+        surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+        put(surface.CreateStaticFrictionAttr(), friction)
+        put(surface.CreateDynamicFrictionAttr(), friction)
+        draft.frictions[friction] = material
+    return draft.frictions[friction]
+
+
+def add_sites(draft: Draft, body: int) -> None:
+    """Write the sites of a body below its prim, as frames."""
+    model = draft.model
+    for site in np.flatnonzero(model.site_bodyid == body).tolist():
+        name = model.site(site).name
+        prim = usd().UsdGeom.Xform.Define(draft.stage, draft.path(draft.bodies[body], name or "site")).GetPrim()
+        place(prim, model.site_pos[site], model.site_quat[site])
+        note(prim, "site", True)
+        note(prim, "name", name)
+        for key, value in _notes(draft, SITE, site).items():
+            note(prim, key, value)

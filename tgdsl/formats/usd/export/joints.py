@@ -1,0 +1,227 @@
+"""MuJoCo's joints and servos as USD's joints and drives; the angle of a USD joint is MuJoCo's `qpos`.
+
+A USD joint holds a frame on each of its two bodies and turns about, or slides along, the common x axis. With T the child's
+pose in its parent at `qpos0` (as MuJoCo keeps it), L1 the frame on the child (at the joint's anchor, x along its axis) and M(q)
+the joint's own motion, the frame on the parent is L0 = T L1 M(-qpos0), so that the child stands at L0 M(q) L1⁻¹.
+
+A joint of USD has no damping of its own, but its drive has: the damping of a drive is that of the servo and of the joint
+together, and `tgdsl:damping` says how much of it is the joint's. A damped joint without a servo has a drive without stiffness.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tgdsl.errors import RobotError
+from tgdsl.formats.usd.export.draft import Draft, note, put, tidy, usd
+from tgdsl.formats.usd.notes import JOINT, notable, plain
+
+FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
+JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+NO_DYNAMICS, FIXED_GAIN = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
+NO_BIAS, AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoint"}
+
+
+def joint_of(draft: Draft, body: int) -> int:
+    """Return the index of a body's joint, or -1 if it is fixed to its parent.
+
+    Raises:
+        RobotError: If it has several joints.
+    """
+    count = int(draft.model.body_jntnum[body])
+    if count > 1:
+        raise RobotError(
+            f'{draft.file}: body "{draft.body_name(body)}" has {count} joints, and a body in USD has one to its parent; '
+            "give each joint a body of its own"
+        )
+    return int(draft.model.body_jntadr[body]) if count else -1
+
+
+def add_joint(draft: Draft, body: int, scope: str, collides: bool) -> Any | None:
+    """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap).
+
+    Args:
+        draft: The stage, with all bodies.
+        body: MuJoCo's index of the child.
+        scope: Path of the scope that holds the joints.
+        collides: Whether the two bodies can collide with each other.
+
+    Returns:
+        The joint's schema, if USD has a joint there that can move.
+    """
+    model, joint = draft.model, joint_of(draft, body)
+    kind = int(model.jnt_type[joint]) if joint >= 0 else -1
+    if kind == FREE or model.body_mocapid[body] >= 0:
+        return None
+    name = model.joint(joint).name if joint >= 0 else ""
+    physics = usd().UsdPhysics
+    path = draft.path(scope, name or f"{draft.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
+    made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(draft.stage, path)
+    note(made.GetPrim(), "name", name)
+    parent = int(model.body_parentid[body])
+    if parent:  # a joint without its first body holds the second in the world
+        made.CreateBody0Rel().SetTargets([draft.bodies[parent]])
+    made.CreateBody1Rel().SetTargets([draft.bodies[body]])
+    if collides:
+        made.CreateCollisionEnabledAttr(True)
+    _frames(draft, body, joint, made)
+    if joint < 0:
+        return None
+    if kind in (SLIDE, HINGE):
+        made.CreateAxisAttr("X")
+        _limit(model, joint, made)
+    _passive(model, joint, made.GetPrim())
+    return made
+
+
+def _frames(draft: Draft, body: int, joint: int, made: Any) -> None:
+    model = draft.model
+    pos, turn = np.zeros(3), Rotation.identity()
+    kind = int(model.jnt_type[joint]) if joint >= 0 else -1
+    if joint >= 0:
+        pos = model.jnt_pos[joint]
+    if kind in (SLIDE, HINGE):
+        turn = _x_to(model.jnt_axis[joint])
+    child = Rotation.from_quat(model.body_quat[body], scalar_first=True)
+    parent_pos, parent_turn = model.body_pos[body] + child.apply(pos), child * turn
+    rest = float(model.qpos0[model.jnt_qposadr[joint]]) if kind in (SLIDE, HINGE) else 0.0
+    if kind == SLIDE:
+        parent_pos = parent_pos - parent_turn.apply([rest, 0.0, 0.0])
+    elif kind == HINGE:
+        parent_turn = parent_turn * Rotation.from_rotvec([-rest, 0.0, 0.0])
+    for number, (place, rotation) in enumerate(((parent_pos, parent_turn), (pos, turn))):
+        quat = rotation.as_quat(canonical=True, scalar_first=True)
+        put(getattr(made, f"CreateLocalPos{number}Attr")(), tidy(place))
+        put(getattr(made, f"CreateLocalRot{number}Attr")(), tidy(quat))
+
+
+def _x_to(axis: np.ndarray) -> Rotation:
+    """Return a rotation that takes +x to a unit vector; by way of -x where that is nearer, so that no turn is near 180°."""
+    start = np.array([1.0 if axis[0] >= 0 else -1.0, 0.0, 0.0])
+    turn = Rotation.from_quat([1.0 + start @ axis, *np.cross(start, axis)], scalar_first=True)
+    return turn if axis[0] >= 0 else turn * Rotation.from_quat([0.0, 0.0, 0.0, 1.0], scalar_first=True)
+
+
+def _limit(model: mujoco.MjModel, joint: int, made: Any) -> None:
+    """Write a joint's range: degrees or metres, infinite without limits."""
+    low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
+    if model.jnt_type[joint] == HINGE:
+        low, high = math.degrees(low), math.degrees(high)
+    put(made.CreateLowerLimitAttr(), low)
+    put(made.CreateUpperLimitAttr(), high)
+
+
+def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
+    """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
+    first = int(model.jnt_dofadr[joint])
+    index = {"jnt": joint, "dof": first}
+    notes = notable(JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(plain(), name)[0])
+    for key, value in notes.items():
+        note(prim, key, value)
+    known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
+    if any(known.values()):
+        prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
+    for key, value in known.items():
+        if value:
+            put(prim.CreateAttribute(f"physxJoint:{key}", usd().Sdf.ValueTypeNames.Float, custom=True), value)
+    damping = float(model.dof_damping[first])
+    if damping:
+        note(prim, "damping", damping)
+    if damping and model.jnt_type[joint] in (SLIDE, HINGE):
+        _drive(model, joint, Servo(0.0, 0.0, math.inf, None), prim)
+
+
+@dataclass(frozen=True)
+class Servo:
+    """What an actuator does to its joint, seen from the joint: gears are folded in. SI units, radians.
+
+    Attributes:
+        stiffness: Effort per error of position; 0 for a velocity servo.
+        damping: Effort per error of velocity.
+        limit: Largest effort, either way.
+        control: Range of the target, or None if it is free.
+        gear: What the actuator's own control and effort are multiplied or divided by.
+    """
+
+    stiffness: float
+    damping: float
+    limit: float
+    control: tuple[float, float] | None
+    gear: float = 1.0
+
+
+def add_drives(draft: Draft, joints: dict[int, Any]) -> None:
+    """Write the actuators that USD has drives for; say which are left out.
+
+    Args:
+        draft: The stage.
+        joints: The schema of each joint that can move, by MuJoCo's index.
+    """
+    model, driven = draft.model, list[int]()
+    for actuator in range(model.nu):
+        name = model.actuator(actuator).name
+        shown = f'{draft.file}: actuator "{name}"' if name else f"{draft.file}: unnamed actuator {actuator}"
+        servo, joint = _servo(model, actuator), int(model.actuator_trnid[actuator, 0])
+        if servo is None:
+            is_motor = model.actuator_biastype[actuator] == NO_BIAS and model.actuator_gaintype[actuator] == FIXED_GAIN
+            what = "is a motor" if is_motor else "is no position or velocity servo of a hinge or slide joint"
+            draft.left_out.append(f"{shown} {what}, which USD has no drive for: left out")
+            continue
+        if joint in driven:
+            draft.left_out.append(f"{shown} is not the first of its joint, and USD has one drive for each: left out")
+            continue
+        driven.append(joint)
+        low, high = model.actuator_forcerange[actuator].tolist()
+        if model.actuator_forcelimited[actuator] and low != -high:
+            draft.left_out.append(f"{shown} has the force range {low:g} {high:g}, and USD's are symmetric: the larger is used")
+        _drive(model, joint, servo, joints[joint].GetPrim())
+        note(joints[joint].GetPrim(), "actuator", name)
+    for order, joint in enumerate(driven if driven != sorted(driven) else ()):
+        note(joints[joint].GetPrim(), "order", order)
+
+
+def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
+    """Return an actuator as a servo, or None if it is none."""
+    kinds = (model.actuator_dyntype[actuator], model.actuator_gaintype[actuator], model.actuator_biastype[actuator])
+    if kinds != (NO_DYNAMICS, FIXED_GAIN, AFFINE_BIAS) or model.actuator_trntype[actuator] not in JOINT_TRANSMISSIONS:
+        return None
+    joint = int(model.actuator_trnid[actuator, 0])
+    if model.jnt_type[joint] not in (SLIDE, HINGE):
+        return None
+    gain, gear = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_gear[actuator, 0])
+    offset, stiffness, damping = (0.0 - model.actuator_biasprm[actuator, :3]).tolist()
+    is_position, is_velocity = stiffness == gain, stiffness == 0 and damping == gain
+    if offset or gain <= 0 or not gear or not (is_position or is_velocity):
+        return None
+    limits = [abs(gear) * np.abs(model.actuator_forcerange[actuator]).max()] if model.actuator_forcelimited[actuator] else []
+    limits += [np.abs(model.jnt_actfrcrange[joint]).max()] if model.jnt_actfrclimited[joint] else []
+    low, high = sorted((model.actuator_ctrlrange[actuator] / gear + 0.0).tolist())
+    return Servo(
+        stiffness=stiffness * gear**2,
+        damping=damping * gear**2,
+        limit=float(min(limits, default=math.inf)),
+        control=(low, high) if model.actuator_ctrllimited[actuator] else None,
+        gear=gear,
+    )
+
+
+def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:
+    """Write a servo as a joint's drive, or write it over the drive that is there."""
+    is_hinge = model.jnt_type[joint] == HINGE
+    unit = math.radians(1.0) if is_hinge else 1.0  # an angular drive counts in degrees
+    drive = usd().UsdPhysics.DriveAPI.Apply(prim, "angular" if is_hinge else "linear")
+    drive.CreateTypeAttr("force")
+    put(drive.CreateStiffnessAttr(), servo.stiffness * unit)
+    put(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
+    put(drive.CreateMaxForceAttr(), servo.limit)
+    if servo.control:
+        note(prim, "ctrlrange", servo.control)
+    if servo.gear != 1.0:
+        note(prim, "gear", servo.gear)

@@ -1,0 +1,214 @@
+"""Robots out: a compiled MJCF or URDF model as a UsdPhysics stage, in SI units but where USD wants degrees.
+
+Bodies are siblings below the default prim, at their world poses. What USD has no word for and tgdsl reads back is kept in
+attributes named `tgdsl:`, in SI units and radians:
+
+- the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
+- a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
+  the actuator's place in the `order`, if actuators do not come in the joints' order;
+- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `usd_notes`.
+
+Textures stay behind.
+"""
+
+from __future__ import annotations
+
+import warnings
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from tgdsl.errors import FileError, RobotError, listed
+from tgdsl.files.files import whole_file
+from tgdsl.formats.robot import load_model
+from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
+from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
+from tgdsl.formats.usd.export.joints import BALL, FREE, add_drives, add_joint, joint_of
+from tgdsl.formats.usd.notes import OPTION, flags, notable, plain
+
+ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
+ENDINGS = (".usda", ".usdc", ".usd")
+
+
+def export_usd(model_file: Path, out: Path) -> None:
+    """Write a robot or scene file as a UsdPhysics stage; the same input gives the same bytes.
+
+    Warns of each thing of the model that USD does not hold, after the file is written.
+
+    Args:
+        model_file: An MJCF or URDF file.
+        out: The stage to write: `.usda` is text, `.usdc` and `.usd` are binary.
+
+    Raises:
+        RobotError: If the model cannot be read, USD cannot express it, or the file cannot be written.
+    """
+    if out.suffix not in ENDINGS:
+        raise RobotError(f"{out}: USD files end in {listed(ENDINGS)}")
+    u = usd()
+    model = load_model(model_file)
+    draft = Draft(model_file, model.spec, model.compiled, u.Usd.Stage.CreateInMemory())
+    _add_scene(draft)
+    joints, materials = (draft.path(draft.root, name) for name in ("joints", "materials"))
+    _add_bodies(draft, materials)
+    _add_joints(draft, joints)
+    _add_filters(draft)
+    _write(draft, out)
+    for message in (*draft.left_out, *_left_out(draft)):
+        warnings.warn(message, stacklevel=2)
+
+
+def _add_scene(draft: Draft) -> None:
+    """Write units, gravity and the default prim."""
+    u, model, stage = usd(), draft.model, draft.stage
+    u.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    u.UsdGeom.SetStageUpAxis(stage, u.UsdGeom.Tokens.z)
+    u.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    name = model.names[: model.names.index(b"\0")].decode()
+    draft.root = draft.path("", name)
+    root = u.UsdGeom.Xform.Define(stage, draft.root).GetPrim()
+    note(root, "name", name)
+    stage.SetDefaultPrim(root)
+    if np.any(model.jnt_type != FREE):
+        u.UsdPhysics.ArticulationRootAPI.Apply(root)
+    is_weightless = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    gravity = np.zeros(3) if is_weightless else model.opt.gravity
+    strength = float(np.linalg.norm(gravity))
+    scene = u.UsdPhysics.Scene.Define(stage, draft.path("", "physicsScene"))
+    put(scene.CreateGravityMagnitudeAttr(), strength)
+    put(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
+    settings = notable(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(plain().opt, name))
+    for key, value in (settings | flags(model)).items():
+        note(scene.GetPrim(), key, value)
+
+
+def _add_bodies(draft: Draft, materials: str) -> None:
+    """Write every body at its world pose at `qpos0`, with its mass, geoms and sites."""
+    u, model = usd(), draft.model
+    state = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, state)
+    if np.any(model.geom_contype | model.geom_conaffinity):
+        u.UsdGeom.Scope.Define(draft.stage, materials)
+    for body in range(model.nbody):
+        path = draft.path(draft.root, draft.body_name(body))
+        if body == 0 and not model.body_geomnum[0] and not np.any(model.site_bodyid == 0):
+            continue
+        draft.bodies[body] = path
+        prim = u.UsdGeom.Xform.Define(draft.stage, path).GetPrim()
+        if body:
+            note(prim, "name", model.body(body).name)
+            place(prim, state.xpos[body], state.xquat[body])
+            _add_mass(draft, body, prim)
+        add_geoms(draft, body, materials)
+        add_sites(draft, body)
+
+
+def _add_mass(draft: Draft, body: int, prim: Any) -> None:
+    u, model = usd(), draft.model
+    rigid = u.UsdPhysics.RigidBodyAPI.Apply(prim)
+    if model.body_mocapid[body] >= 0:
+        rigid.CreateKinematicEnabledAttr(True)
+    mass = u.UsdPhysics.MassAPI.Apply(prim)
+    put(mass.CreateMassAttr(), model.body_mass[body])
+    put(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
+    if not model.body_inertia[body].all():
+        return  # of a body that has none, USD wants neither the moments nor their axes
+    put(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
+    put(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
+
+
+def _add_joints(draft: Draft, scope: str) -> None:
+    model, moving = draft.model, {}
+    excluded = _excluded(model)
+    usd().UsdGeom.Scope.Define(draft.stage, scope)
+    for body in range(1, model.nbody):
+        joint, parent = joint_of(draft, body), int(model.body_parentid[body])
+        collides = parent > 0 and (parent, body) not in excluded and not _is_one(model, parent, body)
+        made = add_joint(draft, body, scope, collides)
+        if made is not None:
+            moving[joint] = made
+        elif joint >= 0:
+            note(draft.stage.GetPrimAtPath(draft.bodies[body]), "freejoint", model.joint(joint).name)
+    add_drives(draft, moving)
+
+
+def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
+    """Return the pairs of bodies that the model excludes from collision, by index and sorted."""
+    return {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature.tolist()}
+
+
+def _is_one(model: mujoco.MjModel, one: int, two: int) -> bool:
+    """Return whether MuJoCo never collides two bodies: welded into one, or parent and child of which neither is fixed."""
+    one, two = int(model.body_weldid[one]), int(model.body_weldid[two])
+    if one == two or not one or not two or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        return one == two
+    return any(int(model.body_weldid[model.body_parentid[child]]) == parent for child, parent in ((one, two), (two, one)))
+
+
+def _add_filters(draft: Draft) -> None:
+    """Write the pairs of bodies that do not collide and that USD would not know of.
+
+    MuJoCo's own filter sees bodies that are welded together as one, USD's joints only the two that they join.
+    """
+    model, u, stage = draft.model, usd(), draft.stage
+    pairs = _excluded(model)
+    masks = model.geom_contype | model.geom_conaffinity
+    colliding = sorted({int(body) for body in model.geom_bodyid[masks != 0]} - {0})
+    pairs |= {(a, b) for a, b in combinations(colliding, 2) if model.body_parentid[b] != a and _is_one(model, a, b)}
+    targets: dict[int, list[str]] = {}
+    for one, two in sorted(pairs):
+        if one:
+            targets.setdefault(one, []).append(draft.bodies[two])
+        elif one in draft.bodies:  # the world is no rigid body: each of its colliders is named
+            others = stage.GetPrimAtPath(draft.bodies[one]).GetChildren()
+            walls = [str(other.GetPath()) for other in others if other.HasAPI(u.UsdPhysics.CollisionAPI)]
+            if walls:
+                targets.setdefault(two, []).extend(walls)
+    for body, others in sorted(targets.items()):
+        filtered = u.UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(draft.bodies[body]))
+        filtered.CreateFilteredPairsRel().SetTargets(others)
+
+
+def _left_out(draft: Draft) -> list[str]:
+    """Return one message for each kind of thing that the model has and USD does not."""
+    model = draft.model
+    counts = {
+        "equality constraints": model.neq,
+        "tendons": model.ntendon,
+        "contact pairs": model.npair,
+        "sensors": model.nsensor,
+        "keyframes": model.nkey,
+        "cameras": model.ncam,
+        "lights": model.nlight,
+        "flexes": model.nflex,
+        "skins": model.nskin,
+        "springs of joints": np.count_nonzero(model.jnt_stiffness),
+        "limits of ball joints": np.count_nonzero(model.jnt_limited[model.jnt_type == BALL]),
+        "gravity compensations": np.count_nonzero(model.body_gravcomp),
+    }
+    messages = [f"{draft.file}: USD holds no {kind}: {count} left out" for kind, count in counts.items() if count]
+    colliding = (model.geom_contype | model.geom_conaffinity) != 0
+    unfit = {
+        "no ellipsoids, and leaves out or rounds": (model.geom_type == ELLIPSOID) & colliding,
+        "no planes on bodies, and leaves out": (model.geom_type == PLANE) & colliding & (model.geom_bodyid > 0),
+    }
+    for what, geoms in unfit.items():
+        names = [model.geom(geom).name or f"unnamed geom {geom}" for geom in np.flatnonzero(geoms).tolist()]
+        messages += [f"{draft.file}: USD's physics has {what}: {listed(names)}"] if names else []
+    light = [body for body in range(1, model.nbody) if not model.body_mass[body] and model.body_weldid[body]]
+    if light:
+        names = listed([draft.body_name(body) for body in light])
+        messages.append(f"{draft.file}: USD takes a mass of 0 for one that is not given: {names}")
+    return messages
+
+
+def _write(draft: Draft, out: Path) -> None:
+    """Write the stage to a file that is whole whenever it is there."""
+    try:
+        with whole_file(out) as temporary:
+            if not draft.stage.GetRootLayer().Export(str(temporary)):
+                raise OSError(0, "USD did not say why")
+    except FileError as error:
+        raise RobotError(f"{out}: cannot be written: {error.reason}") from error

@@ -1,0 +1,175 @@
+"""Colliders and visuals of a USD stage: what each is, which body it moves with, what it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.formats.usd.notes import GEOM, MESH, SITE, read_note, read_notes
+from tgdsl.formats.usd.shapes import SCHEMAS, Shape, approximated, shape_of
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage
+
+FRICTIONS = ("dynamicFriction", "staticFriction")
+"""Coefficients of a physics material, the one that MuJoCo gets first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Geom:
+    """A geometry prim, as it collides or as it is seen.
+
+    Attributes:
+        path: Path of its prim.
+        prim: Its prim.
+        body: Path of its body; None is the world.
+        shape: What it is, in the body's frame.
+        is_collider: Whether it collides.
+        is_visible: Whether it is drawn by default.
+        is_hull: Whether a mesh was meant to be its convex hull.
+        friction: Coefficient of sliding friction, or None if its material has none.
+        density: Density of its material [kg/m³], or 0.
+        color: Red, green, blue, alpha, or None.
+        notes: More attributes of the MJCF geom, if it collides.
+        mesh: Attributes of its MJCF mesh, its name among them.
+    """
+
+    path: str
+    prim: Prim
+    body: str | None
+    shape: Shape
+    is_collider: bool
+    is_visible: bool
+    is_hull: bool
+    friction: float | None
+    density: float
+    color: Float[np.ndarray, 4] | None
+    notes: dict[str, str] = field(default_factory=dict)
+    mesh: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A frame on a body that MJCF calls a site.
+
+    Attributes:
+        prim: Its prim.
+        body: Path of its body; None is the world.
+        pose: Its frame in the body's frame [m].
+        notes: More attributes of the MJCF site.
+    """
+
+    prim: Prim
+    body: str | None
+    pose: Matrix
+    notes: dict[str, str]
+
+
+def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Site]:
+    """Read all prims that are noted to be sites.
+
+    Args:
+        stage: The stage.
+        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
+        frames: World pose of each rigid body [m].
+    """
+    sites = []
+    for prim in stage.prims:
+        if read_note(stage, prim, "site"):
+            body = owners[str(prim.GetPath())]
+            pose = stage.frame(prim)[0]
+            place = pose if body is None else np.linalg.inv(frames[body]) @ pose
+            sites.append(Site(prim, body, place, read_notes(stage, prim, SITE)))
+    return sites
+
+
+def read_geoms(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Geom]:
+    """Read all colliders and all that is visible.
+
+    A mesh that collides as a box or ball and is visible gives two geoms.
+
+    Args:
+        stage: The stage.
+        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
+        frames: World pose of each rigid body [m].
+
+    Raises:
+        RobotError: If a mesh is broken.
+    """
+    geoms: list[Geom] = []
+    instancer = "//"  # what is below a point instancer is only there as its instances
+    for prim in stage.prims:
+        if str(prim.GetPath()).startswith(instancer):
+            continue
+        is_collider = prim.HasAPI(stage.pxr.UsdPhysics.CollisionAPI) and bool(stage.value(prim, "physics:collisionEnabled"))
+        is_shape = prim.GetTypeName() in SCHEMAS
+        is_visible = _is_visible(stage, prim)
+        if not is_shape:
+            if is_collider:
+                stage.drop("colliders were dropped that are no geometry that MuJoCo has", prim)
+            elif is_visible and (prim.IsA(stage.pxr.UsdGeom.Gprim) or prim.IsA(stage.pxr.UsdGeom.PointInstancer)):
+                stage.drop("visuals were dropped that are no geometry that MuJoCo has", prim)
+            if prim.IsA(stage.pxr.UsdGeom.PointInstancer):
+                instancer = f"{prim.GetPath()}/"
+        elif is_collider or is_visible:
+            geoms += _geoms(stage, prim, owners[str(prim.GetPath())], frames, is_collider, is_visible)
+    return geoms
+
+
+def _geoms(
+    stage: Stage, prim: Prim, body: str | None, frames: Mapping[str, Matrix], is_collider: bool, is_visible: bool
+) -> list[Geom]:
+    pose = stage.pose(prim)
+    if abs(np.linalg.det(pose[:3, :3])) == 0:
+        raise stage.error(prim, "its transform is flat: a scale is zero")
+    place = pose if body is None else np.linalg.inv(frames[body]) @ pose
+    shape = shape_of(stage, prim, place)
+    friction, density = _material(stage, prim) if is_collider else (None, 0.0)
+    color = _color(stage, prim)
+    notes, mesh = read_notes(stage, prim, GEOM) if is_collider else {}, read_notes(stage, prim, MESH)
+    mesh |= {"name": name} if (name := read_note(stage, prim, "mesh")) else {}
+    path = str(prim.GetPath())
+    if not is_collider:
+        if shape.vertices is not None and len(shape.vertices) < 4:
+            stage.drop("visual meshes with less than four points were dropped", prim)
+            return []
+        return [Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh)]
+    collided, is_hull = (
+        approximated(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
+    )
+    is_same = collided is shape
+    found = [Geom(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color, notes, mesh)]
+    if is_visible and not is_same:
+        found.append(Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh))
+    return found
+
+
+def _is_visible(stage: Stage, prim: Prim) -> bool:
+    geometry = stage.pxr.UsdGeom
+    if not prim.IsA(geometry.Imageable):
+        return False
+    imageable = geometry.Imageable(prim)
+    is_drawn = imageable.ComputePurpose() in (geometry.Tokens.default_, geometry.Tokens.render)
+    return is_drawn and imageable.ComputeVisibility() != geometry.Tokens.invisible
+
+
+def _material(stage: Stage, prim: Prim) -> tuple[float | None, float]:
+    """Return friction and density [kg/m³] of the material that is bound for physics, or else for all purposes."""
+    material = stage.pxr.UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+    if not material or not material.HasAPI(stage.pxr.UsdPhysics.MaterialAPI):
+        return None, 0.0
+    if stage.number(material, "physics:restitution") > 0:
+        stage.drop("restitution of materials was dropped: MuJoCo has none", material)
+    authored = [stage.authored(material, f"physics:{name}") for name in FRICTIONS]
+    friction = next((float(value) for value in authored if value is not None), None)
+    return friction, stage.number(material, "physics:density") * stage.kilograms / stage.metres**3
+
+
+def _color(stage: Stage, prim: Prim) -> Float[np.ndarray, 4] | None:
+    """Return the display colour; of several, the first."""
+    colors = stage.authored(prim, "primvars:displayColor")
+    if not colors:
+        return None
+    opacity = stage.authored(prim, "primvars:displayOpacity")
+    return np.array([*colors[0], opacity[0] if opacity else 1.0], dtype=np.float64)

@@ -1,0 +1,270 @@
+"""Joints of a USD stage, each as one MuJoCo joint: frames, limits, drives and authored positions, in SI and radians."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.formats.usd.drives import ENDLESS, Drive, Range, read_drive
+from tgdsl.formats.usd.notes import JOINT, read_note, read_notes
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage
+
+OPEN_SIDE = 1e10
+"""Written for a missing limit beside one that exists, which MuJoCo has no word for [rad or m]."""
+MEETING = 1e-4
+"""How far the two frames of a joint may be apart in the authored pose [m and rad]."""
+DOFS = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
+"""Degrees of freedom of a generic joint, as its limits and drives are called."""
+AXES = {"X": np.array([1.0, 0.0, 0.0]), "Y": np.array([0.0, 1.0, 0.0]), "Z": np.array([0.0, 0.0, 1.0])}
+KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "PhysicsSphericalJoint": "ball"}
+"""MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are seen to one by one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint between two bodies, or between one and the world.
+
+    Attributes:
+        path: Path of its prim.
+        prim: Its prim.
+        kind: `hinge`, `slide`, `ball`, `fixed`, or `free` if it holds nothing.
+        axis: Its axis, in the joint frame.
+        bodies: Paths of body 0 and body 1; None is the world.
+        targets: Paths of the prims that it names, which may be below the bodies or static; or empty.
+        frames: The joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero.
+        range: Least and greatest position [rad or m], or None if it has no limits.
+        drive: What drives it.
+        damping: Its own [N·m·s/rad or N·s/m], beside the drive's.
+        armature: [kg·m² or kg].
+        friction: Friction torque or force [N·m or N].
+        is_excluded: Whether it is kept out of the articulation.
+        is_filtering: Whether the bodies must not collide.
+        notes: More attributes of the MJCF joint.
+    """
+
+    path: str
+    prim: Prim
+    kind: str
+    axis: Float[np.ndarray, 3]
+    bodies: tuple[str | None, str | None]
+    targets: tuple[str, str]
+    frames: tuple[Matrix, Matrix]
+    range: Range | None
+    drive: Drive | None
+    damping: float
+    armature: float
+    friction: float
+    is_excluded: bool
+    is_filtering: bool
+    notes: dict[str, str]
+
+    def pose(self, is_swapped: bool) -> Matrix:
+        """Return the pose of the child in its parent at position zero; body 0 is the child if swapped."""
+        parent, child = self.frames[::-1] if is_swapped else self.frames
+        return parent @ np.linalg.inv(child)
+
+    def authored(self, world: tuple[Matrix, Matrix]) -> tuple[Matrix, float, float]:
+        """Return where frame 1 is in frame 0 in given poses, the position [rad or m] and how far off the joint's motion it is.
+
+        Args:
+            world: World poses of body 0 and body 1 [m].
+        """
+        first, second = (pose @ frame for pose, frame in zip(world, self.frames, strict=True))
+        apart = np.linalg.inv(first) @ second
+        turn = Rotation.from_matrix(apart[:3, :3])
+        position, off, tilt = 0.0, apart[:3, 3], turn.magnitude()
+        if self.kind == "hinge":
+            x, y, z, w = turn.as_quat(canonical=True)
+            position = 2 * math.atan2(float(self.axis @ [x, y, z]), float(w))
+            tilt = (Rotation.from_rotvec(-position * self.axis) * turn).magnitude()
+            position = _wrapped(position, self.range)
+        elif self.kind == "slide":
+            position = float(self.axis @ off)
+            off = off - position * self.axis
+        elif self.kind == "ball":
+            tilt = 0.0
+        return apart, position, max(float(np.linalg.norm(off)), float(tilt))
+
+
+def _wrapped(angle: float, limits: Range | None) -> float:
+    """Return the angle, or the same a turn on if only that is within the limits."""
+    if limits is None:
+        return angle
+    return min((angle, angle - 2 * math.pi, angle + 2 * math.pi), key=lambda a: max(limits[0] - a, a - limits[1], 0.0))
+
+
+def read_joints(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Joint]:
+    """Read all enabled joints.
+
+    Args:
+        stage: The stage.
+        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
+        frames: World pose of each rigid body [m].
+
+    Raises:
+        RobotError: If a joint is one that MuJoCo does not have, or joins what does not exist.
+    """
+    joints = []
+    for prim in stage.prims:
+        kind = str(prim.GetTypeName())
+        if not prim.IsA(stage.pxr.UsdPhysics.Joint):
+            if kind.endswith("Joint"):
+                raise stage.error(
+                    prim, f"{kind} is not supported; known joints: revolute, prismatic, spherical, fixed, generic"
+                )
+            continue
+        if stage.value(prim, "physics:jointEnabled"):
+            joint = _joint(stage, prim, owners, frames)
+            if joint.bodies[0] == joint.bodies[1]:
+                stage.drop("joints were dropped that join a body to itself, or the world to the world", prim)
+            else:
+                joints.append(joint)
+    return joints
+
+
+def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> Joint:
+    kind, axis, limits, instance = _kind(stage, prim)
+    if limits and limits[0] > limits[1]:
+        raise stage.error(prim, f"its lower limit {limits[0]!r} is above its upper limit {limits[1]!r}")
+    (first, frame0, target0), (second, frame1, target1) = (_side(stage, prim, side, owners, frames) for side in (0, 1))
+    if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
+        kind, frame0, limits = "fixed", frame0 @ _moved(kind, axis, limits[0]), None
+    _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
+    drive, damping = None, float(read_note(stage, prim, "damping") or 0.0)
+    if kind in ("hinge", "slide"):
+        drive, damping = read_drive(stage, prim, instance, kind, damping)
+    mass = stage.kilograms * (1.0 if kind == "slide" else stage.metres**2)
+    return Joint(
+        path=str(prim.GetPath()),
+        prim=prim,
+        kind=kind,
+        axis=axis,
+        bodies=(first, second),
+        targets=(target0, target1),
+        frames=(frame0, frame1),
+        range=limits,
+        drive=drive,
+        damping=damping,
+        armature=stage.number(prim, "physxJoint:armature") * mass,
+        friction=stage.number(prim, "physxJoint:jointFriction") * mass * (stage.metres if kind == "slide" else 1.0),
+        is_excluded=bool(stage.value(prim, "physics:excludeFromArticulation")),
+        is_filtering=not stage.value(prim, "physics:collisionEnabled"),
+        notes=read_notes(stage, prim, JOINT),
+    )
+
+
+def _moved(kind: str, axis: Float[np.ndarray, 3], position: float) -> Matrix:
+    """Return where frame 1 of a hinge or slide is in frame 0."""
+    matrix = np.eye(4)
+    if kind == "hinge":
+        matrix[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
+    else:
+        matrix[:3, 3] = position * axis
+    return matrix
+
+
+def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | None, str]:
+    """Return the kind of a joint, its axis, its range [rad or m] and which drive is its own."""
+    schema = str(prim.GetTypeName())
+    axis = AXES.get(str(stage.value(prim, "physics:axis")), AXES["X"])
+    if schema == "PhysicsJoint":
+        return _generic(stage, prim)
+    if schema == "PhysicsFixedJoint":
+        return "fixed", axis, None, ""
+    if schema not in KINDS:
+        raise stage.error(prim, f"{schema} is not supported: MuJoCo has no such joint")
+    kind = KINDS[schema]
+    if kind == "ball":
+        if any(stage.number(prim, f"physics:coneAngle{i}Limit", -1.0) >= 0 for i in (0, 1)):
+            stage.drop("cone limits of spherical joints were dropped: MuJoCo limits a ball joint's whole angle", prim)
+        return kind, axis, None, ""
+    low, high = (stage.number(prim, f"physics:{end}Limit") for end in ("lower", "upper"))
+    unit = math.radians(1) if kind == "hinge" else stage.metres
+    return kind, axis, _range(low, high, unit), "angular" if kind == "hinge" else "linear"
+
+
+def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | None, str]:
+    """Return what a joint that is defined by its limits amounts to."""
+    free: dict[str, Range | None] = {}
+    for dof in DOFS:
+        if not prim.HasAPI(stage.pxr.UsdPhysics.LimitAPI, dof):
+            free[dof] = None
+            continue
+        low, high = (stage.number(prim, f"limit:{dof}:physics:{end}") for end in ("low", "high"))
+        if low < high or low == high != 0.0:
+            free[dof] = _range(low, high, math.radians(1) if dof.startswith("rot") else stage.metres)
+    is_unlimited = not any(free.values()) and not prim.HasAPI(stage.pxr.UsdPhysics.LimitAPI, "distance")
+    if not free:
+        return "fixed", AXES["X"], None, ""
+    if len(free) == 1:
+        ((dof, limits),) = free.items()
+        return ("hinge" if dof.startswith("rot") else "slide"), AXES[dof[-1]], limits, dof
+    if is_unlimited and tuple(free) == DOFS:
+        return "free", AXES["X"], None, ""
+    if is_unlimited and tuple(free) == DOFS[3:]:
+        return "ball", AXES["X"], None, ""
+    raise stage.error(
+        prim, f"a generic joint that leaves {', '.join(free)} free is no single MuJoCo joint (hinge, slide, ball, fixed, free)"
+    )
+
+
+def _range(low: float, high: float, unit: float) -> Range | None:
+    """Return a range in SI; a side without limit gets a far one if the other has one."""
+    ends = tuple(math.copysign(OPEN_SIDE, end) if abs(end) >= ENDLESS else end * unit for end in (low, high))
+    return None if max(abs(low), abs(high)) >= ENDLESS and min(abs(low), abs(high)) >= ENDLESS else (ends[0], ends[1])
+
+
+def _side(
+    stage: Stage, prim: Prim, side: int, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]
+) -> tuple[str | None, Matrix, str]:
+    """Return the body on one side of a joint, the joint frame in it, and the path of the prim that is named, or nothing."""
+    targets = prim.GetRelationship(f"physics:body{side}").GetForwardedTargets()
+    if len(targets) > 1:
+        raise stage.error(prim, f"physics:body{side} has {len(targets)} targets; expected one at most")
+    target = stage.usd.GetPrimAtPath(targets[0]) if targets else stage.usd.GetPseudoRoot()
+    if not target or str(target.GetPath()) not in owners:  # an inactive prim is found, but is not there
+        raise stage.error(prim, f"physics:body{side} names {targets[0]}, which does not exist")
+    body = owners[str(target.GetPath())]
+    frame, scale = stage.frame(target)
+    own = np.eye(4)
+    own[:3, 3] = scale * np.array(stage.value(prim, f"physics:localPos{side}"), dtype=np.float64)
+    own[:3, :3] = rotation_of(stage, prim, f"physics:localRot{side}").as_matrix()
+    if not np.isfinite(own).all():
+        raise stage.error(prim, f"physics:localPos{side} is not finite")
+    frame = frame @ own
+    return body, frame if body is None else np.linalg.inv(frames[body]) @ frame, str(targets[0]) if targets else ""
+
+
+def rotation_of(stage: Stage, prim: Prim, name: str) -> Rotation:
+    """Return the value of a quaternion attribute.
+
+    Raises:
+        RobotError: If it has no length.
+    """
+    value = stage.value(prim, name)
+    quat = np.array([value.GetReal(), *value.GetImaginary()], dtype=np.float64)
+    length = np.linalg.norm(quat)
+    if not np.isfinite(length) or length == 0:
+        raise stage.error(prim, f"{name} is no rotation: {value}")
+    return Rotation.from_quat(quat / length, scalar_first=True)
+
+
+def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
+    """Take note of what a joint has that MuJoCo cannot do."""
+    for dof in (*DOFS, "linear", "angular"):
+        gains = [stage.number(prim, f"drive:{dof}:physics:{name}") for name in ("stiffness", "damping")]
+        if dof != instance and prim.HasAPI(stage.pxr.UsdPhysics.DriveAPI, dof) and any(gains):
+            stage.drop(
+                "drives were dropped that are not along the one degree of freedom of a revolute or prismatic joint", prim
+            )
+    for name in ("physics:breakForce", "physics:breakTorque"):
+        if stage.number(prim, name, math.inf) < ENDLESS:
+            stage.drop("joints do not break: their breakForce and breakTorque were dropped", prim)
+    # Schemas that usd-core does not know are not among `GetAppliedSchemas`.
+    if any("Mimic" in name for name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()):
+        stage.drop("couplings between joints (mimic) were dropped", prim)

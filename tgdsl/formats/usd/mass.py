@@ -1,0 +1,166 @@
+"""Mass, centre of mass and inertia of USD bodies, by the precedence that UsdPhysics sets out in its MassAPI."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.formats.usd.geoms import Geom
+from tgdsl.formats.usd.joints import rotation_of
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage
+
+DENSITY = 1000.0
+"""What a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]."""
+BALL = 0.1
+"""Radius of the ball that stands in for a body which has a mass but neither inertia nor geometry [m]."""
+LEAST_INERTIA = 1e-9
+"""Least principal moment of a body whose inertia is that of no real body [kg·m²]."""
+Vector = Float[np.ndarray, "3"]
+Tensor = Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Inertial:
+    """How a body resists motion, in its frame.
+
+    Attributes:
+        mass: [kg].
+        centre: Centre of mass [m].
+        tensor: Inertia about it [kg·m²].
+    """
+
+    mass: float
+    centre: Vector
+    tensor: Tensor
+
+    def principal(self) -> tuple[Vector, Rotation]:
+        """Return the principal moments [kg·m²] and the rotation of their axes."""
+        moments, axes = np.linalg.eigh(self.tensor)
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        return moments, Rotation.from_matrix(axes)
+
+    def about(self, point: Vector) -> Tensor:
+        """Return the inertia about another point [kg·m²]."""
+        arm = point - self.centre
+        return self.tensor + self.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+@dataclass(frozen=True, eq=False)
+class _Authored:
+    """What a prim's MassAPI says, in SI, lengths along the prim's own axes; None or 0 where it says nothing."""
+
+    mass: float = 0.0
+    density: float = 0.0
+    centre: Vector | None = None
+    tensor: Tensor | None = None
+
+
+def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Geom], frame: Matrix) -> Inertial | None:
+    """Return the mass and inertia of a body, or None if it has neither mass nor colliders.
+
+    A body's mass overrules its colliders', a collider's density overrules its body's, and that its material's. A centre of
+    mass that is authored without an inertia is the point about which the colliders' inertia is taken, as in usd-core.
+
+    Args:
+        stage: The stage.
+        body: The body's prim.
+        geoms: Its geoms.
+        frame: Its world pose [m].
+
+    Raises:
+        RobotError: If what is authored is no mass, or no inertia.
+    """
+    own, geoms = _authored(stage, body), list(geoms)
+    parts = [_collider(stage, geom, own.density, frame) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    whole = _sum([part for part in parts if part.mass > 0])
+    if own.mass and whole is not None:
+        whole = Inertial(own.mass, whole.centre, whole.tensor * (own.mass / whole.mass))
+    elif own.mass and own.tensor is None:
+        whole = _stand_in(stage, body, own.mass, geoms)
+    elif own.mass:
+        whole = Inertial(own.mass, np.zeros(3), np.zeros((3, 3)))
+    return None if whole is None else _mended(stage, body, _overruled(whole, own))
+
+
+def _authored(stage: Stage, prim: Prim) -> _Authored:
+    if not prim.HasAPI(stage.pxr.UsdPhysics.MassAPI):
+        return _Authored()
+    mass, density = stage.number(prim, "physics:mass"), stage.number(prim, "physics:density")
+    moments = np.array(stage.value(prim, "physics:diagonalInertia"), dtype=np.float64)
+    for name, value in (("mass", mass), ("density", density), ("diagonalInertia", moments)):
+        if not np.isfinite(value).all() or np.min(value) < 0:
+            raise stage.error(prim, f"physics:{name} is {np.asarray(value).tolist()}; expected 0 or more")
+    centre = np.array(stage.value(prim, "physics:centerOfMass"), dtype=np.float64)
+    tensor = None
+    if moments.any():
+        quat = stage.value(prim, "physics:principalAxes")
+        is_turned = quat.GetReal() or any(quat.GetImaginary())
+        axes = rotation_of(stage, prim, "physics:principalAxes").as_matrix() if is_turned else np.eye(3)
+        tensor = axes @ np.diag(moments) @ axes.T * stage.kilograms * stage.metres**2
+    return _Authored(
+        mass * stage.kilograms,
+        density * stage.kilograms / stage.metres**3,
+        stage.frame(prim)[1] * centre if np.isfinite(centre).all() else None,
+        tensor,
+    )
+
+
+def _overruled(computed: Inertial, own: _Authored) -> Inertial:
+    """Put an authored centre of mass and inertia in place of the computed ones."""
+    centre = computed.centre if own.centre is None else own.centre
+    return Inertial(computed.mass, centre, computed.about(centre) if own.tensor is None else own.tensor)
+
+
+def _collider(stage: Stage, geom: Geom, body_density: float, frame: Matrix) -> Inertial:
+    """Return what a collider contributes, in the body's frame."""
+    own = _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
+    volume, centre, tensor = geom.shape.solid(geom.is_hull)
+    mass = own.mass or volume * (own.density or body_density or geom.density or DENSITY)
+    computed = Inertial(mass, centre, tensor * (mass / volume if volume else 0.0))
+    if own.centre is None and own.tensor is None:
+        return computed
+    place = np.linalg.inv(frame) @ stage.frame(geom.prim)[0]
+    turn, point = place[:3, :3], place[:3, 3]
+    return _overruled(
+        computed,
+        _Authored(
+            centre=None if own.centre is None else turn @ own.centre + point,
+            tensor=None if own.tensor is None else turn @ own.tensor @ turn.T,
+        ),
+    )
+
+
+def _sum(parts: list[Inertial]) -> Inertial | None:
+    if not parts:
+        return None
+    mass = sum(part.mass for part in parts)
+    centre = np.sum([part.mass * part.centre for part in parts], axis=0) / mass
+    return Inertial(mass, centre, np.sum([part.about(centre) for part in parts], axis=0))
+
+
+def _stand_in(stage: Stage, body: Prim, mass: float, geoms: list[Geom]) -> Inertial:
+    """Return a body of which only the mass is known: its visuals filled evenly, or a ball."""
+    solids = [geom.shape.solid(False) for geom in geoms if geom.shape.kind != "plane"]
+    whole = _sum([Inertial(*solid) for solid in solids if solid[0] > 0])
+    if whole is not None:
+        stage.drop("bodies have a mass but neither inertia nor colliders; their visuals were taken as solid", body)
+        return Inertial(mass, whole.centre, whole.tensor * (mass / whole.mass))
+    stage.drop(f"bodies have a mass but neither inertia nor geometry; a ball of {BALL} m radius was taken", body)
+    return Inertial(mass, np.zeros(3), 0.4 * mass * BALL**2 * np.eye(3))
+
+
+def _mended(stage: Stage, body: Prim, found: Inertial) -> Inertial:
+    """Replace an inertia that no rigid body can have by a ball's of about the same size; rounding is only rounded away."""
+    moments, axes = found.principal()
+    low, middle, high = moments
+    if low > 0 and low + middle >= high:
+        return found
+    if low > 0 and low + middle >= high * (1 - 1e-6):  # authored in float32: a disc may miss by a digit
+        turn = axes.as_matrix()
+        return Inertial(found.mass, found.centre, turn @ np.diag([low, middle, (low + middle) * (1 - 1e-12)]) @ turn.T)
+    stage.drop("inertias that no body can have were mended", body)
+    return Inertial(found.mass, found.centre, max(float(moments.mean()), LEAST_INERTIA) * np.eye(3))

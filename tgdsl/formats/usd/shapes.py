@@ -1,0 +1,253 @@
+"""USD geometry as MuJoCo's shapes in a body's frame: primitives where their scale allows, else meshes; volume, inertia."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.formats.usd.meshes import Faces, Vertices, ball_profile, compact, lathed, read_mesh, turned
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage, rotation_and_scale
+
+ROUND = 1e-5
+"""Relative difference of two scales from which on a circle is none any more: scales are often authored in float32."""
+CONVEX = 1e-3
+"""A closed mesh that fills its hull but for this part counts as convex."""
+FLAT = 1e-6
+"""A mesh that is thinner than this part of its length has no hull."""
+SCHEMAS = ("Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane")
+"""Geometry that can be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A shape in its body's frame.
+
+    Attributes:
+        kind: MuJoCo's name of its type.
+        size: Its size as MuJoCo defines it [m].
+        pose: Its frame in the body frame [m].
+        vertices: Of a mesh, in the shape's frame [m].
+        faces: Of a mesh; they look outwards.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    pose: Matrix
+    vertices: Vertices | None = None
+    faces: Faces | None = None
+
+    @cached_property
+    def hull(self) -> trimesh.Trimesh | None:
+        """The hull of a mesh, or None if it is flat."""
+        assert self.vertices is not None
+        spread = np.linalg.svd(self.vertices - self.vertices.mean(axis=0), compute_uv=False)
+        if len(self.vertices) < 4 or spread[2] <= FLAT * spread[0]:
+            return None
+        return trimesh.convex.convex_hull(self.vertices)
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether a mesh is closed and fills its hull."""
+        hull, own = self.hull, self._closed
+        return hull is not None and own is not None and bool(own.volume >= (1 - CONVEX) * hull.volume)
+
+    @cached_property
+    def _closed(self) -> trimesh.Trimesh | None:
+        assert self.vertices is not None and self.faces is not None
+        own = trimesh.Trimesh(*compact(self.vertices, self.faces), process=False)
+        return own if own.is_volume else None
+
+    def solid(self, is_hull: bool) -> tuple[float, Float[np.ndarray, 3], Float[np.ndarray, "3 3"]]:
+        """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
+
+        Args:
+            is_hull: Whether the hull of a mesh counts, rather than the mesh; that of an open mesh always does.
+        """
+        volume, centre, inertia = self._mesh_solid(is_hull) if self.kind == "mesh" else self._primitive_solid()
+        rotation = self.pose[:3, :3]
+        return volume, rotation @ centre + self.pose[:3, 3], rotation @ inertia @ rotation.T
+
+    def _mesh_solid(self, is_hull: bool) -> tuple[float, np.ndarray, np.ndarray]:
+        solid = None if is_hull else self._closed
+        solid = self.hull if solid is None else solid
+        if solid is None:
+            return 0.0, np.zeros(3), np.zeros((3, 3))
+        return float(solid.volume), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
+
+    def _primitive_solid(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Closed forms (any handbook): second moments ∫x², ∫y², ∫z² of each, from which the moments of inertia follow."""
+        if self.kind == "box":
+            x, y, z = self.size
+            volume, squares = 8 * x * y * z, np.array([x * x, y * y, z * z]) / 3
+        elif self.kind in ("sphere", "ellipsoid"):
+            x, y, z = self.size if self.kind == "ellipsoid" else self.size * 3
+            volume, squares = 4 / 3 * np.pi * x * y * z, np.array([x * x, y * y, z * z]) / 5
+        elif self.kind in ("cylinder", "capsule"):
+            r, h = self.size
+            volume, squares = 2 * np.pi * r * r * h, np.array([r * r / 4, r * r / 4, h * h / 3])
+            if self.kind == "capsule":
+                caps = 4 / 3 * np.pi * r**3  # ∫z² of a half ball on a plane at h: V (h² + 3/4 h r + r²/5)
+                own = np.array([r * r / 5, r * r / 5, h * h + 0.75 * h * r + r * r / 5])
+                squares = (volume * squares + caps * own) / (volume + caps)
+                volume += caps
+        else:
+            return 0.0, np.zeros(3), np.zeros((3, 3))
+        return float(volume), np.zeros(3), volume * np.diag(squares.sum() - squares)
+
+
+def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:
+    """Return the shape of a prim of `SCHEMAS`.
+
+    Args:
+        stage: The stage.
+        prim: The prim.
+        place: From the prim's space to the body's frame [m], scale and shear included.
+
+    Raises:
+        RobotError: If its mesh is broken, or its size is not positive.
+    """
+    schema = str(prim.GetTypeName())
+    if schema == "Mesh":
+        return meshed(*read_mesh(stage, prim), place)
+    if schema == "Plane":
+        return _plane(stage, prim, place)
+    split = rotation_and_scale(place[:3, :3])
+    if schema == "Sphere":
+        return _ball(_sizes(stage, prim, "radius")[0], np.zeros(3), place)
+    if schema == "Cube":
+        half = _sizes(stage, prim, "size")[0] / 2
+        return boxed(np.full(3, -half), np.full(3, half), place)
+    axis = str(stage.value(prim, "axis"))
+    half = _sizes(stage, prim, "height", is_least_zero=schema.startswith("Capsule"))[0] / 2
+    if schema.endswith("_1"):
+        low, high = _sizes(stage, prim, "radiusBottom", "radiusTop", is_least_zero=True)
+    else:
+        low, high = (_sizes(stage, prim, "radius")[0],) * 2
+    across, along = _scales(split[1] if split else None, axis)
+    pose = place.copy()
+    pose[:3, :3] = (split[0] if split else np.eye(3)) @ turned(axis)
+    if schema.startswith("Cylinder"):
+        if low == high and across:
+            return Shape("cylinder", (low * across, half * along), pose)
+        return meshed(*lathed([(low, -half), (high, half)], axis), place)
+    if schema.startswith("Capsule"):
+        if low == high and across and abs(across - along) <= ROUND * along:
+            return Shape("capsule", (low * across, half * along), pose) if half else Shape("sphere", (low * across,), pose)
+        return meshed(*lathed(ball_profile(high, -half, half, low), axis), place)
+    return meshed(*lathed([(low, -half), (0.0, half)], axis), place)
+
+
+def _sizes(stage: Stage, prim: Prim, *names: str, is_least_zero: bool = False) -> list[float]:
+    values = [stage.number(prim, name) for name in names]
+    for name, value in zip(names, values, strict=True):
+        if not np.isfinite(value) or value < 0 or (value == 0 and not is_least_zero):
+            raise stage.error(prim, f"{name} is {value!r}; expected more than 0")
+    return values
+
+
+def _scales(scale: Float[np.ndarray, 3] | None, axis: str) -> tuple[float, float]:
+    """Return the scale across an axis and along it; zero across if it is not the same all around, or there is shear."""
+    if scale is None:
+        return 0.0, 0.0
+    along = "XYZ".index(axis)
+    first, second = np.abs(np.delete(scale, along))
+    return (float(first) if abs(first - second) <= ROUND * first else 0.0), float(abs(scale[along]))
+
+
+def meshed(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
+    """Return a mesh: its scale goes into its vertices, and what is left of the transform into its pose."""
+    linear, pose = place[:3, :3], place.copy()
+    if np.linalg.det(linear) < 0:
+        faces = faces[:, ::-1]
+    split = rotation_and_scale(linear)
+    if split is None:
+        pose[:3, :3] = np.eye(3)
+        return Shape("mesh", (), pose, vertices @ linear.T, faces)
+    pose[:3, :3], scale = split
+    return Shape("mesh", (), pose, vertices * scale, faces)
+
+
+def boxed(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matrix) -> Shape:
+    """Return the box between two corners of a prim's space, as a mesh where shear makes it none."""
+    split = rotation_and_scale(place[:3, :3])
+    if split is None:
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+        faces = np.asarray(trimesh.creation.box().faces, dtype=np.int64)  # its corners come in the same order
+        return meshed(corners, faces, place)
+    pose = place.copy()
+    pose[:3, :3], scale = split
+    pose[:3, 3] += place[:3, :3] @ ((low + high) / 2)
+    x, y, z = (np.abs(scale) * (high - low) / 2).tolist()
+    return Shape("box", (x, y, z), pose)
+
+
+def _ball(radius: float, centre: Float[np.ndarray, 3], place: Matrix) -> Shape:
+    """Return a ball under any linear map: an ellipsoid along its singular vectors."""
+    linear, pose = place[:3, :3] * radius, place.copy()
+    pose[:3, 3] += place[:3, :3] @ centre
+    split = rotation_and_scale(linear)
+    if split is None:
+        axes, half, _ = np.linalg.svd(linear)
+        pose[:3, :3] = axes * [1, 1, np.sign(np.linalg.det(axes))]
+    else:
+        pose[:3, :3], half = split[0], np.abs(split[1])
+    x, y, z = half.tolist()
+    return Shape("sphere", (x,), pose) if half.max() - half.min() <= ROUND * x else Shape("ellipsoid", (x, y, z), pose)
+
+
+def _plane(stage: Stage, prim: Prim, place: Matrix) -> Shape:
+    """Return a plane with its normal along its axis; width and length only say how much of it is drawn."""
+    split = rotation_and_scale(place[:3, :3])
+    if split is None:
+        raise stage.error(prim, "a plane cannot be sheared")
+    axis = str(stage.value(prim, "axis"))
+    pose = place.copy()
+    pose[:3, :3] = split[0] @ turned(axis)
+    width, length = _sizes(stage, prim, "width", "length")
+    # Width and length lie along x and y of a plane whose normal is z; along z and y for x; along x and z for y.
+    extents = {"X": (0, length, width), "Y": (width, 0, length), "Z": (width, length, 0)}[axis]
+    half = np.abs(turned(axis).T @ (np.abs(split[1]) * extents)) / 2
+    return Shape("plane", (float(half[0]), float(half[1]), float(max(half)) / 100), pose)
+
+
+def approximated(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple[Shape, bool]:
+    """Return what a mesh collides as, and whether that is the mesh's hull because of its `physics:approximation`.
+
+    Args:
+        stage: The stage.
+        prim: The prim of the mesh.
+        shape: The mesh itself.
+        place: From the prim's space to the body's frame [m], scale and shear included.
+
+    Raises:
+        RobotError: If it is flat, so that it has no hull.
+    """
+    wanted = "none"
+    if prim.HasAPI(stage.pxr.UsdPhysics.MeshCollisionAPI):
+        wanted = str(stage.value(prim, "physics:approximation"))
+    assert shape.vertices is not None
+    if wanted in ("boundingCube", "boundingSphere"):
+        points = read_mesh(stage, prim)[0]
+        low, high = points.min(axis=0), points.max(axis=0)
+        if wanted == "boundingCube":
+            return boxed(low, high, place), False
+        centre = place[:3, :3] @ ((low + high) / 2) + place[:3, 3]
+        placed = points @ place[:3, :3].T + place[:3, 3]
+        pose = np.eye(4)
+        pose[:3, 3] = centre
+        return Shape("sphere", (float(np.linalg.norm(placed - centre, axis=1).max()),), pose), False
+    if shape.hull is None:
+        raise stage.error(prim, "the mesh is flat: it has no hull to collide; use a plane or a thin box")
+    if wanted != "convexHull" and not shape.is_convex:
+        stage.drop(f'meshes with approximation "{wanted}" collide as their convex hulls', prim)
+    return shape, wanted == "convexHull"
+
+
+def quaternion(matrix: Matrix) -> Float[np.ndarray, 4]:
+    """Return the rotation of a rigid transform as w, x, y, z."""
+    return Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)

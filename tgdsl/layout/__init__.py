@@ -1,0 +1,1 @@
+"""Where taxels sit, as numbers."""

@@ -1,0 +1,1 @@
+"""The compiled sensor: tensors in, tensors out."""

@@ -1,0 +1,86 @@
+"""How the steps of a module are called: eager, compiled by torch, or replayed as CUDA graphs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.plan.plan import Plan
+from tgdsl.tensors.fusion import of_its_own
+from tgdsl.tensors.graphed import Graphed
+
+Step = Callable[..., Any]
+"""A bound method of a module that takes tensors and memory by name, and returns tensors by name."""
+
+
+class Calls:
+    """How a module's steps are to be called. A copy of a module compiles its own.
+
+    Attributes:
+        compiled: Compiled steps, by their names; none of a module that is eager. Another dictionary after each `compile`.
+        graphed: The same as CUDA graphs, if those are wanted.
+    """
+
+    def __init__(self) -> None:
+        """Have all steps eager."""
+        self._wanted: tuple[bool, dict[str, Any]] | None = None
+        self.compiled: dict[str, Step] = {}
+        self.graphed: dict[str, Graphed] = {}
+
+    def compile(self, graph: bool, **options: Any) -> None:
+        """Have steps compiled when they are first called, and replayed as CUDA graphs if wanted.
+
+        Args:
+            graph: Whether calls without derivatives replay a CUDA graph.
+            **options: Handed to `torch.compile`.
+        """
+        self._wanted, self.compiled, self.graphed = (graph, options), {}, {}
+
+    def of(self, step: Step) -> Step:
+        """Return what to call for a step: inside a capture of the caller's own, what a graph of ours would capture."""
+        name = step.__name__
+        if self._wanted is not None and name not in self.compiled:
+            graph, options = self._wanted
+            self.compiled[name] = torch.compile(of_its_own(step), **options)
+            if graph:
+                self.graphed[name] = Graphed(self.compiled[name])
+        if name in self.graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
+            return self.graphed[name]
+        return self.compiled.get(name, step)
+
+    def forget_graphs(self) -> None:
+        """Capture anew at the next calls: constants lie elsewhere."""
+        for graphed in self.graphed.values():
+            graphed.forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is compiled: it is bound to the module that this is of."""
+        return {"_wanted": self._wanted, "compiled": {}, "graphed": {}}
+
+
+def inductor_options(plan: Plan) -> dict[str, bool]:
+    """Return what is asked of Inductor for a plan.
+
+    Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
+    taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what
+    there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find a
+    tile takes too many registers.
+    """
+    answers = [answer for query in plan.queries for answer in query.answers]
+    is_slight = (
+        all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
+        and not any(answer.moments or answer.points for answer in answers)
+        and not any(sensor.noise for sensor in plan.sensors)
+        and all(target.num_pairs == 1 and set(target.shapes) <= SHAPES.keys() for target in plan.objects)
+    )
+    return {"assert_indirect_indexing": "variant" in plan.inputs.fields, "triton.prefer_nd_tiling": is_slight}
+
+
+def has_cpp_compiler() -> bool:
+    """Return whether there is a C++ compiler, which Inductor needs for a CPU."""
+    return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)

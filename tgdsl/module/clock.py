@@ -1,0 +1,176 @@
+"""When a reading is made, and with which random numbers: what a module counts where its sensors are imperfect or have rates.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Integral
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tgdsl.errors import TgdslError
+from tgdsl.plan.plan import PlannedSensor
+from tgdsl.sensors.noise.instant import Now
+from tgdsl.sensors.noise.random import Stream, sensor_key, streams
+
+_INT64 = 2**63
+"""First number beyond an int64."""
+
+
+class Clock(nn.Module):
+    """Counts calls and episodes, of each environment alone. It holds nothing until `start`, nor if no sensor asks for it.
+
+    Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
+    (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
+    (env, call), how long before the last call each one was [s], itself first.
+
+    Attributes:
+        home: Has device and dtype of counts that are loaded before the start.
+    """
+
+    def __init__(self, sensors: Sequence[PlannedSensor]):
+        """Note which sensors want to know."""
+        super().__init__()
+        self._sensors = [sensor for sensor in sensors if sensor.is_timed]
+        self._has_history = any(sensor.windows for sensor in sensors)
+        self._drawing = list(dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams))
+        self._seed, self._first_env = 0, None
+        self.home = torch.empty(0)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any sensor wants to know."""
+        return len(self._sensors) > 0 or self._has_history
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments; None before the start."""
+        return len(self._buffers["age"]) if "age" in self._buffers else None  # type: ignore[arg-type]
+
+    def start(self, num_envs: int, calls: int, like: Tensor) -> None:
+        """Begin to count.
+
+        Args:
+            num_envs: Number of environments.
+            calls: How many calls before the present one some ring remembers.
+            like: Has the module's device and dtype.
+        """
+        whole = {"device": like.device, "dtype": torch.int64}
+        for name in ("seed", "first_env"):
+            self.register_buffer(name, torch.zeros((), **whole))
+        for name in ("step", "episode", "age"):
+            self.register_buffer(name, torch.zeros(num_envs, **whole))
+        if calls:
+            self.register_buffer("ages", torch.zeros(num_envs, calls, dtype=like.dtype, device=like.device))
+        # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
+        periods = torch.tensor([sensor.period for sensor in self._sensors], dtype=like.dtype, device=like.device)
+        self.register_buffer("periods", periods, persistent=False)
+        if self._drawing:
+            keys = torch.zeros(len(self._drawing), 2, dtype=torch.int32, device=like.device)
+            self.register_buffer("keys", keys, persistent=False)
+        self._count_anew()
+
+    def free(self) -> None:
+        """Hold nothing again; the seed is kept."""
+        for name in [name for name, _ in self.named_buffers(recurse=False)]:
+            delattr(self, name)
+
+    def seed_with(self, seed: int, first_env: int | None) -> None:
+        """Choose other random numbers, from the next call on; environments are counted from `first_env`.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is negative or no int64.
+        """
+        if not isinstance(seed, Integral):
+            raise TgdslError(f"seed is {seed!r}, expected an integer")
+        if first_env is not None and not (isinstance(first_env, Integral) and 0 <= first_env < _INT64):
+            raise TgdslError(f"first_env is {first_env!r}, expected an integer from 0 to 2**63 - 1")
+        # It is kept as an int64: whoever loads a state dict draws the same numbers.
+        self._seed, self._first_env = (int(seed) + _INT64) % (2 * _INT64) - _INT64, first_env
+        if self.num_envs is not None:
+            self._count_anew()
+
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask."""
+        if self.num_envs is not None:
+            self._buffers["episode"] += chosen  # type: ignore[operator]
+            self._buffers["age"].masked_fill_(chosen, 0)  # type: ignore[union-attr]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return what `nows` and `after` want, by name."""
+        return {f"clock/{name}": buffer for name, buffer in self._buffers.items() if buffer is not None}
+
+    def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
+        """Return when each sensor that wants to know is read, by its name.
+
+        Args:
+            memory: What `tensors` returned; and for each sensor with a rate of its own `<sensor>:sample/phase`, the time since
+                its last sample was due, (env,) [s].
+            dt: Time since the last call [s].
+        """
+        if not self.is_wanted:
+            return {}
+        step, age = memory["clock/step"][:, None], memory["clock/age"][:, None]
+        ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
+        drawn: dict[str, Mapping[int, Stream]] = {}
+        if self._drawing:
+            env = torch.arange(len(age), device=age.device) + memory["clock/first_env"]
+            found = streams(memory["clock/keys"], env, step[:, 0], memory["clock/episode"])
+            drawn = dict(zip(self._drawing, found, strict=True))
+        nows = {}
+        for i, sensor in enumerate(self._sensors):
+            phase, is_due, period = memory.get(f"{sensor.name}:sample/phase"), None, None
+            if phase is not None and dt is not None:
+                period = memory["clock/periods"][i]
+                is_due = (phase[:, None] + 1.5 * dt >= period) | (age == 0)
+            nows[sensor.name] = Now(dt, step, age, ages, is_due, period, drawn.get(sensor.sensor, {}))
+        return nows
+
+    @staticmethod
+    def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:
+        """Return the counts after a call."""
+        counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        if "clock/ages" in clock and dt is not None:
+            ages = clock["clock/ages"]
+            counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1] + dt], dim=1)
+        return counts
+
+    def _count_anew(self) -> None:
+        """Write the seed and what follows from it, and start all counts from 0, in place: captured graphs go on with them."""
+        assert self.num_envs is not None
+        first = _rank() * self.num_envs if self._first_env is None else self._first_env
+        with torch.no_grad():
+            self.get_buffer("seed").fill_(self._seed)
+            self.get_buffer("first_env").fill_(first)
+            for name in ("step", "episode", "age"):
+                self.get_buffer(name).zero_()
+        self._set_keys()
+
+    def _set_keys(self) -> None:
+        if self._drawing:
+            keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._drawing]
+            self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        """Make room for the counts that are loaded, and go on with their seed; do nothing if `Memory` has found errors."""
+        if args[-1]:
+            return
+        age = state_dict.get(f"{prefix}age")
+        if self.is_wanted and isinstance(age, Tensor):
+            ages = state_dict.get(f"{prefix}ages")
+            with torch.inference_mode(False):
+                self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        if self.num_envs is not None:
+            self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
+            self._set_keys()
+
+
+def _rank() -> int:
+    """Return the number of this process among those of a distributed run; 0 if there is none."""
+    distributed = torch.distributed
+    return distributed.get_rank() if distributed.is_available() and distributed.is_initialized() else 0

@@ -1,0 +1,67 @@
+"""Valid random states, for tests and benchmarks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tgdsl.module.state import SHAPES, SceneState, shape_of
+from tgdsl.plan.plan import Inputs
+
+
+def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, spread: float) -> SceneState:
+    """Return a random state of all wanted fields, with bodies close enough to touch.
+
+    Contacts lie around their links, with unit normals and forces inside a friction cone of 0.5; every third slot is unused, and
+    the net force is the slots' sum.
+
+    Args:
+        inputs: What is wanted.
+        num_envs: Number of environments.
+        seed: Seed of the draw.
+        dtype: Dtype of the tensors.
+        spread: Standard deviation of the bodies' positions, and of contacts from their links [m].
+    """
+    generator = torch.Generator().manual_seed(seed)
+    values: dict[str, Any] = {}
+    for name in (name for name in inputs.fields if name in SHAPES):
+        shape = (num_envs, *shape_of(name, inputs))
+        value = torch.randn(shape, generator=generator, dtype=dtype)
+        if name == "body_pos":
+            value = spread * value
+        elif name == "body_quat":
+            value = value / value.norm(dim=-1, keepdim=True)
+        elif name == "contact_found":
+            value = value > -1.0
+        elif name == "variant":
+            value = torch.arange(num_envs)[:, None] % torch.tensor(inputs.num_variants)
+        elif name == "object_size":
+            value = 0.015 + 0.01 * value.clamp(-1, 1)
+        values[name] = value
+    if "contact_force" in values:
+        values |= _contacts(values, inputs, spread)
+    if "dt" in inputs.fields:
+        values["dt"] = 0.01
+    return SceneState(**values)
+
+
+def _contacts(values: dict[str, Tensor], inputs: Inputs, spread: float) -> dict[str, Tensor]:
+    """Turn random numbers into contacts that a solver could have found."""
+    is_used = (torch.arange(inputs.slots) % 3 != 2)[:, None]
+    links = values["body_pos"][:, [inputs.bodies.index(pair.link) for pair in inputs.pairs], None]
+    normal = values["contact_normal"] / values["contact_normal"].norm(dim=-1, keepdim=True)
+    raw = values["contact_force"]
+    along = (raw * normal).sum(dim=-1, keepdim=True)
+    tangential = raw - along * normal
+    size = tangential.norm(dim=-1, keepdim=True)
+    force = along.abs() * (normal + 0.5 * tangential / (size + 1.0))
+    found = {
+        "contact_pos": links + spread * values["contact_pos"],
+        "contact_force": force,
+        "contact_torque": 1e-3 * along * normal,
+        "contact_normal": normal,
+    }
+    found = {name: torch.where(is_used, value, 0.0) for name, value in found.items()}
+    return {**found, "contact_netforce": found["contact_force"].sum(dim=2)}

@@ -1,0 +1,229 @@
+"""What a module carries from one call to the next: buffers of each sensor, windows over last readings, and its clock.
+
+Shapes: `env` environments, `call` calls that a ring remembers, `step` calls of a window, `row` taxels or bodies, `channel`
+numbers per row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from tgdsl.errors import StateError, listed
+from tgdsl.module.clock import Clock
+from tgdsl.plan.plan import PlannedMemory, PlannedSensor
+from tgdsl.tensors.fusion import stored
+
+WINDOW, KEPT = "history/", "kept/"
+"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, channel, row), the last one."""
+
+
+class Memory(nn.Module):
+    """Buffers `sensor:name`, (env, …) or (env, call, …), and `history/<reading>`; none before the first call.
+
+    Attributes:
+        home: Has device and dtype of state that is loaded before the first call.
+    """
+
+    def __init__(self, sensors: Sequence[PlannedSensor]):
+        """Note what sensors carry."""
+        super().__init__()
+        self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
+        for s in sensors:
+            for reading in s.windows:
+                assert s.history is not None
+                shape = (s.history.length, len(reading.channels), reading.num_rows)
+                self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
+        self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
+        self._last: dict[str, tuple[Tensor, int]] = {}
+        self.clock = Clock(sensors)
+        self.home = torch.empty(0)
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any sensor carries something."""
+        return bool(self._planned) or self.clock.is_wanted
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments whose state is held; None before the first call."""
+        held = (buffer for name, buffer in self.named_buffers(recurse=False) if not name.startswith(KEPT))
+        return next((len(buffer) for buffer in held), self.clock.num_envs)
+
+    def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
+        """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
+
+        Args:
+            num_envs: Number of environments: of those whose state is held, if there are any.
+            dt: Time since the last call [s], if some sensor wants to know it.
+            dtype: Dtype of what is remembered.
+            device: Where.
+
+        Raises:
+            StateError: If dt is so short that a ring is too short.
+        """
+        if self.is_wanted and self.num_envs is None:
+            with torch.inference_mode(False):
+                for path, planned in self._planned.items():
+                    shape = (num_envs, *_calls(planned, dt), *planned.shape)
+                    self.register_buffer(path, torch.full(shape, planned.rest, dtype=dtype, device=device))
+                if self.clock.is_wanted:
+                    calls = max((_calls(part, dt)[0] for _, part in self._rings.values()), default=0)
+                    self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
+        held = dict(self.named_buffers(recurse=False))
+        for path, (sensor, planned) in self._rings.items():
+            if _calls(planned, dt)[0] > held[path].shape[1]:
+                what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
+                raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
+        return held | self.clock.tensors()
+
+    @property
+    def num_kept(self) -> int | None:
+        """Number of environments whose last readings are kept; None if none are."""
+        return next((len(buffer) for name, buffer in self.named_buffers(recurse=False) if name.startswith(KEPT)), None)
+
+    def note_last(self, readings: Mapping[str, Tensor]) -> None:
+        """Note what is handed out, (env, row, channel), where it lies; nothing to do once it is kept."""
+        if self.num_kept:
+            self._last = {}
+        else:
+            self._last = {name: (reading.detach(), _version(reading)) for name, reading in readings.items()}
+
+    def keep_last(self, num_envs: int, stacks: Collection[str]) -> None:
+        """From now on keep what is handed out, for the environments that a masked call leaves out.
+
+        Args:
+            num_envs: Number of environments.
+            stacks: Readings whose windows hold them already.
+
+        Raises:
+            StateError: If nothing was handed out yet, or of another number of environments.
+        """
+        if self.num_kept is None:
+            if not self._last:
+                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+            if changed := [name for name, (reading, version) in self._last.items() if _version(reading) != version]:
+                what = f"the readings {listed(changed)} that were handed out last have been written into since"
+                raise StateError(f"{what}, and the environments left out are to have them: write into clones")
+            with torch.inference_mode(False), torch.no_grad():
+                for name, (reading, _) in self._last.items():
+                    if name not in stacks:
+                        copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
+                        self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+        if self.num_kept not in (None, num_envs):
+            raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")
+
+    def keep_no_other(self, num_envs: int) -> None:
+        """Keep readings no longer if they are of another number of environments, which a module without state may change."""
+        if self.num_kept not in (None, num_envs):
+            self._forget_kept()
+
+    def _forget_kept(self) -> None:
+        for name in [name for name, _ in self.named_buffers(recurse=False) if name.startswith(KEPT)]:
+            delattr(self, name)
+
+    def free(self) -> None:
+        """Hold nothing again, as before the first call."""
+        for name in [name for name, _ in self.named_buffers(recurse=False)]:
+            delattr(self, name)
+        self._last = {}
+        self.clock.free()
+
+    def reset(self, chosen: Tensor) -> None:
+        """Begin a new episode in the environments of a mask; what noise and history remember starts anew by its age."""
+        for path, planned in self._planned.items():
+            if "/" not in path.partition(":")[2] and not path.startswith(WINDOW):
+                buffer = self.get_buffer(path)
+                buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
+        self.clock.reset(chosen)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Memory:
+        """Move or cast all buffers; what was handed out last lies elsewhere."""
+        self._last = {}
+        super()._apply(fn, recurse)
+        return self
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        local_metadata: dict[str, Any],
+        strict: bool,
+        missing_keys: list[str],
+        unexpected_keys: list[str],
+        error_msgs: list[str],
+    ) -> None:
+        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state."""
+        found = {path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)}
+        has_clock = f"{prefix}clock.age" in state_dict
+        if found or has_clock:
+            error_msgs.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
+        if error_msgs:
+            return  # nothing is loaded, nor by the clock
+        with torch.inference_mode(False):
+            for path, value in found.items():
+                room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
+                self.register_buffer(path, room)
+        self._last = {}
+        self._forget_kept()  # what is replaced has handed them out
+        own = local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        super()._load_from_state_dict(state_dict, prefix, *own)
+
+    def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
+        """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
+        wrong = [f'"{prefix}{path}" is missing beside other state' for path in self._planned if path not in found]
+        if self.clock.is_wanted and age is None:
+            wrong.append(f'"{prefix}clock.age" is missing beside other state')
+        counts = {len(value) for value in [*found.values(), *([] if age is None else [age])] if value.ndim}
+        if len(counts) > 1:
+            wrong.append(f'the parts of "{prefix}" are of {sorted(counts)} environments')
+        for path, value in found.items():
+            expected = self._planned[path].shape
+            if tuple(value.shape[value.ndim - len(expected) :]) != tuple(expected):
+                wrong.append(
+                    f'"{prefix}{path}" has shape {tuple(value.shape)}, expected (env, …, {", ".join(map(str, expected))})'
+                )
+        return wrong
+
+
+def _version(tensor: Tensor) -> int:
+    """Return how often a tensor was written into, as autograd counts it; inference tensors do not count."""
+    return -1 if tensor.is_inference() else tensor._version
+
+
+def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
+    """Put new state in the place of the old one; of a ring, this call's entry."""
+    with torch.no_grad():
+        for name, value in updated.items():
+            if value.ndim < memory[name].ndim:
+                env, place = _entry_of(memory, name)
+                memory[name].index_put_((env, place), value.detach())
+        for name, value in updated.items():
+            if value.ndim == memory[name].ndim:
+                memory[name].copy_(value.detach())
+
+
+def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
+    """Return new state of the environments of a mask, and the old one of all others."""
+    chosen = {}
+    for name, value in updated.items():
+        old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]
+        chosen[name] = torch.where(mask.view(-1, *[1] * (value.ndim - 1)), value, old)
+    return chosen
+
+
+def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
+    """Return the places of this call's entries in a ring: environment, and which of its calls."""
+    place = stored(memory["clock/step"] % memory[name].shape[1])
+    return torch.arange(len(place), device=place.device), place
+
+
+def _calls(planned: PlannedMemory, dt: float | None) -> tuple[int, ...]:
+    """Return how many calls before the present one a ring holds; nothing if it is none."""
+    if planned.past == 0 or dt is None:
+        return ()
+    return (max(math.ceil(planned.past / dt - 1e-6), 1),)

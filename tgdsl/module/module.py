@@ -1,0 +1,473 @@
+"""The compiled sensor: tensors in, tensors out.
+
+Shapes: `env` environments, `body` bodies of `inputs.bodies`, `pair` pairs of `inputs.pairs`, `slot` contacts per pair, `object`
+felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` calls, `feature` numbers of an observation.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from tgdsl.console.tables import TaxelTable, TaxelTables
+from tgdsl.errors import StateError, TgdslError, did_you_mean
+from tgdsl.module.calls import Calls, has_cpp_compiler, inductor_options
+from tgdsl.module.example import example_state
+from tgdsl.module.history import pushed, reduced
+from tgdsl.module.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.module.observing import ObservationTerm, observation_terms, observe
+from tgdsl.module.outputs import Output, outputs_of
+from tgdsl.module.queries import Queries
+from tgdsl.module.reading import joined_signal, read
+from tgdsl.module.slot_watch import SlotWatch
+from tgdsl.module.state import SceneState
+from tgdsl.module.taxels import images_of, taxel_table
+from tgdsl.plan.plan import Inputs, Plan
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.sensors import KINDS, Kind
+from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.instant import Now
+from tgdsl.tensors.buffers import Constants
+from tgdsl.tensors.devices import check_dtype
+from tgdsl.tensors.env_ids import EnvIds, env_mask
+
+
+class TactileModule(nn.Module):
+    """All sensors of a document, for any number of environments at once.
+
+    Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel,
+    channel) where a sensor stacks its last calls. `observe` makes the observations of them. A module whose sensors carry state
+    (see `num_envs`) takes the batch size of its first call, or of the state dict that it loads, and keeps it until `free`; one
+    without state takes any. Noise is drawn from the seed 0, or from that given to `seed`.
+
+    Each call advances what sensors remember: delays, filters, histories, random numbers. `peek` reads without doing so, and
+    `touch(state, mask)` reads and advances some environments alone.
+    """
+
+    def __init__(self, plan: Plan, kinds: Sequence[Kind] = KINDS, dtype: torch.dtype = torch.float32):
+        """Build a module.
+
+        Args:
+            plan: What to compute.
+            kinds: The kinds that the plan's sensors are of.
+            dtype: Dtype of constants, state and readings, float32 or float64.
+
+        Raises:
+            TgdslError: If the plan uses a kind that is not given, or the dtype is another one.
+        """
+        super().__init__()
+        self.plan = plan
+        known = {kind.name: kind for kind in kinds}
+        for sensor in plan.sensors:
+            if sensor.kind not in known:
+                hint = did_you_mean(sensor.kind, known, "kinds")
+                raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
+        self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
+        self._queries = Queries(plan)
+        self.constants = Constants(self._queries.constants(), dtype)
+        self.memory = Memory(plan.sensors)
+        self._overwritten = [
+            f"{sensor.name}:{name}"
+            for sensor in plan.sensors
+            if plan.queries[sensor.query].answers[sensor.answer].points is not None
+            for name in sensor.state
+            if "/" not in name
+        ]
+        self.calls = Calls()
+        self._dt: tuple[float, Tensor] | None = None
+        self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
+
+    def __repr__(self) -> str:
+        layout, origin = self.plan.layout(), self.plan.origin
+        where = f"{layout.num_taxels} taxels on {len(layout.links)} links of {origin.robot.rpartition('/')[2]}"
+        return f"TactileModule({where} at resolution {origin.resolution}, {self.dtype}, {self.device})\n{self.outputs}"
+
+    @property
+    def inputs(self) -> Inputs:
+        """What the module reads of a scene, and in which order."""
+        return self.plan.inputs
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Name, shape, channels and units of each reading; a tuple that prints as a table."""
+        return outputs_of(self.plan)
+
+    @property
+    def observations(self) -> dict[str, tuple[ObservationTerm, ...]]:
+        """The terms of each observation group: name, type, size, and where its features stand in what `observe` returns."""
+        return observation_terms(self.plan)
+
+    @property
+    def taxels(self) -> dict[str, TaxelTable]:
+        """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
+        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors})
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Dtype of the readings."""
+        return self.constants.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the readings."""
+        return self.constants.device
+
+    @property
+    def has_state(self) -> bool:
+        """Whether any sensor carries something from one call to the next."""
+        return self.memory.is_wanted
+
+    @property
+    def num_envs(self) -> int | None:
+        """Number of environments whose state is held; None before the first call, or if there is no state."""
+        return self.memory.num_envs
+
+    def forward(
+        self, state: SceneState, mask: Tensor | None = None, env_ids: EnvIds | None = None
+    ) -> dict[str, Float[Tensor, "env *step row channel"]]:
+        """Read all sensors, and advance what they remember.
+
+        With `mask` or `env_ids` it reads and advances those environments alone, as after a reset in the middle of a control
+        step: delay, noise and history of the others stay where they are, and their rows are as they were handed out before. A
+        mask on the module's device can be captured in a CUDA graph.
+
+        Args:
+            state: The scene, at one instant.
+            mask: Which environments to read, boolean (env,); default: all.
+            env_ids: The same by indices.
+
+        Returns:
+            Readings of all environments by name, as `outputs` lists them, in the module's dtype. They are tensors of their own,
+            but for a module that replays a CUDA graph (see `compile`), and histories that are declared as views.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device; if there are no
+                such environments, or some are to be left out before anything was handed out.
+        """
+        tensors, num_envs = self._tensors(state)
+        step = "advance"
+        if mask is not None or env_ids is not None:
+            step, tensors["mask"] = "advance_some", self._chosen(mask, env_ids, num_envs)
+        else:
+            self.memory.keep_no_other(num_envs)
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        readings = self._run(step, tensors, memory)
+        self.hand_out(readings)
+        return self._with_views(readings)
+
+    def hand_out(self, readings: Mapping[str, Tensor]) -> None:
+        """Note what a call has handed out; for who replays a captured graph of calls in their place."""
+        self.memory.note_last(readings)
+
+    def peek(self, state: SceneState) -> dict[str, Float[Tensor, "env *step row channel"]]:
+        """Return what a call would read, and advance nothing: the next call draws the same random numbers.
+
+        Args:
+            state: The scene, at one instant.
+
+        Raises:
+            StateError: As a call does.
+            TgdslError: As a call does.
+        """
+        tensors, num_envs = self._tensors(state)
+        is_first = self.has_state and self.num_envs is None
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        try:
+            return self._run("look", tensors, memory)
+        finally:
+            if is_first:
+                self.free()
+
+    def free(self) -> None:
+        """Let go of all that sensors remember, and of the number of environments; the seed is kept.
+
+        The next call may have any number of environments, and begins an episode in each.
+        """
+        self.memory.free()
+
+    def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
+        """Return the fields of a state that are wanted, and the number of environments."""
+        if not isinstance(state, SceneState):
+            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
+            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(self.inputs.fields)}")
+        tensors = state.checked(self.inputs, self.device)
+        if state.dt is not None and "dt" in self.inputs.fields:
+            tensors["dt"] = self._dt_tensor(state.dt)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
+        num_envs, held = tensors["body_pos"].shape[0], self.num_envs
+        if held not in (None, num_envs):
+            held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
+            raise StateError(f"{held_by}; `free()` lets go of it")
+        return tensors, num_envs
+
+    def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
+        """Return which environments are read, and see to it that there is something to read of the others."""
+        if mask is not None and env_ids is not None:
+            raise StateError("found both `mask` and `env_ids`, expected one of them")
+        if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
+            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+            raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
+        self.memory.keep_last(num_envs, {r.name for sensor in self.plan.sensors for r in sensor.windows if r.steps})
+        return env_mask(mask if mask is not None else env_ids, num_envs, self.device, StateError, waits=False)
+
+    def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
+        found = self.calls.of(getattr(self, name))(tensors, memory)
+        return {name: found[name] for name in self.plan.readings()}
+
+    def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings of `core`, and put the new state in the place of the old one."""
+        readings, updated = self._read(tensors, memory)
+        store(memory, updated | _kept(readings, memory))
+        return readings
+
+    def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Do what `advance` does for the environments of `tensors["mask"]`; of the others return what was handed out before."""
+        mask = tensors["mask"]
+        readings, updated = self.core(tensors, memory)
+        updated = chosen_only(memory, updated, mask)
+        for name, reading in readings.items():
+            if f"{KEPT}{name}" in memory:
+                made = torch.where(mask[:, None, None], reading.transpose(1, 2), memory[f"{KEPT}{name}"])
+                readings[name] = made.transpose(1, 2)
+            elif f"{WINDOW}{name}" in memory:
+                readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+        store(memory, updated | _kept(readings, memory))
+        return readings
+
+    def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings of `core`, and leave the state as it is."""
+        return self.core(tensors, memory)[0]
+
+    def core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Compute readings and the new state: a pure function of its arguments, traceable in one graph.
+
+        Args:
+            tensors: The fields of `SceneState` that `inputs` names.
+            memory: State by `sensor:name`, each (env, …), and the clock's.
+
+        Returns:
+            Readings by name, and signals before their noise as `<sensor>/signal`; and the new state, of a ring, (env, call, …),
+            what is new: (env, …).
+        """
+        copies = {name: memory[name].clone() for name in self._overwritten}
+        readings, updated = self._read(tensors, memory | copies)
+        return readings, copies | updated
+
+    def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
+        nows, knobs = self._circumstances(tensors, memory)
+        answers = self._queries.answers(self.constants, tensors, nows, knobs)
+        readings: dict[str, Tensor] = {}
+        joined: dict[tuple[str, ...], Tensor] = {}
+        updated = self.memory.clock.after(memory, tensors.get("dt"))
+        for sensor in self.plan.sensors:
+            felt, probes = answers[sensor.query][sensor.answer]
+            own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
+            constants = self.constants.under(sensor.folder, sensor.constants)
+            kind, signal = self._kinds[sensor.name], None
+            if sensor.joined:
+                if sensor.joined not in joined:
+                    joined[sensor.joined] = self._joined_signal(sensor.joined, felt, probes)
+                signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
+            found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name), signal)
+            updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
+            for reading in sensor.windows:
+                assert sensor.history is not None
+                path = f"{WINDOW}{reading.name}"
+                updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
+                found[reading.name] = reduced(updated[path], sensor.history.reduce)
+            readings |= found
+        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
+            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
+        return readings, updated
+
+    def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
+
+        Raises:
+            ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
+        """
+        return observe(self.plan, self.constants, readings)
+
+    def images(
+        self, name: str, readings: Mapping[str, Tensor]
+    ) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:
+        """Return a reading of taxels as one image per link, and where its pixels are taxels, for convolutions.
+
+        Cells of a link's grid that missed its surface, and inactive probes, are 0 in the image and False in the mask. Links
+        without a grid are left out. Of stacked calls it is the last one.
+
+        Args:
+            name: The reading.
+            readings: All readings.
+
+        Raises:
+            TgdslError: If there is no such reading, if it is not one of taxels, or none of its links has a grid.
+        """
+        return images_of(self.plan, name, readings)
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Begin a new episode in some environments (default: all); the others are left untouched.
+
+        State is at rest again, filters start from the next reading's true value, and gains, dead taxels and what else is drawn
+        per episode are drawn anew.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments. Indices that lie on a GPU are not looked at, as that would
+                wait for it: there the kernel asserts.
+
+        Raises:
+            StateError: If there are no such environments.
+        """
+        if self.num_envs is None:
+            return  # nothing is held yet, and the first call begins an episode
+        with torch.no_grad():
+            self.memory.reset(env_mask(env_ids, self.num_envs, self.device, StateError, waits=False))
+
+    def seed(self, seed: int, first_env: int | None = None) -> TactileModule:
+        """Choose the random numbers of noise; steps and episodes are counted from 0 again.
+
+        They depend on the seed, the sensor's name, the environment's number and the step, and on nothing else: not on other
+        sensors or environments, the batch size, the device or the process. A reset begins the next episode, whose numbers are
+        others: reset first, then seed.
+
+        Args:
+            seed: Any integer; those that differ by a multiple of 2⁶⁴ are the same.
+            first_env: Number of this module's first environment among those of all processes; default: where torch runs
+                distributed, the process's rank times the number of its environments, else 0.
+
+        Returns:
+            The module.
+
+        Raises:
+            TgdslError: If they are no integers, or `first_env` is none that an environment can have.
+        """
+        self.memory.clock.seed_with(seed, first_env)
+        return self
+
+    def compile(self, graph: bool = False, **options: Any) -> TactileModule:
+        """Have calls and `peek` compiled by `torch.compile` into fused kernels, in place; their first one then takes longer.
+
+        Args:
+            graph: Whether calls without derivatives (under `torch.no_grad` or `inference_mode`) replay a CUDA graph: the host
+                then has little to do, and readings lie in the same memory at each call, so copy what is to be kept.
+            **options: Handed to `torch.compile`; default `fullgraph=True, dynamic=True`, one graph for every batch ≥ 2, and
+                `options=inductor_options()`.
+
+        Returns:
+            The module.
+
+        Raises:
+            TgdslError: If graphs are wanted of a module that is not on a GPU.
+        """
+        if graph and self.device.type != "cuda":
+            raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
+        if self.device.type == "cpu" and not has_cpp_compiler():
+            warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
+            return self
+        defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}
+        if not {"mode", "options", "backend"} & options.keys():
+            defaults["options"] = self.inductor_options()
+        self.calls.compile(graph, **{**defaults, **options})
+        return self
+
+    def inductor_options(self) -> dict[str, bool]:
+        """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
+        return inductor_options(self.plan)
+
+    def example_state(
+        self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
+    ) -> SceneState:
+        """Return a valid random state of all wanted fields, with bodies close enough to touch.
+
+        Args:
+            num_envs: Number of environments.
+            seed: Seed of the draw.
+            dtype: Dtype of the tensors.
+            spread: Standard deviation of the bodies' positions, and of contacts from their links [m].
+        """
+        return example_state(self.inputs, num_envs, seed, dtype, spread).to(self.device)
+
+    def explain(self) -> str:
+        """Return an account of what is computed, what was dropped and why, and what it costs."""
+        from tgdsl.module.explain import explain
+
+        return explain(self)
+
+    def _circumstances(
+        self, tensors: dict[str, Tensor], memory: dict[str, Tensor]
+    ) -> tuple[dict[str, Now], dict[str, dict[str, Tensor]]]:
+        """Return by sensor when it is read, where that matters, and the values of its noise."""
+        nows = self.memory.clock.nows(memory, tensors.get("dt"))
+        knobs: dict[str, dict[str, Tensor]] = {}
+        for sensor in self.plan.sensors:
+            names = () if sensor.noise is None else sensor.noise.constants
+            constants = self.constants.under(f"sensors/{sensor.name}/noise", names)
+            knobs[sensor.name] = stages.knob_values(constants, nows.get(sensor.name))
+        return nows, knobs
+
+    def _joined_signal(self, names: Sequence[str], felt: Felt, probes: Probes) -> Tensor:
+        by_name = {sensor.name: sensor for sensor in self.plan.sensors}
+        sensors = [by_name[name] for name in names]
+        constants = [self.constants.under(sensor.folder, sensor.constants) for sensor in sensors]
+        return joined_signal(self._kinds[names[0]], sensors, felt, probes, constants)
+
+    def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Put the memory itself in the place of stacks that are declared as views."""
+        views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
+        return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
+
+    def _dt_tensor(self, dt: float) -> Tensor:
+        """Return dt as a tensor that is written only when it changes.
+
+        Raises:
+            StateError: If it is no time.
+        """
+        if not 0 < dt < math.inf:
+            raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
+        if self._dt is None or self._dt[0] != dt:
+            self._look_at_rates(dt)
+        if self._dt is None or self._dt[0] != dt or self._dt[1].device != self.device or self._dt[1].dtype != self.dtype:
+            with torch.inference_mode(False):
+                self._dt = dt, torch.tensor(dt, dtype=self.dtype, device=self.device)
+        return self._dt[1]
+
+    def _look_at_rates(self, dt: float) -> None:
+        """Warn of sensors that would take samples more often than they are called, the first time."""
+        for sensor in self.plan.sensors:
+            if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:
+                self._warned.add(sensor.sensor)
+                what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
+                warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
+        """Move or cast all tensors; a captured graph has read the old ones.
+
+        Raises:
+            TgdslError: If they are to be neither float32 nor float64.
+        """
+        check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
+        super()._apply(fn, recurse)
+        self.calls.forget_graphs()
+        return self
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        """Have state that is loaded before the first call where the module is."""
+        home = torch.empty(0, dtype=self.dtype, device=self.device)
+        self.memory.home = self.memory.clock.home = home
+        super()._load_from_state_dict(*args, **kwargs)
+
+
+def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return what is kept of readings that are handed out, if anything is."""
+    return {f"{KEPT}{name}": made.transpose(1, 2) for name, made in readings.items() if f"{KEPT}{name}" in memory}

@@ -1,0 +1,157 @@
+"""The state of a scene: what a module reads of simulators and hardware.
+
+Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
+pair, `object` objects of its `inputs.objects`, `joint` joints of its `inputs.joints`, `actuator` actuators of its
+`inputs.actuators`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.errors import StateError
+from tgdsl.plan.plan import Inputs
+
+SHAPES: dict[str, tuple[str | int, ...]] = {
+    "body_pos": ("body", 3),
+    "body_quat": ("body", 4),
+    "body_linvel": ("body", 3),
+    "body_angvel": ("body", 3),
+    "contact_found": ("pair",),
+    "contact_pos": ("pair", "slot", 3),
+    "contact_force": ("pair", "slot", 3),
+    "contact_torque": ("pair", "slot", 3),
+    "contact_normal": ("pair", "slot", 3),
+    "contact_netforce": ("pair", 3),
+    "variant": ("object",),
+    "object_size": ("object", 3),
+    "joint_pos": ("joint",),
+    "joint_vel": ("joint",),
+    "joint_effort": ("joint",),
+    "last_action": ("actuator",),
+}
+"""Shape of each tensor of a `SceneState`, after the leading `env`."""
+
+
+@dataclass
+class SceneState:
+    """What a simulator (or hardware) says of all environments at one instant. Only what `inputs.fields` names is read.
+
+    All is in world axes. Float tensors may be float64 whatever the module's dtype: relative poses are formed in the state's
+    dtype and then cast, so that far from the origin nothing is lost.
+
+    A number that is none is not taken for zero: whatever depends on it, in its environment, is read as not-a-number, what
+    `contact_found` gates included. A slot is unused where force, torque and normal are all zero; where it is then does not
+    matter. A contact whose normal is zero acts where it is, and what needs its normal is read as not-a-number.
+
+    Attributes:
+        body_pos: Position of each body's frame [m].
+        body_quat: Orientation of each body, w, x, y, z.
+        body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
+        body_angvel: Angular velocity of the body [rad/s].
+        contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive, as that
+            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`.
+        contact_pos: Contact points [m].
+        contact_force: Force on the link at each point [N].
+        contact_torque: Torque on the link at each point [N·m].
+        contact_normal: Unit normal out of the object at each point.
+        contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
+        variant: Which of its variants each object has, from 0; 0 for one that has none.
+        object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
+        joint_pos: Position of each joint, of the same instant as the bodies' poses [rad; slides: m].
+        joint_vel: Velocity of each joint, of that instant [rad/s; slides: m/s].
+        joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
+        last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
+        dt: Time since the last state [s].
+    """
+
+    body_pos: Float[Tensor, "env body 3"] | None = None
+    body_quat: Float[Tensor, "env body 4"] | None = None
+    body_linvel: Float[Tensor, "env body 3"] | None = None
+    body_angvel: Float[Tensor, "env body 3"] | None = None
+    contact_found: Tensor | None = None
+    contact_pos: Float[Tensor, "env pair slot 3"] | None = None
+    contact_force: Float[Tensor, "env pair slot 3"] | None = None
+    contact_torque: Float[Tensor, "env pair slot 3"] | None = None
+    contact_normal: Float[Tensor, "env pair slot 3"] | None = None
+    contact_netforce: Float[Tensor, "env pair 3"] | None = None
+    variant: Int[Tensor, "env object"] | None = None
+    object_size: Float[Tensor, "env object 3"] | None = None
+    joint_pos: Float[Tensor, "env joint"] | None = None
+    joint_vel: Float[Tensor, "env joint"] | None = None
+    joint_effort: Float[Tensor, "env joint"] | None = None
+    last_action: Float[Tensor, "env actuator"] | None = None
+    dt: float | None = None
+
+    def to(self, *args: Any, **kwargs: Any) -> SceneState:
+        """Return the state with `torch.Tensor.to` applied to every tensor; a dtype applies to what is not an integer."""
+        values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
+        if moved["variant"] is not None:
+            moved["variant"] = moved["variant"].to(values["variant"].dtype)
+        return SceneState(**moved)
+
+    def checked(self, inputs: Inputs, device: torch.device) -> dict[str, Tensor]:
+        """Return the tensors that a module wants, after a look at their shapes.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+        """
+        tensors: dict[str, Tensor] = {}
+        for name in inputs.fields:
+            value = getattr(self, name)
+            if value is None:
+                raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
+            if name != "dt":
+                tensors[name] = _checked(name, value, shape_of(name, inputs), device)
+        num_envs = {name: value.shape[0] for name, value in tensors.items()}
+        for name, count in num_envs.items():
+            if count != num_envs["body_pos"]:
+                raise StateError(f"SceneState.{name} holds {count} environments, body_pos {num_envs['body_pos']}")
+        if (
+            "variant" in tensors and device.type == "cpu"
+        ):  # a look at a GPU's numbers would wait for it; there the kernel asserts
+            _check_variants(tensors["variant"], inputs)
+        return tensors
+
+
+def _check_variants(variant: Tensor, inputs: Inputs) -> None:
+    for i, (name, num) in enumerate(zip(inputs.objects, inputs.num_variants, strict=True)):
+        own = variant[:, i]
+        if ((own < 0) | (own >= num)).any():
+            found = sorted({int(v) for v in own.tolist() if not 0 <= v < num})
+            raise StateError(f"SceneState.variant of object {name} is {found[0]}, expected 0 to {num - 1}")
+
+
+def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
+    """Return the shape that a field has for a module, after the leading `env`."""
+    sizes = {
+        "body": len(inputs.bodies),
+        "pair": len(inputs.pairs),
+        "slot": inputs.slots,
+        "object": len(inputs.objects),
+        "joint": len(inputs.joints),
+        "actuator": len(inputs.actuators),
+    }
+    return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
+
+
+def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device) -> Tensor:
+    if not isinstance(value, Tensor):
+        raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
+    if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
+        expected = ", ".join(map(str, want))
+        raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected})")
+    if value.device != device:
+        raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
+    if name == "variant":
+        if value.dtype not in (torch.int64, torch.int32):
+            raise StateError(f"SceneState.variant is {value.dtype}, expected torch.int64 or torch.int32")
+    elif name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
+        raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
+    return value

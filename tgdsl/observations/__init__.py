@@ -1,0 +1,1 @@
+"""What a policy reads, made of readings and of joints."""

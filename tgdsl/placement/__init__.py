@@ -1,0 +1,1 @@
+"""Where taxels go on a robot's links."""

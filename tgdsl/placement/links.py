@@ -1,0 +1,163 @@
+"""A robot's tree of bodies as a table: joints, geoms, surface, mass and link groups."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
+from tgdsl.files.files import layout_file, robot_file, robot_names
+from tgdsl.formats.robot import SHAPE_NAMES, Model, load_model
+from tgdsl.schema.load import LoadedLayout, load_layout
+from tgdsl.schema.select import select
+
+_HEADER = ("body", "joints", "geoms", "area [cm²]", "mass [g]", "groups")
+_NUMBERS = (3, 4)
+_JOINTS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): "free",
+    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
+    int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
+    int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
+}
+
+
+def robot_path(robot: str) -> Path:
+    """Return the file of a robot given by a path, or of one that tgdsl brings, by its name.
+
+    Raises:
+        TgdslError: If there is neither.
+    """
+    path = robot_file(robot, Path())
+    if path is None:
+        raise TgdslError(f'there is no file or robot "{robot}"; {did_you_mean(robot, robot_names(), "robots")}')
+    return path
+
+
+def open_robot(robot: str) -> Model:
+    """Return the robot of a file (MJCF, URDF, USD), or one that tgdsl brings, by its name.
+
+    Raises:
+        TgdslError: If there is neither.
+        RobotError: If the file cannot be read.
+    """
+    return load_model(robot_path(robot))
+
+
+def layout_of(robot: str) -> Path | None:
+    """Return the layout of a robot given by name; a file has none."""
+    known = robot_names().get(robot)
+    return None if known is None else layout_file(known)
+
+
+def links_table(robot: Model, layout: Path | None = None) -> list[str]:
+    """Return the lines of the table: one body after another in depth-first order, children indented.
+
+    Areas are the sum over the geoms that can be touched: where these overlap, both count.
+
+    Args:
+        robot: The robot.
+        layout: A layout file whose groups are shown.
+
+    Raises:
+        SpecError: If the layout has mistakes.
+    """
+    model = robot.compiled
+    groups = _groups(robot, load_layout(layout)) if layout else {}
+    blocks: list[list[tuple[str, ...]]] = [[(name,) for name in _HEADER]]
+    depth = {0: 0}
+    for body in range(model.nbody):
+        depth[body] = depth[int(model.body_parentid[body])] + 1 if body else 0
+        name = model.body(body).name or f"(unnamed body {body})"
+        cells = (
+            ("  " * depth[body] + name,),
+            _joints(model, body) or ("-" if body else "",),
+            _geoms(model, body) or ("-",),
+            (_area(robot, body),),
+            (f"{1e3 * model.body_mass[body]:.1f}" if body else "",),
+            (", ".join(groups.get(name, ())),),
+        )
+        blocks.append(list(cells))
+    return _aligned(blocks)
+
+
+def _aligned(blocks: Sequence[Sequence[tuple[str, ...]]]) -> list[str]:
+    """Return blocks of cells, of one or several lines each, as lines with aligned columns."""
+    widths = [max(len(line) for block in blocks for line in block[i]) for i in range(len(_HEADER))]
+    lines = []
+    for block in blocks:
+        for k in range(max(len(cell) for cell in block)):
+            texts = [cell[k] if k < len(cell) else "" for cell in block]
+            pads = [
+                text.rjust(w) if i in _NUMBERS else text.ljust(w) for i, (text, w) in enumerate(zip(texts, widths, strict=True))
+            ]
+            lines.append("  ".join(pads).rstrip())
+    return lines
+
+
+def _joints(model: mujoco.MjModel, body: int) -> tuple[str, ...]:
+    found = []
+    first = int(model.body_jntadr[body])
+    for joint in range(first, first + int(model.body_jntnum[body])):
+        kind = _JOINTS[int(model.jnt_type[joint])]
+        name = model.joint(joint).name
+        span = f" {_range(model, joint, kind)}" if kind != "free" else ""
+        found.append(f"{name}: {kind}{span}" if name else f"{kind}{span}")
+    return tuple(found)
+
+
+def _range(model: mujoco.MjModel, joint: int, kind: str) -> str:
+    if not model.jnt_limited[joint]:
+        return "unlimited"
+    low, high = (model.jnt_range[joint] * 1e3 if kind == "slide" else np.degrees(model.jnt_range[joint])).tolist()
+    unit = "mm" if kind == "slide" else "deg"
+    return f"up to {high:.4g} {unit}" if kind == "ball" else f"{low:.4g} to {high:.4g} {unit}"
+
+
+def _geoms(model: mujoco.MjModel, body: int) -> tuple[str, ...]:
+    found = []
+    paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
+    first = int(model.body_geomadr[body])
+    for geom in range(first, first + int(model.body_geomnum[body])):
+        shape = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown")
+        mesh = model.mesh(model.geom_dataid[geom]).name if shape in ("mesh", "sdf") else ""
+        kind = f"{shape} {mesh}" if mesh else shape
+        name = model.geom(geom).name
+        is_colliding = model.geom_contype[geom] or model.geom_conaffinity[geom] or geom in paired
+        found.append(f"{name + ': ' if name else ''}{kind}, {'colliding' if is_colliding else 'visual'}")
+    return tuple(found)
+
+
+def _area(robot: Model, body: int) -> str:
+    name = robot.compiled.body(body).name
+    geoms = robot.touchable(name) if name else ()
+    if not geoms:
+        return "-"
+    try:
+        return f"{1e4 * robot.surface(geoms).face_areas.sum():.2f}"
+    except RobotError:
+        return "unbounded"
+
+
+def _groups(robot: Model, layout: LoadedLayout) -> dict[str, list[str]]:
+    """Return the groups that each body is in.
+
+    Raises:
+        SpecError: If a group has a pattern that matches nothing.
+    """
+    candidates = [[body, *(n for geom in robot.touchable(body) for n in geom.names)] for body in robot.bodies]
+    names = [name for geom in robot.geoms for name in geom.names]
+    problems: list[Problem] = []
+    found: dict[str, list[str]] = {}
+    for group, selection in layout.spec.groups.items():
+
+        def report(where: tuple[str, int], what: str, hint: str, group: str = group) -> None:
+            problems.append(layout.problem(("groups", group), what, hint))
+
+        for i in select(selection, candidates, layout.spec.groups, report, group, names):
+            found.setdefault(robot.bodies[i], []).append(group)
+    if problems:
+        raise SpecError(problems)
+    return found

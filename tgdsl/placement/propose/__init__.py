@@ -1,0 +1,1 @@
+"""A first layout for a robot that nobody has described."""

@@ -1,0 +1,160 @@
+"""A proposed layout as YAML with comments: what was guessed, and what to edit."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tgdsl.errors import TgdslError, listed
+from tgdsl.fields import units
+from tgdsl.files.files import with_folder, writable, write_whole
+from tgdsl.formats.robot import Model
+from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, escaped, propose
+
+WIDTH = 120
+"""Lists of names are broken at this column."""
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*\Z")
+_KEYWORDS = {"null", "true", "false", "yes", "no", "on", "off", "y", "n"}
+_HEADER = """\
+# A layout for {robot}, proposed by `tgdsl layout new`: nobody has looked at it yet.
+# Density: {density:g} taxels per cm² at `med`, a quarter of that at `low`, four times as much at `high`; at least 1 a link.
+# `radius` is how far a taxel feels: neighbours overlap a little. To edit: drop links that are not to feel, move links
+# between groups, and give a region (facing, box, sphere, geoms), or `method: grid`, where all around is not what you want.
+# A document takes it as `robot: {{model: ..., layout: THIS FILE}}` and says which resolution with `resolution: med`.
+"""
+_ABOUT = {
+    "tips": "guessed: the last links of all chains",
+    "palm": "guessed: the largest link from which the chains branch off",
+    "fingers": "all that moves against it",
+    "hand": "every link with taxels",
+}
+_NO_PALM = "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n"
+
+USUAL_DENSITY = (100.0, math.inf)
+"""Taxels per area below which another unit was most likely meant [1/m²]: one per square decimetre."""
+
+
+def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool) -> list[str]:
+    """Propose a layout for a robot and write it; return what to tell the user.
+
+    Args:
+        robot: The robot.
+        density: Taxels per area at `med`, such as `4/cm2`.
+        with_groups: Whether to propose link groups.
+        out: The file.
+        is_forced: Whether it may be replaced.
+
+    Raises:
+        TgdslError: If the density is none, the file is there already or cannot be written, or the robot has no link that can
+            carry taxels.
+    """
+    try:
+        per_area = units.parse(density, "density")
+    except ValueError as error:
+        raise TgdslError(f"--density: {error}") from error
+    if per_area <= 0:
+        raise TgdslError(f"--density: {density} is out of range, expected more than 0")
+    if (what := units.doubt(per_area, "density", *USUAL_DENSITY)) is not None:
+        warnings.warn(f"--density {density}: {'; '.join(what)}", stacklevel=2)
+    if out.is_file() and not is_forced:
+        raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
+    writable(out)
+    proposal = propose(robot, per_area, with_groups)
+    write_whole(with_folder(out), layout_text(proposal, robot.file.name).encode())
+    totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
+    return [
+        f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
+        *(f"group {name}: {listed(members)}" for name, members in proposal.groups.items()),
+        *(f"left out: {line}" for line in _left_out(proposal)),
+        f"{out}: every guess in it is marked; please look at them",
+    ]
+
+
+def layout_text(proposal: Proposal, robot: str) -> str:
+    """Return the file's text; the same proposal gives the same text.
+
+    Args:
+        proposal: The layout.
+        robot: How the text calls the robot.
+    """
+    parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
+    parts += [f"# Left out: {line}\n" for line in _left_out(proposal)]
+    if proposal.groups and proposal.shared:
+        names = ", ".join(map(quoted, proposal.shared))
+        parts.append(f"# Mind: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
+    parts += ["tgdsl: 1\n", _groups_text(proposal), "resolutions:\n"]
+    for resolution in FACTORS:
+        total = sum(link.counts[resolution] for link in proposal.links)
+        parts.append(f"  {resolution}:  # {total} taxels\n")
+        parts += [_link_text(proposal, link, resolution) for link in proposal.links]
+    return "".join(parts)
+
+
+def _left_out(proposal: Proposal) -> list[str]:
+    """Return the bodies without taxels, one line per reason."""
+    reasons = dict.fromkeys(why for _, why in proposal.left_out)
+    names = {reason: [quoted(name) for name, why in proposal.left_out if why == reason] for reason in reasons}
+    return [f"{', '.join(names[reason])}: {_one_line(reason)}" for reason in reasons]
+
+
+def _groups_text(proposal: Proposal) -> str:
+    if not proposal.groups:
+        return ""
+    lines = ["groups:\n"]
+    for name, members in proposal.groups.items():
+        lines.append(f"  # {_ABOUT[name]}\n" + _broken(f"  {name}: [", [quoted(member) for member in members]))
+        if name == "tips" and "palm" not in proposal.groups:
+            lines.append(_NO_PALM)
+    if any(member.startswith("[") for members in proposal.groups.values() for member in members):
+        lines.append("  # A name such as [p]alm means the link palm, where the group has the same name.\n")
+    return "".join(lines)
+
+
+def _link_text(proposal: Proposal, link: LinkProposal, resolution: str) -> str:
+    entry: dict[str, Any] = proposal.placement(link, resolution)
+    text = f"    {quoted(escaped(link.name))}: {_flow(entry)}\n"
+    if resolution != "med":
+        return text
+    side = (
+        "inner side guessed from how the joints close"
+        if link.facing
+        else "which side is the inner one is not clear: all around"
+    )
+    return f"    # {1e4 * link.area:.3g} cm², {side}\n{text}"
+
+
+def _flow(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_flow(item) for item in value) + "]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def quoted(name: str) -> str:
+    """Return a name as YAML reads it back: plain if it is a simple word, else in double quotes, on one line."""
+    if _PLAIN.match(name) and name.lower() not in _KEYWORDS:
+        return name
+    text = json.dumps(name, ensure_ascii=False)
+    return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
+
+
+def _one_line(text: str) -> str:
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def _broken(start: str, items: Sequence[str]) -> str:
+    """Return a flow sequence that is broken before `WIDTH`."""
+    lines, line = [], start
+    for i, item in enumerate(items):
+        piece = item + ("," if i + 1 < len(items) else "]")
+        if len(line) + len(piece) > WIDTH and line.strip() and not line.endswith("["):
+            lines.append(line.rstrip())
+            line = "    "
+        line += piece + " "
+    return "\n".join([*lines, line.rstrip()]) + "\n"

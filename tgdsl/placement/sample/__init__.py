@@ -1,0 +1,1 @@
+"""Taxels on a link's surface: grids, even samples, points."""

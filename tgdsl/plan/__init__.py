@@ -1,0 +1,1 @@
+"""What to compute, with nothing left to decide."""

@@ -1,0 +1,1 @@
+"""What kinds ask of a scene, one folder each."""

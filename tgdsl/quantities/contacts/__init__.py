@@ -1,0 +1,1 @@
+"""Contacts: the solver's, on the bodies that carry a sensor."""

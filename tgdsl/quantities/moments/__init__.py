@@ -1,0 +1,1 @@
+"""Moments of objects' surfaces about each probe."""

@@ -1,0 +1,103 @@
+"""What is near each probe: the moments of every object's surface, in the link's frame.
+
+Shapes: `env` environments, `taxel` probes, `case` 1, or `env` if the object differs between environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Rot, Vec
+from tgdsl.quantities.contact_depth.query import Felt, Motion, Pairs, Probes, gathered
+from tgdsl.quantities.moments.moments import MomentField, Moments, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.tensors.fusion import takes_kernel
+
+
+class Plane(NamedTuple):
+    """A plane in its object's frame: rotates plane vectors, whose z is its normal, into it; its origin [m]."""
+
+    rotation: Rot
+    pos: Vec
+
+
+class MomentSource(NamedTuple):
+    """One object, and how its moments are found.
+
+    Attributes:
+        name: Its name.
+        first_pair: Index of its first pair.
+        num_pairs: Number of its pairs.
+        pair: Index of each probe's pair among them.
+        radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
+            the object itself.
+        shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
+        surface: Its outer surface but for planes; None if there is no more to it.
+        planes: Its planes.
+        area: Area of its outer surface, planes left out [m²].
+    """
+
+    name: str
+    first_pair: int
+    num_pairs: int
+    pair: Int[Tensor, " taxel"]
+    radius: Float[Tensor, "*env taxel"]
+    shift: Float[Tensor, "env taxel"] | None
+    surface: MomentField | PointCloud | None
+    planes: tuple[Plane, ...]
+    area: Float[Tensor, "case 1"]
+
+
+def with_moments(felt: Felt, pairs: Pairs, probes: Probes, sources: Sequence[MomentSource]) -> Felt:
+    """Return an answer with moments, motions and areas of objects added. Moments are never gated."""
+    found: dict[str, Moments] = {}
+    motions: dict[str, Motion] = {}
+    for source in sources:
+        own = slice(source.first_pair, source.first_pair + source.num_pairs)
+        found[source.name] = _felt_moments(pairs, own, probes, source)
+        if pairs.motion is not None:
+            linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
+            motions[source.name] = Motion(linear, angular, turn)
+    return felt._replace(moments=found, motions=motions, area={source.name: source.area for source in sources})
+
+
+def _felt_moments(pairs: Pairs, own: slice, probes: Probes, source: MomentSource) -> Moments:
+    """Return the moments of an object at the probes, in their links' frames."""
+    tensors = [source.radius, *probes.pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
+    field = source.surface
+    if isinstance(field, MomentField) and not field.is_smooth and not source.planes and takes_kernel(*tensors):
+        from tgdsl.quantities.moments.nearby_kernel import felt_moments
+
+        return felt_moments(pairs, own, probes.pos, source.pair, source.radius, source.shift, field)
+    rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
+    point = planes.add(planes.rotate(rotation, probes.pos), gathered(pairs.offset, own, source.pair))
+    moments = _moments(point, source)
+    return Moments(moments.mass, planes.rotate_back(rotation, moments.first))
+
+
+def _moments(point: Vec, source: MomentSource) -> Moments:
+    """Return the moments of an object at points in its frame."""
+    parts = []
+    if isinstance(source.surface, MomentField):
+        near = field_moments(point, source.surface, source.shift)
+        if source.shift is not None:  # to first order S0 becomes negative near the edge of the sensing ball
+            near = near._replace(mass=torch.clamp(near.mass, min=0))
+        # The field knows no radius: an inactive probe asks one that is not its own.
+        is_active = source.radius > 0
+        none = torch.zeros_like(near.mass)
+        parts.append(Moments(torch.where(is_active, near.mass, 0.0), planes.where(is_active, near.first, (none, none, none))))
+    elif source.surface is not None:
+        parts.append(cloud_moments(point, source.surface, source.radius))
+    for plane in source.planes:
+        local = planes.rotate_back(plane.rotation, planes.sub(point, plane.pos))
+        near = plane_moments(local, source.radius)
+        parts.append(Moments(near.mass, planes.rotate(plane.rotation, near.first)))
+    mass, first = parts[0]
+    for part in parts[1:]:
+        mass, first = mass + part.mass, planes.add(first, part.first)
+    return Moments(mass, first)

@@ -1,0 +1,1 @@
+"""Points sampled on objects, and how deep they are in links' own surfaces."""

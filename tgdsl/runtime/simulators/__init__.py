@@ -1,0 +1,1 @@
+"""What simulators of a module's scene have in common."""

@@ -1,0 +1,90 @@
+"""Objects that differ between environments: which variant and size each environment has, and the models to match."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+
+from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.plan.plan import Inputs
+from tgdsl.scene.scene import Choice, SceneModels
+from tgdsl.schema.objects import NUM_SIZES
+
+Values = int | float | Sequence[Any] | np.ndarray
+"""Numbers, one per environment or one for all."""
+
+
+class EnvObjects:
+    """What the objects of `inputs.objects` are like in each environment.
+
+    To begin with, environment i has variant i modulo their number, in the size that the document or the scene gives.
+
+    Shapes: `env` environments, `object` objects of `inputs.objects`.
+
+    Attributes:
+        variant: The field `variant` of a state.
+        object_size: The field `object_size` of a state [m]; 0 for objects whose size is not part of it.
+    """
+
+    variant: Int[np.ndarray, "env object"]
+    object_size: Float[np.ndarray, "env object 3"]
+
+    def __init__(self, scenes: SceneModels, inputs: Inputs, num_envs: int):
+        self._scenes = scenes
+        self._num_variants = dict(zip(inputs.objects, inputs.num_variants, strict=True))
+        self._choices = [{name: Choice(env % num) for name, num in self._num_variants.items()} for env in range(num_envs)]
+        self._tabulate()
+
+    def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
+        """Say what objects are like in some environments: see `BatchSimulation.set_objects`."""
+        chosen = [dict(self._choices[env]) for env in ids]
+        for name, value in variants.items():
+            for choices, variant in zip(chosen, self._variants(name, value, len(ids)), strict=True):
+                choices[name] = Choice(int(variant))
+        for name, value in sizes.items():
+            for choices, size in zip(chosen, self._sizes(name, value, len(ids)), strict=True):
+                num = NUM_SIZES[self._scenes.type(name, choices[name].variant)]
+                if len(size) < num or not (size[:num] > 0).all():
+                    raise SimulationError(f"size of object {name} is {size.tolist()}, expected {num} positive lengths")
+                x, y, z = [*size[:num].tolist(), 0.0, 0.0][:3]
+                choices[name] = replace(choices[name], size=(x, y, z))
+        for env, choices in zip(ids, chosen, strict=True):
+            self._choices[env] = choices
+        self._tabulate()
+
+    def _tabulate(self) -> None:
+        self.variant = np.array([[choice.variant for choice in own.values()] for own in self._choices], dtype=np.int64)
+        self.object_size = np.array([[self._size(*item) for item in own.items()] for own in self._choices])
+
+    def models(self) -> list[mujoco.MjModel]:
+        """Return each environment's model; those that are alike share one."""
+        return self._scenes.models(self._choices)
+
+    def _size(self, name: str, choice: Choice) -> tuple[float, float, float]:
+        return self._scenes.size(name, choice) if self._scenes.objects[name].is_sized else (0.0, 0.0, 0.0)
+
+    def _known(self, name: str) -> None:
+        if name not in self._num_variants:
+            hint = did_you_mean(name, self._num_variants, "objects that do")
+            raise SimulationError(f'no object "{name}" differs between environments; {hint}')
+
+    def _variants(self, name: str, value: Values, count: int) -> Int[np.ndarray, " n"]:
+        self._known(name)
+        found, num = np.asarray(value), self._num_variants[name]
+        if found.shape not in ((), (count,)) or found.dtype.kind not in "iu" or (found < 0).any() or (found >= num).any():
+            raise SimulationError(f"variants of object {name}: expected {count} integers from 0 to {num - 1}, found {value}")
+        return np.broadcast_to(found, count)
+
+    def _sizes(self, name: str, value: Values, count: int) -> Float[np.ndarray, "n size"]:
+        self._known(name)
+        if not self._scenes.objects[name].is_sized:
+            raise SimulationError(f"the size of object {name} is fixed; the document frees it with `size: per_env`")
+        found = np.atleast_1d(np.asarray(value, dtype=np.float64))
+        if found.shape[:-1] not in ((), (count,)) or not np.isfinite(found).all():
+            raise SimulationError(f"sizes of object {name}: found shape {found.shape}, expected ({count}, 1 to 3), finite")
+        return np.broadcast_to(found, (count, found.shape[-1]))

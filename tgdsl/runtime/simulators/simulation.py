@@ -1,0 +1,290 @@
+"""What simulators of a module's scene have in common, whatever steps the physics.
+
+Shapes: `env` environments, `nq`, `nv` and `nu` as in MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Unpack
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
+from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
+from tgdsl.runtime.simulators.joints import Joints
+from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
+from tgdsl.tensors.env_ids import EnvIds
+
+
+class Simulation(ABC):
+    """Environments of one model, read by one module.
+
+    A module with state remembers each environment's episode: one simulation at a time reads it, from when it is made until it
+    is closed or let go of.
+
+    Attributes:
+        model: The compiled scene; where objects differ between environments, that of the first.
+        substeps: Physics steps per control step.
+    """
+
+    model: mujoco.MjModel
+    substeps: int
+    _touch: TactileModule
+    _arrays: Mapping[str, Tensor]
+    _faults: EnvFaults
+    _table: StateTable
+    _is_closed = False
+
+    @property
+    @abstractmethod
+    def num_envs(self) -> int:
+        """Number of environments."""
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        return self.substeps * float(self.model.opt.timestep)
+
+    @property
+    def qpos(self) -> Float[Tensor, "env nq"]:
+        """Positions of the joints, as MuJoCo's `qpos`: a live tensor.
+
+        What is written into it counts from the next step on, and what `state` hands out stays that of the last step: use
+        `set_state`, or call `forward`. After `step` it is where the environments are now.
+        """
+        return self._arrays["qpos"]
+
+    @property
+    def qvel(self) -> Float[Tensor, "env nv"]:
+        """Velocities of the joints, as MuJoCo's `qvel`: a live tensor, as `qpos` is."""
+        return self._arrays["qvel"]
+
+    @property
+    def ctrl(self) -> Float[Tensor, "env nu"]:
+        """Controls of the actuators, as MuJoCo's `ctrl`: a live tensor, as `qpos` is."""
+        return self._arrays["ctrl"]
+
+    @cached_property
+    def joints(self) -> Joints:
+        """Where each joint stands: `sim.qpos[:, sim.joints["thumb"].qpos]`, `sim.qvel[:, sim.joints["thumb"].qvel]`.
+
+        A joint without a name goes by its body's, if the body has no other.
+        """
+        return Joints(self.model)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of `qpos`."""
+        return tuple(self.joints)
+
+    @property
+    def faults(self) -> Bool[Tensor, " env"]:
+        """Environments that have diverged, or whose controls or given state were not finite.
+
+        With `on_fault="raise"` those that wait for a reset; with `on_fault="reset"` those that the last step has started anew.
+        """
+        return self._faults.mask
+
+    @property
+    def fault_counts(self) -> Int[Tensor, " env"]:
+        """How many times each environment has had a fault since the simulation was made."""
+        return self._faults.counts.clone()
+
+    def step(self, control: Tensor | np.ndarray | None = None) -> None:
+        """Advance all environments by one control step.
+
+        As with `mj_step`, poses, velocities and contacts are then those at the start of the last physics step, and `state`
+        hands out these: with `substeps=1` what was before the step. `forward` evaluates them where the environments are now.
+
+        Args:
+            control: Actuator controls, (env, actuator) or (actuator,) for all alike; default: as they were. Those on a GPU
+                are checked there.
+
+        Raises:
+            SimulationError: If controls do not fit, or a pool of MuJoCo Warp was too small; and with `on_fault="raise"` if
+                controls are not finite or an environment has diverged. The other environments have then made their step. On a
+                GPU as soon as it is known.
+        """
+        self._begin_step(control)
+        self._advance(self.substeps)
+
+    def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
+        """Advance all environments by one control step, and hand out the state after each of its physics steps.
+
+        For sensors that are read at every physics step: `for state in sim.substates(control): readings = touch(state)`. The
+        simulator is where `step` would have left it once all are taken; who stops earlier has made fewer physics steps. With
+        `on_fault="reset"` environments start anew after the physics step of their fault, and make the others from there.
+
+        Args:
+            control: Actuator controls, as for `step`; they are set when the first state is asked for.
+
+        Yields:
+            What `state` returns after each physics step; its `dt` is that of one physics step.
+
+        Raises:
+            SimulationError: As `step` does, at the physics step where it happens.
+        """
+        self._begin_step(control)
+        for _ in range(self.substeps):
+            self._advance(1)
+            yield self._state(float(self.model.opt.timestep))
+
+    def state(self) -> SceneState:
+        """Return what the module wants on its device, all of one instant; `dt` is that of a control step.
+
+        After `step` the instant is the start of the last physics step, where MuJoCo has evaluated poses, velocities and
+        contacts: with `substeps=1` that before the step. After `reset`, `set_state` and `forward` it is where the environments
+        are.
+        """
+        self._refuse_if_closed()
+        return self._state(self.control_step)
+
+    def reset(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
+        """Begin a new episode in some environments (default: all), in the simulator and in the module.
+
+        They start from the keyframe at time 0, then with the values given, as `MjData` after `mj_resetData`, assignments and
+        `mj_forward`. Nothing of the others changes. On a GPU a boolean mask and values that are there are used without
+        waiting; of indices there, the host waits to see them.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments.
+            **values: MuJoCo's `qpos`, `qvel`, `ctrl` or another array of the state, as for `set_state`.
+
+        Raises:
+            SimulationError: If there are no such environments, a value does not fit, numbers on the host are not finite, or
+                MuJoCo reports an environment as failed.
+        """
+        self._refuse_if_closed()
+        self._begin_episodes(env_ids, self._table.rows(values, env_ids))
+
+    def set_state(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
+        """Put some environments (default: all) into a state; their time and the module's memory go on.
+
+        What follows from it is evaluated, as `mj_forward` does: `state` hands out this instant. Nothing of the other
+        environments changes.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments.
+            **values: `qpos`, `qvel`, `ctrl`, or another of MuJoCo's arrays that an environment's future follows from (`act`,
+                `mocap_pos`, `mocap_quat`, `time`, `qacc_warmstart`, …); what is not given stays. Each has one row for all
+                environments alike, or with indices a row for each in their order, or else (env, …), of which the chosen rows
+                are taken. Tensors or arrays of any float dtype, on any device. Quaternions are brought to unit length by
+                MuJoCo's rule (`mju_normalize4`).
+
+        Raises:
+            SimulationError: If there are no such environments or arrays, a shape does not fit, or numbers on the host are not
+                finite or hold a quaternion of length 0; nothing has changed. On a GPU such environments keep what they had
+                and have a fault.
+        """
+        self._refuse_if_closed()
+        self._put(env_ids, self._table.rows(values, env_ids))
+
+    @abstractmethod
+    def forward(self, env_ids: EnvIds | None = None) -> None:
+        """Evaluate poses, velocities and contacts of some environments (default: all) where they are now, as `mj_forward` does.
+
+        `state` then hands out this instant, for the price of about one physics step; forces follow from the present controls.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments.
+
+        Raises:
+            SimulationError: If there are no such environments.
+        """
+
+    def close(self) -> None:
+        """Let go of the module, so that another simulation can read it; this one can no longer be used."""
+        self._is_closed = True
+        if _reader(self._touch) is self:
+            del _READERS[self._touch]
+
+    @abstractmethod
+    def _state(self, dt: float) -> SceneState: ...
+
+    @abstractmethod
+    def _advance(self, num_steps: int) -> None:
+        """Make physics steps, and see to faults."""
+
+    @abstractmethod
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None: ...
+
+    @abstractmethod
+    def _put(self, env_ids: EnvIds | None, rows: Rows) -> None: ...
+
+    def _begin_step(self, control: Tensor | np.ndarray | None) -> None:
+        """Take controls over.
+
+        Raises:
+            SimulationError: If they do not fit, or are the host's and not finite.
+        """
+        self._refuse_if_closed()
+        self._faults.begin_step()
+        if control is None:
+            return
+        ctrl = self.ctrl
+        values = control_tensor(control, self.num_envs, self.model.nu)
+        is_read_here = not (values.is_cuda and ctrl.is_cuda)
+        values = values.to(ctrl.device, ctrl.dtype)
+        if is_read_here and self._faults.on_fault == "raise":
+            refuse_unfinite(values)
+        is_bad = is_unfinite(values)
+        self._faults.note(BAD_CONTROL, is_bad)
+        ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
+
+    def _refuse_if_closed(self) -> None:
+        if self._is_closed:
+            raise SimulationError("this simulation is closed; make another one")
+
+
+_READERS: weakref.WeakKeyDictionary[TactileModule, weakref.ref[Simulation]] = weakref.WeakKeyDictionary()
+"""Which simulation reads a module that has state."""
+
+
+def _reader(touch: TactileModule) -> Simulation | None:
+    found = _READERS.get(touch)
+    return None if found is None else found()
+
+
+def refuse_unfit(touch: TactileModule, num_envs: int, substeps: int, model: mujoco.MjModel | None) -> None:
+    """Refuse what no simulation can do.
+
+    Raises:
+        SimulationError: If there is nothing to step, a model of one's own is given for objects that differ, or the module's
+            state is another simulation's or of other environments.
+    """
+    if num_envs < 1 or substeps < 1:
+        raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
+    if model is not None and touch.inputs.objects:
+        what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
+        raise SimulationError(f"{what}; leave `model` out")
+    if not touch.has_state:
+        return
+    if _reader(touch) is not None:
+        gc.collect()  # a simulation that nobody holds may still hold itself
+    other = _reader(touch)
+    if other is not None:
+        raise SimulationError(
+            f"this module is read by a simulation of {other.num_envs} environments, whose state it holds; `close` that one, or "
+            "give this one a module of its own: tgdsl.compile(...) again, or copy.deepcopy(touch)"
+        )
+    if touch.num_envs not in (None, num_envs):
+        what = f"this module holds the state of {touch.num_envs} environments, and num_envs is {num_envs}"
+        raise SimulationError(f"{what}; touch.free() frees it")
+
+
+def claim(touch: TactileModule, sim: Simulation) -> None:
+    """Note that a simulation reads a module."""
+    if touch.has_state:
+        _READERS[touch] = weakref.ref(sim)

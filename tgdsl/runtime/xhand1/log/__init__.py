@@ -1,0 +1,1 @@
+"""What a hand said, recorded and played again."""

@@ -1,0 +1,284 @@
+"""Logs of the real hand: every reading bit for bit, every failure, what the counts mean and whose they are, as one `.npz` file.
+
+Arrays of the file, readable with `numpy.load`:
+
+- `sequence`, `requested_at`, `received_at` (reading,): number of the exchange, and its times [s] on the clock of
+  `time.monotonic` of the computer that recorded;
+- one array (reading, …) for each attribute of `HandState`, by its name, value for value;
+- `fault_time`, `fault_kind`, `fault_message`, `fault_reading` (fault,): when no reading came, as which error, what that said,
+  and how many readings had come before;
+- `about`: text (JSON) with the format's version, the hand's identity, its calibration's text and the time of day at the start.
+
+Shapes: `reading` the readings, `fault` the failures; others as in `payloads`.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from tgdsl.errors import TgdslError
+from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
+from tgdsl.runtime.xhand1.identity import HandIdentity
+from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.wire import errors
+from tgdsl.runtime.xhand1.wire.errors import HandError
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, NUM_JOINTS, NUM_TAXELS, HandState
+
+FORMAT = 1
+RECORD = np.dtype(
+    [
+        ("sequence", "<i8"),
+        ("requested_at", "<f8"),
+        ("received_at", "<f8"),
+        ("joint_id", "u1", (NUM_JOINTS,)),
+        ("sensor_id", "u1", (NUM_JOINTS,)),
+        ("position", "<f4", (NUM_JOINTS,)),
+        ("current", "<u2", (NUM_JOINTS,)),
+        ("raw_position", "<u2", (NUM_JOINTS,)),
+        ("joint_temperature", "<u2", (NUM_JOINTS,)),
+        ("joint_error", "<u2", (NUM_JOINTS, 3)),
+        ("reserved", "<u2", (NUM_JOINTS, 3)),
+        ("total_force", "<i2", (len(FINGERS), 3)),
+        ("taxel_force", "<i2", (len(FINGERS), NUM_TAXELS, 3)),
+        ("taxel_temperature", "u1", (len(FINGERS), 20)),
+        ("total_temperature", "u1", (len(FINGERS),)),
+    ]
+)
+"""One reading: the arrays of a log, row by row."""
+TIMES = ("sequence", "requested_at", "received_at")
+STATE = tuple(name for name in RECORD.names or () if name not in TIMES)
+CHUNK = 256
+"""Readings that are in memory at a time: 1 MB of them."""
+_DAMAGE = (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zlib.error, zipfile.BadZipFile, struct.error)
+"""What a damaged archive raises, of all kinds."""
+
+
+class LogError(TgdslError):
+    """A log that cannot be read or written: damaged, cut, of another format, or holding nothing."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A failure: when no reading came, and why.
+
+    Attributes:
+        time: When it was noticed, on the clock of the readings [s].
+        kind: Name of the error's class.
+        message: What it said.
+    """
+
+    time: float
+    kind: str
+    message: str
+
+    @classmethod
+    def of(cls, error: HandError, time: float) -> Fault:
+        """Return that of an error."""
+        return cls(time, type(error).__name__, str(error))
+
+    def error(self) -> HandError:
+        """Return the error as it was; of a class that is not known here, as its base."""
+        kind = getattr(errors, self.kind, None)
+        if isinstance(kind, type) and issubclass(kind, HandError):
+            return kind(self.message)
+        return HandError(f"{self.kind}: {self.message}")
+
+
+@dataclass(frozen=True, eq=False)
+class HandLog:
+    """A log that was checked from end to end. Times and failures are in memory; readings are read from the file on demand.
+
+    Attributes:
+        path: The file.
+        identity: The hand; None if it was not asked.
+        calibration: What its counts meant when it was recorded; None if nothing was known.
+        started_at: Time of day at the start [s since 1970], for people.
+        sequence: Number of the exchange of each reading.
+        requested_at: When each was asked for [s].
+        received_at: When each was here [s].
+        faults: The failures, in order.
+        fault_reading: How many readings had come before each.
+    """
+
+    path: Path
+    identity: HandIdentity | None
+    calibration: Calibration | None
+    started_at: float
+    sequence: Int[np.ndarray, " reading"]
+    requested_at: Float[np.ndarray, " reading"]
+    received_at: Float[np.ndarray, " reading"]
+    faults: tuple[Fault, ...] = field(repr=False)
+    fault_reading: Int[np.ndarray, " fault"]
+
+    @property
+    def num_readings(self) -> int:
+        """Number of readings."""
+        return len(self.sequence)
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first reading to the last reading or failure [s]."""
+        return max([float(self.received_at[-1]), *(fault.time for fault in self.faults)]) - float(self.received_at[0])
+
+    def column(self, name: str) -> np.ndarray:
+        """Return one array of the file, all readings at once: `total_force` (reading, finger, 3) and so on.
+
+        Raises:
+            LogError: If the file has gone, or changed.
+        """
+        try:
+            with zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
+                return np.lib.format.read_array(member, allow_pickle=False)
+        except _DAMAGE as error:
+            raise _damaged(self.path, error) from error
+
+    def readings(self, start: int = 0) -> Iterator[Reading]:
+        """Yield the readings in order, as they were; `CHUNK` of them are in memory at a time.
+
+        Args:
+            start: Index of the first one.
+
+        Raises:
+            LogError: If the file has gone, or changed.
+        """
+        with ExitStack() as stack:
+            try:
+                archive = stack.enter_context(zipfile.ZipFile(self.path))
+                members = {name: stack.enter_context(archive.open(f"{name}.npy")) for name in STATE}
+                for name, member in members.items():
+                    _read_header(member, name)
+                    _skip(member, start * RECORD[name].itemsize)
+            except _DAMAGE as error:
+                raise _damaged(self.path, error) from error
+            for first in range(start, self.num_readings, CHUNK):
+                last = min(first + CHUNK, self.num_readings)
+                try:
+                    chunk = {name: _rows(member, name, last - first) for name, member in members.items()}
+                except _DAMAGE as error:
+                    raise _damaged(self.path, error) from error
+                for i in range(first, last):
+                    state = HandState(**{name: rows[i - first] for name, rows in chunk.items()})
+                    times = float(self.requested_at[i]), float(self.received_at[i])
+                    yield Reading(int(self.sequence[i]), *times, state)
+
+
+def open_log(path: str | Path) -> HandLog:
+    """Read a log's times and failures, and check every byte of it.
+
+    Raises:
+        LogError: If it cannot be read, is no log, is damaged or cut, of another format, or holds no reading.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if "about.npy" not in archive.namelist():
+                raise LogError(f"{path}: no log of `tgdsl hand record`: this .npz file has no array `about`")
+            if (damaged := archive.testzip()) is not None:
+                raise LogError(f"{path}: this log is damaged: its array {damaged.removesuffix('.npy')} is not what was written")
+            about = json.loads(str(_array(archive, "about")))
+            if about["format"] != FORMAT:
+                raise LogError(f"{path}: a log of format {about['format']}, this version of tgdsl reads format {FORMAT}")
+            log = _log(path, archive, about)
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+    _check(log)
+    return log
+
+
+def _log(path: Path, archive: zipfile.ZipFile, about: dict[str, Any]) -> HandLog:
+    sequence, requested_at, received_at = (_array(archive, name) for name in TIMES)
+    for name in RECORD.names or ():
+        with archive.open(f"{name}.npy") as member:
+            num_rows = _read_header(member, name)
+        if num_rows != len(sequence):
+            raise LogError(f"{path}: this log is damaged: {num_rows} rows in {name}, but {len(sequence)} in sequence")
+    times, kinds, messages, places = (_array(archive, f"fault_{name}") for name in ("time", "kind", "message", "reading"))
+    told = zip(times, kinds, messages, strict=True)
+    faults = tuple(Fault(float(time), str(kind), str(message)) for time, kind, message in told)
+    identity, started_at = _identity(about["hand"]), float(about["started_at"])
+    if places.shape != times.shape or places.dtype != np.dtype("<i8"):
+        raise ValueError(f"fault_reading is {places.dtype} of shape {places.shape}, expected int64 of shape {times.shape}")
+    calibration = _calibration(about)
+    return HandLog(path, identity, calibration, started_at, sequence, requested_at, received_at, faults, places)
+
+
+def _check(log: HandLog) -> None:
+    """Raise a `LogError` unless times go forward."""
+    if not log.num_readings:
+        raise LogError(f"{log.path}: this log holds no reading")
+    rises = all((np.diff(values) >= 0).all() for values in (log.requested_at, log.received_at))
+    rises = rises and bool((np.diff(log.sequence) > 0).all())
+    is_causal = np.isfinite(log.received_at).all() and (log.requested_at <= log.received_at).all()
+    times, places = [fault.time for fault in log.faults], [0, *log.fault_reading, log.num_readings]
+    is_ordered = (np.diff(times) >= 0).all() and (np.diff(places) >= 0).all()
+    if not rises or not is_causal or not is_ordered:
+        raise LogError(f"{log.path}: this log is damaged: its times do not go forward")
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    with archive.open(f"{name}.npy") as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _read_header(member: Any, name: str) -> int:
+    """Read an array's header; return its number of rows.
+
+    Raises:
+        ValueError: If it is not that of a log's array of this name.
+    """
+    version = np.lib.format.read_magic(member)
+    if version != (1, 0):
+        raise ValueError(f"{name} is an array of version {version}, expected (1, 0)")
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(member)
+    base, row = RECORD[name].base, RECORD[name].shape
+    if is_fortran or dtype != base or not shape or shape[1:] != row:
+        raise ValueError(f"{name} is {dtype} of shape {shape}, expected {base} of shape (reading, {str(row)[1:]}")
+    return shape[0]
+
+
+def _rows(member: Any, name: str, num_rows: int) -> np.ndarray:
+    data = member.read(num_rows * RECORD[name].itemsize)
+    return np.frombuffer(data, RECORD[name].base).reshape(num_rows, *RECORD[name].shape)
+
+
+def _skip(member: Any, num_bytes: int) -> None:
+    while num_bytes > 0 and (data := member.read(min(num_bytes, 1 << 20))):
+        num_bytes -= len(data)
+
+
+def _identity(told: dict[str, Any] | None) -> HandIdentity | None:
+    if told is None:
+        return None
+    as_bytes = {name: None if told[name] is None else bytes.fromhex(told[name]) for name in IDENTITY_BYTES}
+    return HandIdentity(str(told["device"]), int(told["hand_id"]), **as_bytes)  # type: ignore[arg-type]
+
+
+IDENTITY_BYTES = ("version", "side", "serial_number", "name")
+"""Attributes of `HandIdentity` that are bytes, and hexadecimal text in a log."""
+
+
+def _calibration(about: dict[str, Any]) -> Calibration | None:
+    if about["calibration"] is None:
+        return None
+    with tempfile.TemporaryDirectory(prefix="tgdsl-") as folder:
+        file = Path(folder) / "calibration.yaml"
+        file.write_text(about["calibration"], encoding="utf-8")
+        return load_calibration(file)
+
+
+def _damaged(path: Path, error: BaseException) -> LogError:
+    if isinstance(error, FileNotFoundError | IsADirectoryError | PermissionError):
+        return LogError(f"{path}: cannot read this log: {error.strerror}")
+    return LogError(f"{path}: this log is damaged, cut, or no .npz file: {error}")

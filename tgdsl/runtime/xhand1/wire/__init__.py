@@ -1,0 +1,1 @@
+"""The XHand1's serial line: bytes, frames, replies, ports."""

@@ -1,0 +1,268 @@
+"""One request and its reply on the serial line, with all that can come between.
+
+Replies carry no number that says which request they answer. So that an old one is never taken for a new one:
+
+- a request goes out only on a silent line, and the last reply before the line falls silent again counts, if no damaged one
+  follows;
+- a reply that is complete before the wire could have carried it is not this request's;
+- after a failure the hand is asked for its version: the answer can only follow what was still on its way.
+
+A hand that does not answer version requests (their reply is *unverified*) must be silent for `settle_s` instead. What is then
+left: a reply that comes later than `reply_timeout_s + settle_s`, and apart from the next one, is taken for the next one. And
+for all hands: one that is repeated after a silence, just when the next one would come, if that is lost.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from tgdsl.runtime.xhand1.wire.errors import (
+    HandAddressError,
+    HandChecksumError,
+    HandDisconnectedError,
+    HandError,
+    HandRefusedError,
+    HandTimeoutError,
+)
+from tgdsl.runtime.xhand1.wire.parser import FrameParser
+from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, encode_frame, hand_address
+from tgdsl.runtime.xhand1.wire.replies import Addresses, Reply, Waiting
+from tgdsl.runtime.xhand1.wire.serial_port import BAUD, Port
+
+_CLOCK_TOLERANCE = 0.97
+"""Part of the nominal time that a UART with a fast clock may take for a frame."""
+
+_VERSION_TRIES = 3
+_BABBLE = "the line does not fall silent: something else is sending on it"
+
+
+@dataclass(frozen=True)
+class LinkTiming:
+    """Times of the line.
+
+    Attributes:
+        baud: Bits per second; 10 bits carry one byte.
+        reply_timeout_s: How long a reply may take to be complete [s].
+        silence_s: Silence after which a reply that has begun will not go on [s]. FTDI adapters pause for up to 16 ms.
+        settle_s: Silence that is asked for after a failure [s]: if the hand tells its version, since the last byte.
+        quiet_s: Silence that ends a good reply [s].
+        checks_wire_time: Whether a reply that is complete sooner than the baud rate allows is refused as that of an earlier
+            request. Turn it off for a line that is faster than it says.
+    """
+
+    baud: int = BAUD
+    reply_timeout_s: float = 0.03
+    silence_s: float = 0.018
+    settle_s: float = 0.018
+    quiet_s: float = 0.0005
+    checks_wire_time: bool = True
+
+
+@dataclass
+class LinkCounters:
+    """What happened on the line so far.
+
+    Attributes:
+        num_requests: Requests sent.
+        num_replies: Requests that were answered.
+        num_timeouts: Requests without an answer.
+        num_damaged: Requests with a damaged answer.
+        num_foreign: Frames from or to other addresses.
+        num_unexpected: Replies that were not asked for: repeated, early, or to another command.
+        num_discarded_bytes: Bytes that belonged to no frame, or that came when nothing was asked.
+    """
+
+    num_requests: int = 0
+    num_replies: int = 0
+    num_timeouts: int = 0
+    num_damaged: int = 0
+    num_foreign: int = 0
+    num_unexpected: int = 0
+    num_discarded_bytes: int = 0
+
+
+class Link:
+    """A port on which one hand answers, one request at a time. Not for use by two threads."""
+
+    def __init__(
+        self,
+        port: Port,
+        addresses: Addresses | None,
+        timing: LinkTiming,
+        counters: LinkCounters | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Take over an open port.
+
+        Args:
+            port: The port.
+            addresses: The hand's; None accepts replies from and to any address but those of the host's own requests.
+            timing: Times of the line.
+            counters: Where to count; default: anew.
+            clock: Seconds that only go forward.
+        """
+        self.port = port
+        self.timing = timing
+        self.counters = LinkCounters() if counters is None else counters
+        self._addresses = addresses
+        self._clock = clock
+        self._parser = FrameParser()
+        self._is_suspect = True
+        self._silent_since = clock()
+        self._tells_version: bool | None = None if addresses else False
+
+    def exchange(self, command: Command, payload: bytes = b"", reply_size: int | None = None, hand_id: int = 0) -> Reply:
+        """Send a request and return its reply.
+
+        Args:
+            command: What is asked.
+            payload: The request's bytes.
+            reply_size: Length of the reply's payload, if it is known.
+            hand_id: Whom to ask where the link has no addresses.
+
+        Raises:
+            HandTimeoutError: If no reply came in time, or the line does not fall silent.
+            HandChecksumError: If bytes came, but no sound reply.
+            HandAddressError: If only others replied.
+            HandRefusedError: If the hand replied with its error command.
+            HandDisconnectedError: If the port went away.
+        """
+        self._await_silence()
+        if self._is_suspect and self._tells_version is not False:
+            self._synchronise()
+        return self._ask(command, payload, reply_size, hand_id)
+
+    def post(self, command: Command, payload: bytes) -> None:
+        """Send a request at once and wait for nothing; its reply is discarded by the next exchange.
+
+        Raises:
+            HandDisconnectedError: If the port went away.
+        """
+        hand_id = 0 if self._addresses is None else self._addresses.hand_id
+        self._is_suspect = True
+        self._silent_since = self._clock()
+        self.counters.num_requests += 1
+        self.port.write(encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload)))
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self.port.close()
+
+    def _ask(self, command: Command, payload: bytes, reply_size: int | None, hand_id: int) -> Reply:
+        hand_id = hand_id if self._addresses is None else self._addresses.hand_id
+        request = encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload))
+        self._is_suspect = True
+        self.counters.num_requests += 1
+        waiting = Waiting(command, reply_size, self._addresses, self._wire_time(request, reply_size), self._clock())
+        self.port.write(request)
+        self._listen(waiting)
+        if waiting.reply is None:
+            raise self._failure(waiting)
+        self._is_suspect = False
+        self.counters.num_replies += 1
+        return waiting.reply
+
+    def _synchronise(self) -> None:
+        """Ask for the version, so that what is still on its way comes before the answer; learn at first whether there is one.
+
+        Raises:
+            HandError: If there was one before, and is none now.
+        """
+        for left in range(1 if self._tells_version else _VERSION_TRIES, 0, -1):
+            try:
+                self._ask(Command.VERSION, b"", None, 0)
+            except HandDisconnectedError:
+                raise
+            except HandError:
+                if left == 1 and self._tells_version:
+                    raise
+                self._await_silence()
+            else:
+                self._tells_version = True
+                return
+        self._tells_version = False
+
+    def _wire_time(self, request: bytes, reply_size: int | None) -> float:
+        if not self.timing.checks_wire_time:
+            return 0.0
+        num_bytes = len(request) + OVERHEAD + (reply_size or 0)
+        return _CLOCK_TOLERANCE * 10 * num_bytes / self.timing.baud
+
+    def _await_silence(self) -> None:
+        """Wait until the line is silent, if it may not be.
+
+        Raises:
+            HandTimeoutError: If it does not fall silent.
+        """
+        if not self._is_suspect and not self.port.pending():
+            return
+        self._is_suspect = True
+        give_up_at = self._clock() + self.timing.reply_timeout_s + self.timing.settle_s
+        while self._clock() - self._silent_since < self.timing.settle_s or self.port.pending():
+            if data := self.port.read():
+                self._silent_since = self._clock()
+                self.counters.num_discarded_bytes += len(data)
+            if self._clock() > give_up_at:
+                raise HandTimeoutError(_BABBLE)
+        self._parser = FrameParser()
+
+    def _listen(self, waiting: Waiting) -> None:
+        """Collect what comes until a reply has come and the line is silent, or nothing more is to be expected."""
+        timing, parser = self.timing, self._parser
+        give_up_at = waiting.requested_at + timing.reply_timeout_s
+        last_byte_at = waiting.requested_at
+        discarded = parser.num_discarded
+        while True:
+            data = self.port.read()
+            now = self._clock()
+            if data:
+                last_byte_at = now
+                waiting.sort(parser.feed(data), now)
+            is_damaged = bool(parser.num_buffered) or parser.num_discarded > discarded
+            is_answered = waiting.reply is not None and not parser.num_buffered
+            if (is_answered and now - last_byte_at >= timing.quiet_s) or (
+                is_damaged and now - last_byte_at >= timing.silence_s
+            ):
+                break
+            if now >= give_up_at and waiting.reply is None:
+                waiting.num_incomplete = parser.num_buffered
+                break
+            if now >= give_up_at + timing.settle_s:
+                waiting.reply, waiting.is_babble = None, True
+                break
+        waiting.sort(parser.flush(), last_byte_at)
+        if parser.num_trailing >= OVERHEAD:  # less is a glitch, as when a driver lets go of the bus
+            waiting.reply = None
+        waiting.num_damaged = parser.num_discarded - discarded
+        self._silent_since = last_byte_at if waiting.num_damaged or self._tells_version else self._clock()
+        self.counters.num_discarded_bytes += waiting.num_damaged
+        self.counters.num_foreign += waiting.num_foreign
+        self.counters.num_unexpected += waiting.num_unexpected
+
+    def _failure(self, waiting: Waiting) -> HandError:
+        what = f"command {waiting.command:#04x} ({waiting.command.name.lower()})"
+        if waiting.refusal is not None:
+            return HandRefusedError(f"the hand refused {what}; its error reply holds {waiting.refusal.hex(' ') or 'nothing'}")
+        if waiting.is_babble:
+            return HandTimeoutError(_BABBLE)
+        if waiting.num_damaged > waiting.num_incomplete:
+            self.counters.num_damaged += 1
+            return HandChecksumError(f"the reply to {what} came damaged: {waiting.num_damaged} bytes are in no sound frame")
+        self.counters.num_timeouts += 1
+        if waiting.foreign is not None and self._addresses is not None:
+            expected = "from {:#04x} to {:#04x}".format(*self._addresses.reply)
+            found = f"from {waiting.foreign.source:#04x} to {waiting.foreign.destination:#04x}"
+            return HandAddressError(f"a reply came {found}, expected {expected}; if it is this hand's, set its reply addresses")
+        if waiting.is_early:
+            took = f"sooner than {self.timing.baud} baud allow"
+            return HandTimeoutError(f"a reply to {what} came {took}: an earlier one's, or set checks_wire_time=False")
+        if waiting.wrong_size is not None:
+            return HandTimeoutError(f"the reply to {what} has {waiting.wrong_size} bytes, expected {waiting.reply_size}")
+        if waiting.num_incomplete:
+            within = f"{1e3 * self.timing.reply_timeout_s:.0f} ms"
+            return HandTimeoutError(
+                f"the reply to {what} was not complete within {within}: {waiting.num_incomplete} bytes had come"
+            )
+        return HandTimeoutError(f"no reply to {what} within {1e3 * self.timing.reply_timeout_s:.0f} ms")

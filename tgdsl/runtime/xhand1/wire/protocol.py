@@ -1,0 +1,109 @@
+"""The XHand1's serial protocol: frames and checksum, as pure functions; `payloads` says what they carry.
+
+A frame is `55 AA | source | destination | command | length u16 | payload | crc u16`, all little-endian; the checksum is
+CRC-16/XMODEM over all that stands before it. Source: the facts that a republished vendor header, a PNDbotics wiki and an open
+driver tested on hardware agree on. What they leave open, and what is therefore our assumption, is marked *unverified* below:
+the payloads of every command but the exchange, and the addresses in replies.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from tgdsl.runtime.xhand1.wire.errors import ProtocolError
+
+HEADER = b"\x55\xaa"
+HOST_ADDRESS = 0xFE
+HAND_ADDRESS = 0x80
+"""A hand's address is this with its id in the low seven bits."""
+HEAD_SIZE = 7
+OVERHEAD = HEAD_SIZE + 2
+MAX_PAYLOAD = 8224
+MAX_FRAME = MAX_PAYLOAD + OVERHEAD
+
+FIRMWARE_COMMANDS = frozenset({0xA1, 0xA2, 0xA3, 0xA4, 0xB0})
+"""Commands that write firmware: they are never sent."""
+
+
+class Command(IntEnum):
+    """Commands by name."""
+
+    ERROR = 0x00
+    EXCHANGE = 0x02
+    READ_PARAMETERS = 0x03
+    WRITE_PARAMETERS = 0x04
+    SAVE = 0x05
+    READ_LOOP_PARAMETERS = 0x06
+    WRITE_LOOP_PARAMETERS = 0x07
+    SET_MODE = 0x08
+    READ_MODE = 0x09
+    QUERY_PRESSURE = 0x11
+    CLEAR_PRESSURE = 0x12
+    VERSION = 0x13
+    RESET = 0x14
+    READ_REGISTER = 0x15
+    WRITE_REGISTER = 0x16
+    CALIBRATE = 0x17
+
+
+class Register(IntEnum):
+    """Registers that say which hand it is."""
+
+    SIDE = 20
+    SERIAL_NUMBER = 21
+    HAND_ID = 53
+    NAME = 54
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame, without header, length and checksum.
+
+    Attributes:
+        source: Address of who sent it.
+        destination: Address of whom it is for.
+        command: What it asks or answers: a `Command`, or a number that has no name here.
+        payload: Its bytes, at most `MAX_PAYLOAD`.
+    """
+
+    source: int
+    destination: int
+    command: int
+    payload: bytes = b""
+
+
+def hand_address(hand_id: int) -> int:
+    """Return the address of a hand.
+
+    Raises:
+        ProtocolError: If the id does not fit seven bits.
+    """
+    if not 0 <= hand_id < 0x80:
+        raise ProtocolError(f"hand id {hand_id}: expected 0 to 127")
+    return HAND_ADDRESS | hand_id
+
+
+def crc16(data: bytes | bytearray | memoryview) -> int:
+    """Return CRC-16/XMODEM: polynomial 0x1021, start 0, not reflected, no final exclusive or."""
+    return binascii.crc_hqx(data, 0)
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """Return a frame's bytes.
+
+    Raises:
+        ProtocolError: If a number does not fit a byte, the payload is too long, or the command writes firmware.
+    """
+    for name, value in (("source", frame.source), ("destination", frame.destination), ("command", frame.command)):
+        if not 0 <= value <= 0xFF:
+            raise ProtocolError(f"{name} is {value}, expected 0 to 255")
+    if len(frame.payload) > MAX_PAYLOAD:
+        raise ProtocolError(f"the payload has {len(frame.payload)} bytes, expected at most {MAX_PAYLOAD}")
+    if frame.command in FIRMWARE_COMMANDS:
+        raise ProtocolError(f"command {frame.command:#04x} writes firmware; it is never sent")
+    head = struct.pack("<2sBBBH", HEADER, frame.source, frame.destination, frame.command, len(frame.payload))
+    body = head + frame.payload
+    return body + struct.pack("<H", crc16(body))

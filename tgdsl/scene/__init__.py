@@ -1,0 +1,1 @@
+"""Scenes as an artefact carries them."""

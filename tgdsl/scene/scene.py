@@ -1,0 +1,277 @@
+"""Scenes as an artefact carries them, compiled by MuJoCo: what both the compiler and the simulators need of it."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from tgdsl.errors import ArtifactError, RobotError
+from tgdsl.files.files import robots_folder
+from tgdsl.plan.plan import Asset, SceneFile, SceneGeom, SceneObject
+from tgdsl.scene.places import ROBOTS, located
+
+INHERITED = (
+    *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
+    *("group", "rgba", "material"),
+)
+"""What a variant's geoms have of the body's first geom."""
+_STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+OFF_CENTER = 2e-6
+"""Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
+
+
+@contextmanager
+def muted_mujoco() -> Iterator[None]:
+    """Turn what MuJoCo would print and log while it reads a model into Python warnings.
+
+    One is left out: a robot attached under its own names, with no prefix, is just what a scene of ours wants, and scenes are
+    never saved by MuJoCo, which is what it warns of.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: warnings.warn(f"MuJoCo: {message}", stacklevel=2))
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*Attaching a spec with an empty prefix")
+            yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
+    """Compile a scene whose assets' contents are at hand, its objects as the scene's own text has them."""
+    with muted_mujoco():
+        return _spec(scene, assets).compile()
+
+
+def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
+    parts = {name: text.encode() for name, text in scene.parts.items()}
+    return mujoco.MjSpec.from_string(
+        scene.mjcf, include=parts, assets={key: readable(key, content) for key, content in assets.items()}
+    )
+
+
+def readable(name: str, content: bytes) -> bytes:
+    """Return a file as MuJoCo reads it: an STL file that is text in binary, any other as it is."""
+    if Path(name).suffix.lower() != ".stl" or content.lstrip()[:5].lower() != b"solid":
+        return content
+    if len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        return content  # binary, whatever its header says
+    try:
+        corners = np.array(_STL_VERTEX.findall(content)).astype(np.float32).reshape(-1, 3, 3)
+    except ValueError:
+        return content  # MuJoCo will name it
+    triangles = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
+    triangles["corners"] = corners
+    return bytes(80) + len(corners).to_bytes(4, "little") + triangles.tobytes() if len(corners) else content
+
+
+def scene_model(scene: SceneFile) -> mujoco.MjModel:
+    """Return the compiled model of a scene, its assets read from where they were found; objects have their first variant.
+
+    Raises:
+        ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
+    """
+    return SceneModels(scene).model({})
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What an object is like in one environment.
+
+    Attributes:
+        variant: Which of its variants it has.
+        size: Its size as MuJoCo defines it [m]; None: as the scene or the variant says.
+    """
+
+    variant: int = 0
+    size: tuple[float, float, float] | None = None
+
+
+def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: Mapping[str, Choice]) -> mujoco.MjSpec:
+    """Give objects the geoms of one variant each: the spec is changed in place and returned.
+
+    Bodies that are welded to an object's body lose theirs. Whatever is chosen, the same geoms and meshes are there, so that
+    MuJoCo lays its data out alike: those that a variant lacks weigh nothing, are not seen, and collide only with what has a bit
+    of `conaffinity` that nothing has. A custom number of each geom's says whether it is lacking: its looks, which are the
+    template's, do not.
+
+    Args:
+        spec: The scene.
+        objects: The objects.
+        choices: What each is like, by its name; default: its first variant.
+    """
+    for target in objects:
+        choice = choices.get(target.name, Choice())
+        body = spec.body(target.body)
+        if target.types:
+            template = body.geoms[0]
+            for i in range(len(target.types)):
+                _add_geom(spec, target, i, choice.variant, template)
+            for geom in (*body.geoms[: -len(target.types)], *_welded_geoms(body, target.others)):
+                spec.delete(geom)
+        if choice.size is not None:
+            body.geoms[_sized_geom(target, choice.variant)].size = choice.size
+    return spec
+
+
+def _welded_geoms(body: mujoco.MjsBody, others: Sequence[str]) -> list[mujoco.MjsGeom]:
+    """Return the geoms of the bodies below one that have no joint, and are not others."""
+    below = [child for child in body.bodies if not child.joints and child.name not in others]
+    return [geom for child in below for geom in (*child.geoms, *_welded_geoms(child, others))]
+
+
+def _sized_geom(target: SceneObject, variant: int) -> int:
+    """Return which of its body's geoms an object is whose size is chosen."""
+    return next(i for i, geom in enumerate(target.variants[variant]) if geom is not None) if target.types else 0
+
+
+def geom_name(target: SceneObject, i: int) -> str:
+    """Return the name that geom i of an object has in the scene."""
+    return f"tgdsl/{target.name}/{i}"
+
+
+def is_absent(model: mujoco.MjModel, geom: int) -> bool:
+    """Return whether a geom is one that its object lacks in this model: see `with_choices`."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, _absence(model.geom(geom).name))
+    return number >= 0 and bool(model.numeric_data[model.numeric_adr[number]])
+
+
+def _absence(name: str) -> str:
+    """Return the name of the custom number that says whether a geom is lacking."""
+    return f"{name}/is_absent"
+
+
+def _free_bit(spec: mujoco.MjSpec) -> int:
+    """Return a bit that no geom collides with."""
+    used = int(np.bitwise_or.reduce([int(geom.conaffinity) for geom in spec.geoms]))
+    free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
+    if free is None:
+        raise RobotError("the scene's geoms use all bits of `conaffinity`; objects that vary need a free one")
+    return free
+
+
+def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom) -> None:
+    """Add geom i of an object to its body as one variant has it, and the meshes that it has in any."""
+    meshes = {}
+    for v, geoms in enumerate(target.variants):
+        own = geoms[i]
+        if own is not None and own.mesh:
+            meshes[v] = f"tgdsl/{target.name}/{v}/{i}"
+            spec.add_mesh(name=meshes[v], file=own.mesh, scale=[own.scale] * 3)
+    chosen = target.variants[variant][i]
+    like = chosen or next(geoms[i] for geoms in target.variants if geoms[i] is not None)
+    assert isinstance(like, SceneGeom)
+    geom = spec.body(target.body).add_geom(
+        name=geom_name(target, i),
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{target.types[i].upper()}"),
+        size=[*like.size, 0.0, 0.0, 0.0][:3],
+        pos=like.pos,
+        quat=like.quat,
+        density=like.density,
+    )
+    if meshes:
+        geom.meshname = meshes.get(variant, next(iter(meshes.values())))
+    for name in INHERITED:
+        setattr(geom, name, getattr(template, name))
+    spec.add_numeric(name=_absence(geom.name), data=[float(chosen is None)])
+    if chosen is None:
+        geom.contype, geom.conaffinity = _free_bit(spec), 0
+        geom.mass, geom.density = 0.0, 0.0
+        geom.rgba = [0.0, 0.0, 0.0, 0.0]
+        geom.material = ""
+
+
+class SceneModels:
+    """The models of a scene whose objects differ between environments, all of one layout, each compiled once while in use."""
+
+    def __init__(self, scene: SceneFile):
+        """Read the assets.
+
+        Raises:
+            ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
+        """
+        self.objects = {target.name: target for target in scene.objects}
+        with muted_mujoco():
+            self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
+        self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}
+        self._off_center: tuple[str, ...] = ()
+        for target in scene.objects:
+            own = [self.model({target.name: Choice(v)}) for v in range(len(target.variants))]
+            # MuJoCo stores less of a body whose centre of mass is its origin.
+            if len({(model.nC, model.nM, model.nD, model.nB) for model in own}) > 1:
+                self._off_center += (target.body,)
+        if self._off_center:
+            self._models.clear()
+
+    def model(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
+        """Return the scene with some choices of objects; the others have their first variant.
+
+        Raises:
+            RobotError: If MuJoCo cannot compile it.
+        """
+        key = tuple(choices.get(name, Choice()) for name in self.objects)
+        if key not in self._models:
+            try:
+                with muted_mujoco():
+                    self._models[key] = self._compiled(choices)
+            except ValueError as error:
+                raise RobotError(f"MuJoCo cannot compile the scene with {dict(choices)}: {error}") from error
+        return self._models[key]
+
+    def models(self, choices: Sequence[Mapping[str, Choice]]) -> list[mujoco.MjModel]:
+        """Return the model of each environment, and forget those that none has: sizes drawn anew would pile up."""
+        found = [self.model(own) for own in choices]
+        used = {id(model) for model in found}
+        self._models = {key: model for key, model in self._models.items() if id(model) in used}
+        return found
+
+    def size(self, name: str, choice: Choice) -> tuple[float, float, float]:
+        """Return the size of an object whose size may be chosen, as MuJoCo defines it [m]."""
+        if choice.size is not None:
+            return choice.size
+        target, model = self.objects[name], self.model({name: choice})
+        x, y, z = model.geom_size[model.body(target.body).geomadr[0] + _sized_geom(target, choice.variant)]
+        return float(x), float(y), float(z)
+
+    def type(self, name: str, variant: int) -> str:
+        """Return MuJoCo's name of the type of a variant of an object whose size may be chosen."""
+        target, model = self.objects[name], self.model({name: Choice(variant)})
+        kind = model.geom_type[model.body(target.body).geomadr[0] + _sized_geom(target, variant)]
+        return mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+
+    def _compiled(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
+        spec = with_choices(self._base.copy(), list(self.objects.values()), choices)
+        model = spec.compile()
+        for name in self._off_center:
+            body, id = spec.body(name), model.body(name).id
+            body.explicitinertial = True
+            body.mass, body.inertia = model.body_mass[id], model.body_inertia[id]
+            body.iquat, body.ipos = model.body_iquat[id], model.body_ipos[id] + np.array([OFF_CENTER, 0, 0])
+        return spec.compile() if self._off_center else model
+
+
+def _content(asset: Asset) -> bytes:
+    path = asset.path
+    try:
+        path = located(asset, robots_folder())
+        content = path.read_bytes()
+    except OSError as error:
+        place = error.filename or path
+        raise ArtifactError(f"asset {place} of the scene cannot be read: {error.strerror}; compile again") from error
+    if hashlib.sha256(content).hexdigest() != asset.sha256:
+        raise ArtifactError(f"asset {path} has changed since the scene was compiled; compile again")
+    return content
+
+
+def portable(path: Path) -> str:
+    """Return a path as an artefact keeps it: `robots:` and the rest for a robot that comes with tgdsl, else absolute."""
+    folder, path = robots_folder().resolve(), path.resolve()
+    return f"{ROBOTS}{path.relative_to(folder).as_posix()}" if path.is_relative_to(folder) else path.as_posix()

@@ -1,0 +1,348 @@
+"""Footprint: which share of a contact's force each taxel near it carries.
+
+A solver knows a contact as a point x_c with force f_c and torque τ_c; a skin has taxels around that point. The shares are
+
+    κ_cj = b_cj max(0, 1 − |x_j − x_c|²/r_f²),   b_cj = −2 n_j · m_c between 0 and 1
+    w_cj = (d_j/R_j + 10⁻³) κ_cj²,   λ⁰_cj = w_cj / Σ_j w_cj
+    λ_cj ∝ λ⁰_cj exp(β · g_cj),   g_cj = (x_j − x_c) × f̂_c / r_f,   Σ_j λ_cj = 1
+    γ_c = t² (3 − 2t),   t = max_j κ_cj / (3/4) up to 1
+
+d_j depth and R_j radius of the probe, n_j its outward normal, m_c the contact's normal out of the object, r_f the footprint's
+radius [m], f̂_c the force's direction. b_cj says whether the contact is on the taxel's side of the body: wholly where it
+presses within 60° of straight in, not at all from 90° on, as on the back of a finger. γ_c is the fraction of the contact's
+force that the skin captures: of a contact on an active taxel's side all up to half a footprint from that, nothing from a whole
+one. Both fade continuously. β is one vector per body. Of all shares it picks those with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c =
+Σ_c γ_c τ_c and the least relative entropy to λ⁰, contacts weighted by γ_c |f_c|: they never become negative, and a contact that
+is split in two of the same place and direction counts as the one. To first order β is the λ⁰-weighted least-norm correction.
+It is found by Newton's method on the convex dual in a fixed number of steps: with H the mean covariance of g and e the excess
+moment, both over Σ_c γ_c |f_c|,
+
+    s = (H + ε)⁻¹ H (H + ε)⁻¹ e,   β ← β − s / √(1 + s · H s + s · s / 10)
+
+which goes nowhere in directions in which no shares make a moment, as along the row where taxels stand in one, and is damped by
+what it would do to the shares. Where no shares have the moment (the contact lies outside the hull of the taxels that it covers)
+those on its side take more and more of it, and what is left is reported.
+
+Source: the maximum-entropy shape functions of Arroyo & Ortiz, *Int. J. Numer. Meth. Engng* 65 (2006), which meet a moment with
+non-negative shares in the same manner; the footprint as their prior and the moment of a force for that of a place are ours.
+
+Shapes: `*body` bodies, such as (env, body) or (env,); `contact` contacts of a body, `taxel` taxels of that body, both in the
+frame of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.tensors.fusion import takes_kernel
+
+LEVENBERG = 1e-3
+"""Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
+FAR = 1e3
+"""Where inactive taxels are for a kernel that does not know of them [m]: beyond all contacts' reach."""
+
+
+def unreached() -> float:
+    """Return the weight of a taxel that the object does not reach [probe's radius of depth]: someone must carry the load."""
+    return 1e-3
+
+
+def damping() -> float:
+    """Return what a step of β counts beside its effect on the shares [1].
+
+    It bounds steps where taxels of hardly any share decide.
+    """
+    return 0.1
+
+
+def log2_e() -> float:
+    """Return log₂ e."""
+    return 1.4426950408889634
+
+
+def no_force() -> float:
+    """Return the force [N] below which a direction fades to zero."""
+    return 1e-12
+
+
+class Footprint(NamedTuple):
+    """How one body's contacts are shared out.
+
+    Attributes:
+        share: γ_c λ_cj, fraction of each contact's force on each taxel.
+        residual: What the shares leave of the moment, Σ_c γ_c τ_c − Σ_c Σ_j γ_c λ_cj (x_j − x_c) × f_c, a couple [N·m]; planes
+            (*body,).
+    """
+
+    share: Float[Tensor, "*body contact taxel"]
+    residual: Vec
+
+
+def footprint(
+    pos: Vec,
+    is_active: Bool[Tensor, "*padding taxel"],
+    depth: Float[Tensor, "*body taxel"],
+    inward: Vec,
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    normal: Vec,
+    radius: Float[Tensor, "*padding"],
+    levenberg: Float[Tensor, " iteration"],
+) -> Footprint:
+    """Return the shares of contacts of bodies, and what they leave of the moment; derivatives are finite everywhere.
+
+    Args:
+        pos: Taxel positions [m], planes (taxel,) or (body, taxel).
+        is_active: Which taxels can carry.
+        depth: Depth of each probe over its radius [1].
+        inward: −2 n of each taxel, planes like those of `pos` [1].
+        point: Contact points [m], planes (*body, contact).
+        force: Forces on the body [N].
+        torque: Torques on the body at the contact points [N·m].
+        normal: Unit normals out of the objects.
+        radius: Radius of a footprint r_f [m], one for all or (body,).
+        levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
+    """
+    arm = planes.vec((to[..., None, :] - at[..., None]) / radius[..., None, None] for to, at in zip(pos, point, strict=True))
+    apart = torch.where(is_active[..., None, :], planes.dot(arm, arm), 4.0)
+    each, of = planes.vec(part[..., None] for part in normal), planes.vec(part[..., None, :] for part in inward)
+    pull = (1 - apart).clamp(min=0) * planes.dot(each, of).clamp(0, 1)
+    weight = (depth[..., None, :] + unreached()) * pull**2
+    near = (pull.amax(dim=-1) / 0.75).clamp(max=1)
+    captured = near * near * (3 - 2 * near)
+    strength = torch.sqrt(planes.dot(force, force) + no_force() ** 2)
+    lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
+    load = captured * strength
+    total = load.sum(dim=-1) + no_force()
+    wanted = planes.vec((captured * part).sum(dim=-1) / (radius * total) for part in torque)
+    share = _tilted(weight, lever, _tilt(weight, lever, load / total[..., None], wanted, levenberg))
+    left = planes.vec(
+        (captured * part).sum(dim=-1) - radius * (load * (share * g).sum(dim=-1)).sum(dim=-1)
+        for part, g in zip(torque, lever, strict=True)
+    )
+    return Footprint(captured[..., None] * share, left)
+
+
+class Bodies(NamedTuple):
+    """Which taxels each body has: they stand one body after the other.
+
+    Attributes:
+        taxel: Taxels of each body; a body with fewer than another repeats its first.
+        inverse_radius: 1/R of each [1/m], 0 for inactive ones and those repeated.
+        row: Place of each taxel in these, flattened.
+        first: First taxel of each body, and the number of all.
+        box: Least and largest coordinates of its active taxels [m].
+        place: Position of each taxel [m], with inactive ones beyond all contacts' reach, for a kernel that knows of none; and
+            −2 times its outward normal.
+        padded: Position and −2 times the normal of those of `taxel`.
+    """
+
+    taxel: Int[Tensor, "body padded"]
+    inverse_radius: Float[Tensor, "body padded"]
+    row: Int[Tensor, " taxel"]
+    first: Int[Tensor, " bodies_and_one"]
+    box: Float[Tensor, "body 6"]
+    place: Float[Tensor, "taxel 6"]
+    padded: Float[Tensor, "6 body padded"]
+
+
+def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
+    """Return the least and the largest coordinates of taxels [m], 0 of none."""
+    return np.concatenate([pos.min(axis=0), pos.max(axis=0)]) if len(pos) else np.zeros(6)
+
+
+def place(
+    pos: Float[np.ndarray, "taxel 3"], normal: Float[np.ndarray, "taxel 3"], is_active: Bool[np.ndarray, " taxel"]
+) -> Float[np.ndarray, "taxel 6"]:
+    """Return the positions of taxels [m], `FAR` away if they cannot carry, and −2 n."""
+    return np.concatenate([np.where(is_active[:, None], pos, FAR), -2.0 * normal], axis=1)
+
+
+class Shared(NamedTuple):
+    """What contacts' forces become.
+
+    Attributes:
+        force: Force on each taxel, Σ_c γ_c λ_cj f_c [N].
+        carried: Their sum over each body's taxels [N].
+        residual: What they leave of the moment [N·m].
+    """
+
+    force: Float[Tensor, "env 3 taxel"]
+    carried: Float[Tensor, "env 3 body"]
+    residual: Float[Tensor, "env 3 body"]
+
+
+def shared_forces(
+    bodies: Bodies,
+    depth: Float[Tensor, "env taxel"],
+    point: Vec,
+    force: Vec,
+    torque: Vec,
+    normal: Vec,
+    radius: Float[Tensor, " body"],
+    levenberg: Float[Tensor, " iteration"],
+) -> Shared:
+    """Share out the contacts of all bodies.
+
+    Args:
+        bodies: Which taxels each body has.
+        depth: Depth of each probe [m].
+        point: Contact points [m], planes (env, body, contact).
+        force: Forces on the body [N].
+        torque: Torques on the body at the contact points [N·m].
+        normal: Unit normals out of the objects.
+        radius: Radius of a footprint r_f [m].
+        levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
+    """
+    taxel, inverse_radius = bodies.taxel, bodies.inverse_radius
+    if takes_kernel(depth, *point, *force, *torque, *normal):
+        from tgdsl.sensors.force_taxel import footprint_kernel
+
+        own = inverse_radius.flatten()[bodies.row]
+        weight = depth * own + unreached()
+        args = radius, levenberg, bodies.first, bodies.box
+        shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
+        return Shared(shared, sums[:, :3], sums[:, 3:])
+    # Of torch's operations on a CPU `index` and `exp` wake other threads for a few thousand numbers, these do not.
+    own = depth.index_select(1, taxel.flatten()).unflatten(1, taxel.shape)
+    share, residual = footprint(
+        planes.vec(bodies.padded[:3]),
+        inverse_radius > 0,
+        own * inverse_radius,
+        planes.vec(bodies.padded[3:]),
+        point,
+        force,
+        torque,
+        normal,
+        radius,
+        levenberg,
+    )
+    padded = [(share * part[..., None]).sum(dim=2) for part in force]
+    found = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
+    return Shared(found, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
+
+
+def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:
+    """Return shares ∝ weight · exp(β · g), which sum to 1, or are all zero where all weights are."""
+    exponent = torch.where(weight > 0, planes.dot(planes.vec(part[..., None, None] for part in tilt), lever), 0.0)
+    weight = weight * torch.exp2(log2_e() * (exponent - exponent.detach().amax(dim=-1, keepdim=True)))
+    total = weight.sum(dim=-1, keepdim=True)
+    return weight / torch.where(total == 0, 1.0, total)
+
+
+def _tilt(weight: Tensor, lever: Vec, load: Tensor, wanted: Vec, levenberg: Tensor) -> Vec:
+    """Return β [1], planes (*body,)."""
+    zero = torch.zeros_like(wanted[0])
+    tilt: Vec = (zero, zero, zero)
+    for least in levenberg.unbind():
+        share = _tilted(weight, lever, tilt)
+        mean = planes.vec((share * g).sum(dim=-1) for g in lever)
+        off = planes.vec(g - m[..., None] for g, m in zip(lever, mean, strict=True))
+        excess = planes.vec((load * m).sum(dim=-1) - w for m, w in zip(mean, wanted, strict=True))
+        spread = [(load * (share * off[i] * off[k]).sum(dim=-1)).sum(dim=-1) for i, k in _UPPER]
+        halfway = _solve(spread, least, excess)
+        step = _solve(spread, least, _times(spread, halfway))
+        size = planes.dot(step, _times(spread, step)) + damping() * planes.dot(step, step)
+        tilt = planes.sub(tilt, planes.scale(torch.rsqrt(1 + size), step))
+    return tilt
+
+
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def _times(matrix: list[Tensor], right: Vec) -> Vec:
+    """Return A b: planes, A symmetric, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    return planes.dot((xx, xy, xz), right), planes.dot((xy, yy, yz), right), planes.dot((xz, yz, zz), right)
+
+
+def _solve(matrix: list[Tensor], least: Tensor, right: Vec) -> Vec:
+    """Return (A + ε)⁻¹ b by LDLᵀ: planes, A symmetric positive semi-definite, its upper triangle row by row."""
+    xx, xy, xz, yy, yz, zz = matrix
+    first = xx + least
+    by_x, bz_x = xy / first, xz / first
+    second = torch.maximum(yy + least - by_x * xy, least / 2)  # exactly, it is at least ε; rounding can bring it below
+    cross = yz - by_x * xz
+    bz_y = cross / second
+    third = torch.maximum(zz + least - bz_x * xz - bz_y * cross, least / 2)
+    y = right[1] - by_x * right[0]
+    z = (right[2] - bz_x * right[0] - bz_y * y) / third
+    y = y / second - bz_y * z
+    return right[0] / first - by_x * y - bz_x * z, y, z
+
+
+def reference(
+    pos: Float[np.ndarray, "taxel 3"],
+    is_active: Bool[np.ndarray, " taxel"],
+    depth: Float[np.ndarray, " taxel"],
+    outward: Float[np.ndarray, "taxel 3"],
+    point: Float[np.ndarray, "contact 3"],
+    force: Float[np.ndarray, "contact 3"],
+    torque: Float[np.ndarray, "contact 3"],
+    normal: Float[np.ndarray, "contact 3"],
+    radius: float,
+    levenberg: Sequence[float],
+) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, 3]]:
+    """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m].
+
+    `outward` are the taxels' own normals n, `normal` those of the contacts.
+    """
+    num = len(point)
+    weight, captured = np.zeros((num, len(pos))), np.zeros(num)
+    strength = np.sqrt(np.sum(force**2, axis=1) + no_force() ** 2)
+    for c in range(num):
+        apart = np.where(is_active, np.sum((pos - point[c]) ** 2, axis=1) / radius**2, 4.0)
+        pull = np.maximum(0.0, 1.0 - apart) * np.clip(-2.0 * outward @ normal[c], 0.0, 1.0)
+        weight[c] = (depth + unreached()) * pull**2
+        t = min(1.0, pull.max() / 0.75)
+        captured[c] = t**2 * (3.0 - 2.0 * t)
+    lever = [np.cross(pos - point[c], force[c] / strength[c]) / radius for c in range(num)]
+    load = captured * strength
+    total = load.sum() + no_force()
+    beta = reference_beta(weight, lever, load / total, captured @ torque / (radius * total), levenberg)
+    shares = np.array([captured[c] * reference_tilt(weight[c], lever[c] @ beta) for c in range(num)]).reshape(num, len(pos))
+    carried = np.zeros(3)
+    for c in range(num):
+        for x, part in zip(pos, shares[c], strict=True):
+            carried += part * np.cross(x - point[c], force[c]) if part else 0.0
+    return shares, captured @ torque - carried
+
+
+def reference_beta(
+    weight: Float[np.ndarray, "contact taxel"],
+    lever: Sequence[Float[np.ndarray, "taxel 3"]],
+    load: Float[np.ndarray, " contact"],
+    wanted: Float[np.ndarray, 3],
+    levenberg: Sequence[float],
+) -> Float[np.ndarray, 3]:
+    """Return β [1] after the given steps."""
+    beta = np.zeros(3)
+    for least in levenberg:
+        excess, spread = -wanted, np.zeros((3, 3))
+        for c, part in enumerate(load):
+            share = reference_tilt(weight[c], lever[c] @ beta)
+            mean = share @ lever[c]
+            excess = excess + part * mean
+            spread += part * (share * (lever[c] - mean).T) @ (lever[c] - mean)
+        curvature = spread + least * np.eye(3)
+        step = np.linalg.solve(curvature, spread @ np.linalg.solve(curvature, excess))
+        beta -= step / np.sqrt(1.0 + step @ spread @ step + damping() * step @ step)
+    return beta
+
+
+def reference_tilt(weight: Float[np.ndarray, " taxel"], exponent: Float[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
+    """Return shares ∝ weight · exp(exponent) of the taxels that have any weight."""
+    share, has_weight = np.zeros(len(weight)), weight > 0
+    if has_weight.any():
+        share[has_weight] = weight[has_weight] * np.exp(exponent[has_weight] - exponent[has_weight].max())
+        share /= share.sum()
+    return share

@@ -1,0 +1,168 @@
+"""Force taxel: the solver's contact force on each body, shared out over the taxels near each contact.
+
+    f_j = Σ_c γ_c λ_cj f_c                                                                    [N]
+    p_j = max(0, −f_j · n_j) / A_j                                                            [Pa]
+    missed = f_net − Σ_j f_j                                                                  [N]
+    residual = Σ_c γ_c (x_c × f_c + τ_c) − Σ_j x_j × f_j                                      [N·m]
+
+with c the solver's contacts of the sensor's objects on one body, f_c their forces on the link, τ_c their torques at the
+contact points x_c, f_net their whole; j that body's taxels with place x_j, outward normal n_j and area A_j, all in the link's
+frame. The captured fraction γ_c and the shares λ_cj ≥ 0, which sum to 1, are those of `footprint`: near the contact and on its
+side of the body, by depth, and such that the moment of the taxel forces is that of the contacts as far as shares can meet it.
+
+So Σ_j f_j + missed = f_net always: no load is lost or made up, static shear included. As every f_j is a sum of contact forces
+with weights ≥ 0, it leaves no cone that they share, such as the friction cone of a flat face. A contact that slides off the
+sensor, or around an edge of its body, hands its force to `missed` continuously. So is missed what lies further than a footprint
+from every active taxel, or on the back of the body. What contacts beyond `slots` carry acts at the centre of the others, see
+`quantities.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per body. The residual is a pure
+couple, since the shared forces sum to those they came from: it is the same about any point.
+
+Source: a solver's contacts are rigid points; this is the distribution of a resultant on a Winkler foundation, whose pressure is
+proportional to depth (Johnson, *Contact Mechanics*, §4.3), with its moment corrected.
+
+Limits: depth is that of the object that a probe is deepest in, so two objects within one footprint share their taxels. Shares
+follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; forces there
+begin at what the solver says.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from pydantic import Field, StrictInt
+from torch import Tensor
+
+from tgdsl.errors import LowerError
+from tgdsl.fields.models import PositiveLength, Usual
+from tgdsl.geometry import planes
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.quantities.reference import Touch
+from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
+from tgdsl.sensors.force_taxel import footprint
+from tgdsl.sensors.noise import FORCE
+
+SPACINGS = 3.0
+"""Default radius of a footprint, in spacings of the taxels: the middle of a square of four is within half of it."""
+
+
+class ForceTaxelSpec(ContactProbeSpec):
+    """The solver's contact force, shared out over the taxels."""
+
+    kind: Literal["force_taxel"]
+    """Force [N] or pressure [Pa] of each taxel, which sum to the solver's contact force."""
+    outputs: Annotated[tuple[Literal["force", "pressure"], ...], Field(min_length=1)] = ("force",)
+    """What a reading holds, force before pressure."""
+    footprint: Annotated[PositiveLength | None, Usual("length", high=0.1)] = None
+    """Radius r_f around a contact in which taxels carry it [m]; a contact further than r_f/2 from the nearest taxel is partly
+    missed. Default: on each body 3 times the taxels' spacing, the root of their mean area."""
+    moment_iterations: Annotated[StrictInt, Field(ge=0, le=64)] = 4
+    """Newton steps towards the contacts' moment; 0: shares by depth and distance alone [1]."""
+    slots: Annotated[StrictInt, Field(ge=1)] = 8
+    """Contacts per pair of body and object that are shared out; what others carry acts at the centre of these [1]."""
+
+    def radii(self, layout: Layout) -> np.ndarray:
+        """Return r_f of each body [m]."""
+        own = [layout.area[(layout.body_id == b) & (layout.radius > 0)] for b in range(len(layout.bodies))]
+        spacing = [float(np.sqrt(area.mean())) if len(area) else 1.0 for area in own]
+        return np.array([self.footprint or SPACINGS * each for each in spacing])
+
+    @property
+    def levenberg(self) -> tuple[float, ...]:
+        """Least curvature of each Newton step [1]."""
+        return (footprint.LEVENBERG,) * self.moment_iterations
+
+
+def reference(
+    spec: ForceTaxelSpec, layout: Layout, touch: Touch, state: ReferenceState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return f [N] and p [Pa], of the outputs asked for: (taxel, channel)."""
+    force, _, _ = reference_reports(spec, layout, touch)
+    pressure = np.maximum(0.0, -np.sum(force * layout.normal, axis=1)) / np.where(layout.radius > 0, layout.area, 1.0)
+    parts = {"force": force, "pressure": pressure[:, None]}
+    return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
+
+
+def reference_reports(spec: ForceTaxelSpec, layout: Layout, touch: Touch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return f (taxel, 3) [N], missed (body, 3) [N] and residual (body, 3) [N·m]."""
+    contacts = touch.contacts
+    assert contacts is not None
+    force, missed, residual = np.zeros((layout.num_taxels, 3)), contacts.net.copy(), np.zeros_like(contacts.net)
+    is_active = layout.radius > 0
+    depth = np.where(is_active, touch.depth / np.where(is_active, layout.radius, 1.0), 0.0)
+    for b in range(len(layout.bodies)):
+        own, at = layout.body_id == b, contacts.body == b
+        share, residual[b] = footprint.reference(
+            layout.pos[own], is_active[own], depth[own], layout.normal[own],
+            contacts.pos[at], contacts.force[at], contacts.torque[at], contacts.normal[at],
+            spec.radii(layout)[b], spec.levenberg,
+        )  # fmt: skip
+        force[own] = share.T @ contacts.force[at]
+        missed[b] -= force[own].sum(axis=0)
+    return force, missed, residual
+
+
+def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
+    """Pad the taxels of each body to the same number, with inactive ones, so that all bodies are one batch."""
+    is_active = layout.radius > 0
+    counts = np.bincount(layout.body_id)
+    first = np.concatenate([[0], np.cumsum(counts)])
+    taxel = np.repeat(first[:-1, None], counts.max(), axis=1)  # padding repeats the body's own first taxel
+    rank = np.arange(layout.num_taxels) - first[layout.body_id]
+    inverse_radius = np.zeros(taxel.shape)
+    taxel[layout.body_id, rank] = np.arange(layout.num_taxels)
+    inverse_radius[layout.body_id, rank] = np.where(is_active, 1.0 / np.where(is_active, layout.radius, 1.0), 0.0)
+    constants = {
+        "taxel": taxel,
+        "inverse_radius": inverse_radius,
+        "first": first,
+        "row": layout.body_id * counts.max() + rank,
+        "box": np.array([footprint.box(layout.pos[(layout.body_id == b) & is_active]) for b in range(len(counts))]),
+        "place": footprint.place(layout.pos, layout.normal, is_active),
+        "padded": np.concatenate([layout.pos.T, -2.0 * layout.normal.T])[:, taxel],
+        "footprint": spec.radii(layout),
+        "levenberg": np.array(spec.levenberg),
+    }
+    channels: list[Channel] = []
+    if "force" in spec.outputs:
+        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
+    if "pressure" in spec.outputs:
+        if (layout.area[is_active] <= 0).any():
+            raise LowerError("a taxel of no area has no pressure", field="outputs", hint="leave pressure out, or give its area")
+        channels.append(Channel("pressure", "Pa"))
+        constants["inward"] = -layout.normal.T / np.where(is_active, layout.area, np.inf)
+    reports = {
+        "missed": tuple(Channel(f"missed_{axis}", "N") for axis in "xyz"),
+        "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
+    }
+    return Lowered(tuple(channels), reports=reports, constants=constants, needs=frozenset({"contacts"}), slots=spec.slots)
+
+
+def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
+    contacts = felt.contacts
+    assert contacts is not None
+    bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
+    shared = footprint.shared_forces(
+        bodies,
+        felt.depth,
+        contacts.pos,
+        contacts.force,
+        contacts.torque,
+        contacts.normal,
+        constants["footprint"],
+        constants["levenberg"],
+    )
+    missed = torch.stack(contacts.net, dim=1) - shared.carried
+    readings = {"missed/signal": missed, "residual/signal": shared.residual}
+    if "inward" not in constants:
+        return {"signal": shared.force, **readings}, {}
+    force = planes.vec(shared.force.unbind(1))
+    readings |= {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
+    readings["pressure"] = planes.dot(force, planes.vec(constants["inward"])).clamp(min=0)
+    return readings, {}
+
+
+FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE)

@@ -1,0 +1,1 @@
+"""Triangle surfaces on NumPy: rays, solids, samples, regions."""

@@ -1,0 +1,174 @@
+"""A link's outer surface: its meshes cleaned, and the parts that lie inside others dropped.
+
+Real meshes hold screws and magnets as parts of their own, and disagree with themselves about what is outside.
+
+The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned: compiled modules run without it.
+
+Shapes: `f` faces, `edge` three per face, `part` connected parts of the mesh, `n` points. Everything is in the body
+frame.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tgdsl.surfaces.region import LENGTH_TOLERANCE
+from tgdsl.surfaces.surface import Surface
+
+MAX_HOLE = 0.05
+"""A part is solid, so that points can be inside it, if the squared length of its border is at most this share of its
+area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """A clean surface whose enclosed parts are gone.
+
+    Attributes:
+        surface: Its triangles; solid parts are counter-clockwise seen from outside.
+        part: Connected part of each face.
+        is_solid: Which parts enclose a volume.
+    """
+
+    surface: Surface
+    part: Int[np.ndarray, " f"]
+    is_solid: Bool[np.ndarray, " part"]
+
+    @cached_property
+    def offset(self) -> float:
+        """Distance to either side of a face at which points are tested for being inside [m]."""
+        return max(1e-6 * float(np.ptp(self.surface.corners.reshape(-1, 3), axis=0).max()), LENGTH_TOLERANCE)
+
+    def solid(self, part: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+        """Return vertices and faces of one part."""
+        used, faces = np.unique(self.surface.faces[self.part == part], return_inverse=True)
+        return self.surface.vertices[used], faces.reshape(-1, 3).astype(np.int64)
+
+    def winding(self, part: int, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return how often a part winds around points: 1 inside, 0 outside, 1/2 on a flat piece of it."""
+        import igl
+
+        winding = np.zeros(len(pos))
+        vertices, faces = self.solid(part)
+        near = ((pos >= vertices.min(axis=0) - self.offset) & (pos <= vertices.max(axis=0) + self.offset)).all(axis=1)
+        if near.any():
+            winding[near] = np.atleast_1d(igl.winding_number(vertices, faces, pos[near]))
+        return winding
+
+
+def outer_shell(surface: Surface) -> Shell:
+    """Return the cleaned surface without the parts that lie wholly inside another.
+
+    Closed parts that are inside out are turned, so that all face outward.
+
+    Args:
+        surface: The link's triangles, in the body frame.
+
+    Raises:
+        ImportError: If pymeshlab is not installed.
+    """
+    clean = _clean(surface)
+    part = _parts(clean)
+    is_solid = _solid(clean, part)
+    volume = np.bincount(part, _signed_volumes(clean, part), minlength=len(is_solid))
+    is_turned = (is_solid & (volume < 0))[part]
+    faces = np.where(is_turned[:, None], clean.faces[:, ::-1], clean.faces)
+    shell = Shell(Surface(clean.vertices, faces, clean.face_geom, clean.geoms), part, is_solid)
+    is_kept = ~_enclosed(shell)[part]
+    kept, part = np.unique(part[is_kept], return_inverse=True)
+    return Shell(shell.surface.keep(is_kept), part, is_solid[kept])
+
+
+def _clean(surface: Surface) -> Surface:
+    """Weld vertices, drop faces without area or that repeat another, make windings agree; each geom by itself."""
+    import pymeshlab as untyped
+
+    pymeshlab: Any = untyped
+    parts = []
+    for geom in range(len(surface.geoms)):
+        faces = surface.faces[surface.face_geom == geom]
+        if not len(faces):
+            continue
+        meshes = pymeshlab.MeshSet()
+        used, faces = np.unique(faces, return_inverse=True)
+        vertices = surface.vertices[used]
+        meshes.add_mesh(pymeshlab.Mesh(vertices, faces.reshape(-1, 3)))
+        weld = 1e-7 * float(np.ptp(vertices, axis=0).max())
+        meshes.meshing_merge_close_vertices(threshold=pymeshlab.PureValue(weld))
+        meshes.meshing_remove_duplicate_faces()
+        meshes.meshing_remove_null_faces()
+        if _disagrees(meshes.current_mesh().face_matrix()):
+            # Where more than two faces share an edge there is no coherent winding, and the file's is kept.
+            with suppress(pymeshlab.PyMeshLabException):
+                meshes.meshing_re_orient_faces_coherently()
+        mesh = meshes.current_mesh()
+        faces = mesh.face_matrix().astype(np.int64)
+        face_geom = np.full(len(faces), geom, dtype=np.int64)
+        parts.append(Surface(np.array(mesh.vertex_matrix()), faces, face_geom, ()))
+    joined = Surface.joined(parts)
+    return Surface(joined.vertices, joined.faces, joined.face_geom, surface.geoms)
+
+
+def _edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "edge 2"]:
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _disagrees(faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Return whether two neighbours run along their common edge in the same sense."""
+    edges = _edges(faces.astype(np.int64))
+    _, edge, num_faces = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    sense = np.bincount(edge.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    return bool(((num_faces == 2) & (sense != 0)).any())
+
+
+def _parts(surface: Surface) -> Int[np.ndarray, " f"]:
+    """Return the connected part of each face, numbered in the order of the faces."""
+    start, end = _edges(surface.faces).T
+    size = len(surface.vertices)
+    _, label = connected_components(coo_array((np.ones(len(start), bool), (start, end)), (size, size)), directed=False)
+    label = label[surface.faces[:, 0]]
+    _, first, part = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[part]
+
+
+def _solid(surface: Surface, part: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " part"]:
+    """Return which parts are closed but for small holes."""
+    edges = np.sort(_edges(surface.faces), axis=1)
+    _, first, num_faces = np.unique(edges, axis=0, return_index=True, return_counts=True)
+    border = first[num_faces == 1]
+    length = np.linalg.norm(np.diff(surface.vertices[edges[border]], axis=1)[:, 0], axis=1)
+    num = part.max(initial=-1) + 1
+    perimeter = np.bincount(part[border // 3], length, minlength=num)
+    return perimeter**2 <= MAX_HOLE * np.bincount(part, surface.face_areas, minlength=num)
+
+
+def _signed_volumes(surface: Surface, part: Int[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Return the volume between each face and its part's first corner; negative if the face looks toward it [m³]."""
+    _, first = np.unique(part, return_index=True)
+    corners = surface.corners - surface.corners[first, :1][part]
+    return np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+
+
+def _enclosed(shell: Shell) -> Bool[np.ndarray, " part"]:
+    """Return which parts lie wholly inside some solid part."""
+    num = len(shell.is_solid)
+    owner = np.full(len(shell.surface.vertices), -1)
+    owner[shell.surface.faces] = shell.part[:, None]
+    vertices, owner = shell.surface.vertices[owner >= 0], owner[owner >= 0]
+    is_enclosed = np.zeros(num, dtype=bool)
+    for part in np.flatnonzero(shell.is_solid).tolist():
+        other = owner != part
+        # Not 1/2: a vertex on the other's surface, even in a notch of it, shall not count.
+        is_out = shell.winding(part, vertices[other]) < 0.9
+        is_inside = np.bincount(owner[other][is_out], minlength=num) == 0
+        is_inside[part] = False
+        is_enclosed |= is_inside
+    return is_enclosed

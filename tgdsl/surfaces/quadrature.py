@@ -1,0 +1,278 @@
+"""The outer surface of an object as triangles and as points with area weights: what integrals over it are summed from.
+
+Geoms become triangles, which are halved to a spacing; those of a primitive add up to its area in closed form. What lies inside
+another geom of the object is no surface, nor is a face that two geoms share from opposite sides; of one that they share from
+the same side the first counts. Triangles that another geom's surface crosses are halved further. Nothing depends on a seed,
+but for points that are asked to be random.
+
+Shapes: `n` points, `f` triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from scipy.special import elliprg
+
+from tgdsl.compiler.felt import FeltGeom
+from tgdsl.geometry.planes import vec
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.surfaces.solid import Solid, halved
+
+SECTIONS = 128
+"""Least number of sides of what stands for a circle before its points are moved onto the true surface."""
+CUT = 16.0
+"""How many times finer than the spacing triangles are where another geom's surface cuts them."""
+STEP = 1e-7
+"""How far a point is moved out or in to see what is there [m]."""
+
+Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """Points that stand for a surface.
+
+    Attributes:
+        pos: Places in the body's frame [m].
+        area: Surface that each stands for [m²].
+    """
+
+    pos: Float[np.ndarray, "n 3"]
+    area: Float[np.ndarray, " n"]
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """The points, to look for near ones."""
+        return KDTree(self.pos)
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """Small triangles of an outer surface.
+
+    Attributes:
+        corners: Their corners in the body's frame [m]; those of a primitive are chords of it.
+        pos: The point of the true surface at the middle of each [m].
+        normal: Unit normal out of the object there.
+        area: Surface that each stands for [m²].
+    """
+
+    corners: Float[np.ndarray, "f 3 3"]
+    pos: Float[np.ndarray, "f 3"]
+    normal: Float[np.ndarray, "f 3"]
+    area: Float[np.ndarray, " f"]
+
+    def quadrature(self, spacing: float) -> Quadrature:
+        """Return one point per piece, or one for all those that share a cube of half the spacing [m]."""
+        cube = np.floor((self.pos - self.pos.min(axis=0)) / (0.5 * spacing)).astype(np.int64)
+        num = cube.max(axis=0) + 1
+        _, which = np.unique(np.ravel_multi_index(tuple(cube.T), tuple(num)), return_inverse=True)
+        area = np.bincount(which, self.area)
+        pos = np.stack([np.bincount(which, self.area * part) for part in self.pos.T], axis=1)
+        return Quadrature(pos / area[:, None], area)
+
+    def random(self, count: int, seed: int) -> Quadrature:
+        """Return points drawn alike from all of the surface, each standing for the same area."""
+        return Quadrature(self._drawn(count, seed)[0], np.full(count, self.area.sum() / count))
+
+    def random_by_side(self, count: int, seed: int) -> Quadrature:
+        """Return the points of `random` in an order in which neighbours are mostly near: side by side, each along a curve.
+
+        The six sides are what faces along one of the axes more than along the others; on each, points follow a Morton curve.
+        """
+        pos, piece = self._drawn(count, seed)
+        normal = self.normal[piece]
+        axis = np.abs(normal).argmax(axis=1)
+        faces_up = normal[np.arange(count), axis] > 0
+        return Quadrature(pos[np.lexsort((_morton(pos), faces_up, axis))], np.full(count, self.area.sum() / count))
+
+    def _drawn(self, count: int, seed: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+        """Return random points, and the piece that each is from."""
+        rng = np.random.default_rng(seed)
+        piece = rng.choice(len(self.area), count, p=self.area / self.area.sum())
+        weight = rng.dirichlet((1.0, 1.0, 1.0), count)
+        off = self.pos[piece] - self.corners[piece].mean(axis=1)
+        return (weight[:, :, None] * self.corners[piece]).sum(axis=1) + off, piece
+
+
+def outer_surface(geoms: Sequence[FeltGeom], spacing: float) -> Pieces:
+    """Return the outer surface of an object's geoms, planes left out, in pieces not longer than a spacing.
+
+    Args:
+        geoms: The geoms of one variant.
+        spacing: Longest side of a piece [m].
+
+    Raises:
+        BakeError: If a mesh has no face with an area.
+    """
+    solids = [_Geom.of(felt, spacing) for felt in geoms if felt.shape != "plane"]
+    empty = np.zeros((0, 3))
+    parts = [(np.zeros((0, 3, 3)), empty, empty, np.zeros(0)), *(_outer(i, solids, spacing) for i in range(len(solids)))]
+    return Pieces(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Geom:
+    """A geom's triangles, signed distance and its gradient, all in the body's frame."""
+
+    corners: Float[np.ndarray, "f 3 3"]
+    distance: Distance
+    is_mesh: bool
+    stretch: float
+    """Area of the true surface over that of the triangles."""
+
+    @staticmethod
+    def of(felt: FeltGeom, spacing: float) -> _Geom:
+        geom = felt.geom
+        solid = None if felt.surface is None else Solid(felt.surface, leaf=spacing / CUT)
+        corners = _triangles(felt.shape, geom.size, spacing) if solid is None else solid.corners
+
+        def distance(pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            local = (pos - geom.pos) @ geom.rotation
+            if solid is not None:
+                value, gradient = solid.distance(local)
+            else:
+                x, y, z = torch.from_numpy(np.ascontiguousarray(local.T))
+                planes = SHAPES[felt.shape]((x, y, z), vec(torch.from_numpy(np.asarray(geom.size, float)).unbind()))
+                value, gradient = planes[0].numpy(), torch.stack(planes[1], dim=1).numpy()
+            return value, gradient @ geom.rotation.T
+
+        stretch = 1.0 if solid is not None else primitive_area(felt.shape, geom.size) / _areas(corners).sum()
+        return _Geom(corners @ geom.rotation.T + geom.pos, distance, solid is not None, stretch)
+
+    def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        return self.distance(pos)[0] < 0
+
+    def on_surface(self, corners: Float[np.ndarray, "f 3 3"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the points of the true surface at the middle of triangles, and the unit normals out of the solid there."""
+        middle = corners.mean(axis=1)
+        if not self.is_mesh:
+            value, gradient = self.distance(middle)
+            return middle - value[:, None] * gradient, gradient
+        normal = _cross(corners)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        is_inverted = self.is_inside(middle + STEP * normal)
+        return middle, np.where(is_inverted[:, None], -normal, normal)
+
+
+def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray, ...]:
+    """Return corners, places, normals and areas of the pieces of one geom that are on the outside of all."""
+    own, others = solids[i], [(j < i, other) for j, other in enumerate(solids) if j != i]
+    corners, kept = own.corners, []
+    while len(corners):
+        pos, normal = own.on_surface(corners)
+        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        is_out, is_cut = np.ones(len(corners), bool), np.zeros(len(corners), bool)
+        for is_earlier, other in others:
+            value = other.distance(pos)[0]
+            is_out &= value > -side
+            near = np.flatnonzero((np.abs(value) <= side) & (side <= spacing))
+            hidden = _hidden(own, other, is_earlier, corners[near])
+            is_cut[near] |= hidden.any(axis=0) & ~hidden.all(axis=0) & (side[near] > spacing / CUT)
+            is_out[near] &= ~hidden[0] | is_cut[near]
+        is_split = is_out & ((side > spacing) | is_cut)
+        is_done = is_out & ~is_split
+        done = corners[is_done]
+        kept.append((done, pos[is_done], normal[is_done], own.stretch * _areas(done)))
+        corners = halved(corners[is_split])
+    return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
+
+
+def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "4 f"]:
+    """Return whether another geom hides the surface at the middle of triangles and just within their corners."""
+    middle = corners.mean(axis=1)
+    found = []
+    for k in range(4):
+        pulled = corners if k == 0 else corners + 0.98 * (corners[:, k - 1] - middle)[:, None]
+        pos, normal = own.on_surface(pulled)
+        hidden = other.is_inside(pos + STEP * normal)
+        found.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
+    return np.array(found)
+
+
+def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Return the places of points on a Morton curve through 1024³ cubes: the bits of their three indices, interleaved."""
+    low = pos.min(axis=0)
+    size = max(float((pos - low).max()), 1e-30)
+    cube = (1023 / size * (pos - low)).astype(np.int64)
+    bit = np.arange(10)
+    return ((cube[:, :, None] >> bit & 1) << (3 * bit + np.arange(3)[:, None])).sum(axis=(1, 2))
+
+
+def _cross(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 3"]:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _areas(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, " f"]:
+    return 0.5 * np.linalg.norm(_cross(corners), axis=1)
+
+
+def primitive_area(shape: str, size: Float[np.ndarray, 3]) -> float:
+    """Return the area of a primitive [m²]; of an ellipsoid by Carlson's integral (DLMF 19.33.2).
+
+    Args:
+        shape: Its type.
+        size: As in MuJoCo: half sizes, semi-axes, or radius and half length [m].
+    """
+    a, b, c = map(float, size)
+    match shape:
+        case "box":
+            return 8.0 * (a * b + b * c + c * a)
+        case "sphere":
+            return 4.0 * np.pi * a**2
+        case "capsule":
+            return 4.0 * np.pi * a * (a + b)
+        case "cylinder":
+            return 2.0 * np.pi * a * (a + 2.0 * b)
+        case _:
+            return float(4.0 * np.pi * elliprg((a * b) ** 2, (b * c) ** 2, (c * a) ** 2))
+
+
+def _triangles(shape: str, size: Float[np.ndarray, 3], spacing: float) -> Float[np.ndarray, "f 3 3"]:
+    """Return triangles of a primitive in its own frame."""
+    if shape == "box":
+        return np.concatenate([_box_face(size, axis, sign) for axis in range(3) for sign in (-1.0, 1.0)])
+    radius = float(size.max() if shape == "ellipsoid" else size[0])
+    half = float(size[1]) if shape in ("capsule", "cylinder") else 0.0
+    sections = max(SECTIONS, int(np.ceil(2 * np.pi * radius / spacing)))
+    # The chord polygon has the circle's length, so that what stands for the surface has its area.
+    swell = (np.pi / sections) / np.sin(np.pi / sections)
+    wall = np.linspace(-half, half, max(1, int(np.ceil(2 * half / spacing))) + 1)
+    if shape == "cylinder":
+        radii = radius * np.linspace(0, 1, max(1, int(np.ceil(radius / spacing))) + 1)[:-1]
+        profile = [*((r, -half) for r in radii), *((radius, z) for z in wall), *((r, half) for r in radii[::-1])]
+        return _revolved(np.array(profile), sections, swell)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 2 * (sections // 4) + 1)
+    ball = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    if shape != "capsule":
+        return _revolved(ball, sections, swell) * (size if shape == "ellipsoid" else radius)
+    lower, upper = radius * ball[: len(ball) // 2 + 1], radius * ball[len(ball) // 2 :]
+    straight = np.stack([np.full(len(wall) - 2, radius), wall[1:-1]], axis=1)
+    return _revolved(np.concatenate([lower - [0, half], straight, upper + [0, half]]), sections, swell)
+
+
+def _box_face(size: np.ndarray, axis: int, sign: float) -> np.ndarray:
+    a, b = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]] * size
+    middle = sign * np.eye(3)[axis] * size
+    p, q, r, s = middle - a - b, middle + a - b, middle + a + b, middle - a + b
+    return np.array([[p, q, r], [p, r, s]])
+
+
+def _revolved(profile: Float[np.ndarray, "k 2"], sections: int, swell: float) -> Float[np.ndarray, "f 3 3"]:
+    """Return the surface that a line of points (distance from the axis, height) sweeps about z."""
+    angle = 2 * np.pi * np.arange(sections + 1) / sections
+    ring = swell * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = np.concatenate(
+        [profile[:, None, :1] * ring, np.broadcast_to(profile[:, None, 1:], (len(profile), sections + 1, 1))], axis=2
+    )
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    both = np.concatenate([np.stack(part, axis=2).reshape(-1, 3, 3) for part in ((a, b, c), (a, c, d))])
+    area = np.linalg.norm(_cross(both), axis=1)
+    return both[area > 1e-12 * area.max()]

@@ -1,0 +1,1 @@
+"""What torch is told: dtypes, devices, buffers, where kernels stand in for operations, CUDA graphs, environments by index."""

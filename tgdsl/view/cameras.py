@@ -1,0 +1,147 @@
+"""From where a hand is seen: views by name or angle, and the one that shows most.
+
+Shapes: `taxel` taxels of one sensor or layout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.layout.layout import Layout
+from tgdsl.view.discs import taxels_of
+from tgdsl.view.dots import Dots, Pose
+from tgdsl.view.shot import Camera, Solid, camera_for, is_seen, rasterise, screen_for, unit
+
+Array = np.ndarray
+VIEWS = {
+    "front": (6.0, 16.0),
+    "back": (186.0, 16.0),
+    "left": (-70.0, 10.0),
+    "right": (70.0, 10.0),
+    "top": (0.0, 90.0),
+    "bottom": (0.0, -90.0),
+    "iso": (36.0, 32.0),
+}
+"""Where the camera is, from the taxels' mean normal: degrees round the hand to the picture's right, and degrees up."""
+_AROUND, _RISES = range(0, 360, 45), (-30, 16, 50)
+_LOOK = 200
+"""Columns and rows of the pictures by which views are compared."""
+
+
+class ViewError(TgdslError):
+    """A picture that cannot be drawn of what was given."""
+
+
+def angles_of(view: str) -> tuple[float, float]:
+    """Return where a view is from: azimuth and elevation [degrees].
+
+    Args:
+        view: One of `VIEWS`, or the two numbers themselves, such as "30,20".
+
+    Raises:
+        ViewError: If it is none.
+    """
+    if view in VIEWS:
+        return VIEWS[view]
+    azimuth, comma, elevation = view.partition(",")
+    if not comma:
+        raise ViewError(f'there is no view "{view}"; {did_you_mean(view, VIEWS, "views")}')
+    try:
+        angles = float(azimuth), float(elevation)
+    except ValueError:
+        angles = np.nan, np.nan
+    if not (np.isfinite(angles).all() and abs(angles[1]) <= 90):
+        raise ViewError(f'there is no view "{view}"; expected azimuth and elevation in degrees, the latter from -90 to 90')
+    return angles
+
+
+def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
+    """Return where a keyframe puts the bodies; without one, where the model's own initial state does.
+
+    Raises:
+        ViewError: If the model has no such keyframe.
+    """
+    state = mujoco.MjData(model)
+    if keyframe is not None:
+        names = [model.key(i).name for i in range(model.nkey)]
+        if keyframe not in names:
+            raise ViewError(f'the scene has no keyframe "{keyframe}"; {did_you_mean(keyframe, names, "keyframes")}')
+        mujoco.mj_resetDataKeyframe(model, state, names.index(keyframe))
+    mujoco.mj_kinematics(model, state)
+    return Pose(state.xpos.copy(), state.xquat.copy())
+
+
+def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, top: int) -> Camera:
+    """Return the camera of a view: it is fixed to the hand's first body, so that a hand that closes is seen from the same side.
+
+    Args:
+        view: One of `VIEWS`, or azimuth and elevation in degrees.
+        model: The robot.
+        layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
+        pose: Where the bodies are.
+        top: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
+            those that do not point at the camera.
+    """
+    initial = pose_of(model, None)
+    taxels = [taxels_of(model, initial, layout) for layout in layouts]
+    weight = np.concatenate([each.size**2 for each in taxels])
+    centre = weight @ np.concatenate([each.pos for each in taxels]) / weight.sum()
+    normal = unit(weight @ np.concatenate([each.normal for each in taxels]), np.zeros(3))
+    axes = Rotation.from_quat(initial.quat[top], scalar_first=True).as_matrix().T
+    axes = np.concatenate([axes, -axes])
+    across = axes[np.abs(axes @ normal) < 0.7]
+    up = across[np.argmax(across @ (centre - initial.pos[top] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
+    toward = unit(normal - (normal @ up) * up, axes[np.argmin(np.abs(axes @ up))])
+    around, rise = np.radians(angles_of(view))
+    level = np.cos(around) * toward + np.sin(around) * np.cross(up, toward)
+    toward = np.cos(rise) * level + np.sin(rise) * up
+    right = np.cross(up, level)
+    frame = np.stack([right, np.cross(toward, right), toward])
+    turn = Rotation.from_quat(pose.quat[top], scalar_first=True).as_matrix() @ axes[:3]
+    right, above, toward = frame @ turn.T
+    return Camera(right, above, toward, pose.pos[top])
+
+
+def best_camera(dots: Dots, hand: Solid, model: mujoco.MjModel, layout: Layout, pose: Pose, top: int) -> Camera:
+    """Return the camera that those taxels face which read most (see `camera_for`), or the one that shows most taxels.
+
+    Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more.
+
+    Args:
+        dots: The taxels.
+        hand: What hides taxels.
+        model: The robot.
+        layout: The taxels that views are named after, see `camera_of`.
+        pose: Where the bodies are.
+        top: The hand's first body.
+    """
+    first = camera_for(dots, pose.pos[top])
+    wanted = dots.is_touched if dots.is_touched.any() else dots.size > 0
+    own, _ = _shown(dots, wanted, hand, first)
+    if 2 * own >= wanted.sum():
+        return first
+    others = [(camera, _shown(dots, wanted, hand, camera)) for camera in _candidates(model, layout, pose, top)]
+    best, (most, _) = max(others, key=lambda entry: entry[1])
+    return first if 2 * own >= most else best
+
+
+def _candidates(model: mujoco.MjModel, layout: Layout, pose: Pose, top: int) -> Iterator[Camera]:
+    for view in (*VIEWS, *(f"{around},{rise}" for rise in _RISES for around in _AROUND)):
+        yield camera_of(view, model, [layout], pose, top)
+
+
+def _shown(dots: Dots, wanted: Array, hand: Solid, camera: Camera) -> tuple[int, int]:
+    """Return how many of the taxels that are wanted a camera shows, and how many in all."""
+    facing = hand.normals.mean(axis=1) @ camera.toward > 0
+    corners = hand.corners[facing]
+    flat = np.concatenate([camera.project(corners).reshape(-1, 3), camera.project(dots.pos)])[:, :2]
+    margin = 1e-3  # [m] so that a single point has a size too
+    screen = screen_for(camera, np.stack([flat.min(axis=0) - margin, flat.max(axis=0) + margin]), _LOOK, _LOOK)
+    shot = rasterise(screen.project(corners), _LOOK, _LOOK)
+    seen = is_seen(dots, screen.project(dots.pos), shot, camera) & (dots.size > 0)
+    return int((seen & wanted).sum()), int(seen.sum())

@@ -1,0 +1,182 @@
+"""Taxels as dots: where they are in the world, and how much they read.
+
+Shapes: `taxel` taxels of one sensor or layout, `body` bodies of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from tgdsl.module.history import last_step
+from tgdsl.module.memory import Memory
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.runtime.source import Simulator
+
+Array = np.ndarray
+
+
+class Pose(NamedTuple):
+    """Bodies in the world at one instant: origins [m], and orientations as quaternions w, x, y, z."""
+
+    pos: Float[Array, "body 3"]
+    quat: Float[Array, "body 4"]
+
+
+@dataclass(frozen=True, eq=False)
+class Taxels:
+    """Taxels in the world.
+
+    Attributes:
+        pos: Position in the world [m].
+        normal: Outward unit normal in the world.
+        size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
+    """
+
+    pos: Float[Array, "taxel 3"]
+    normal: Float[Array, "taxel 3"]
+    size: Float[Array, " taxel"]
+
+
+@dataclass(frozen=True, eq=False)
+class Dots(Taxels):
+    """The rows of one reading in one environment: taxels, or bodies, and what they read.
+
+    Attributes:
+        value: Magnitude of the reading, in `unit`.
+        quantity: What is read, such as `|force|`.
+        unit: Its unit, with the prefix that suits the values; empty for plain numbers.
+        vector: The reading itself in the world, in SI units, if it is a vector.
+        scale: What a number in SI units is multiplied with to be in `unit`.
+        would_read: Which of them would read anything without noise; None: those that do.
+    """
+
+    value: Float[Array, " taxel"]
+    quantity: str
+    unit: str
+    vector: Float[Array, "taxel 3"] | None = None
+    scale: float = 1.0
+    would_read: Bool[Array, " taxel"] | None = None
+
+    @property
+    def is_read(self) -> Bool[Array, " taxel"]:
+        """Which taxels read anything: those that are coloured."""
+        return self.value > 0
+
+    @property
+    def is_touched(self) -> Bool[Array, " taxel"]:
+        """Which taxels read anything, noise apart: those that are counted."""
+        return self.is_read if self.would_read is None else self.would_read
+
+    @property
+    def label(self) -> str:
+        """Quantity and unit."""
+        return f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
+
+    def summary(self, chosen: Int[Array, " chosen"] | slice = slice(None)) -> str:
+        """Return the sum of some taxels, unless they are lengths, and the largest magnitude.
+
+        Vectors are summed as vectors, `|Σ|`, as the table of `tgdsl run` does; magnitudes alone as they are, `Σ`.
+        """
+        value, unit = self.value[chosen], f" {self.unit}" if self.unit else ""
+        if not value.any():
+            return f"0{unit}"
+        total = f"Σ {value.sum():.3g}{unit}"
+        if self.vector is not None:
+            size = self.scale * np.linalg.norm(self.vector[chosen].sum(axis=0))
+            total = f"|Σ| {size:.{3 if size >= 0.1 else 2}g}{unit}"
+        if self.unit in ("m", "mm", "µm"):
+            total = ""
+        most = f"max {value.max():.2g}{unit}" if self.unit else ""
+        return " · ".join(part for part in (total, most) if part)
+
+    @property
+    def headline(self) -> str:
+        """The summary of all taxels, with what is summed: `|Σ force| 2.45 N · max 0.3 N`."""
+        summary = self.summary()
+        named = summary.replace("|Σ|", f"|Σ {self.quantity.strip('|')}|")
+        return named if named != summary else f"{self.quantity} {summary}"
+
+
+def dots_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Dots:
+    """Return where the taxels of a reading are in one environment, and what they read.
+
+    A reading of bodies has one dot for each, amid its taxels.
+
+    Args:
+        touch: The module.
+        sim: The scene, at the instant of the reading.
+        output: Which reading; its magnitude is the norm over the channels that share the first one's unit.
+        values: The reading of all environments; of stacked calls the last one is shown.
+        env: Which environment.
+    """
+    table = touch.taxels[output.sensor]
+    pose = Pose(*sim.body_poses(env))
+    pos, normal = in_world(sim.model, pose, table["body"], table["pos"], table["normal"])
+    size = np.sqrt(table["area"]) * (table["radius"] > 0)
+    bodies = np.array(table["body"])
+    if output.rows == "body":
+        member = np.array([bodies == body for body in output.bodies])
+        pos, normal, size = (np.array([part[own].mean(axis=0) for own in member]) for part in (pos, normal, 3 * size))
+        bodies = np.array(output.bodies)
+    same = [i for i, unit in enumerate(output.units) if unit == output.units[0]]
+    read = last_step(values)[env].detach().cpu().double().numpy()[:, same]
+    value = np.linalg.norm(read, axis=1)
+    is_vector = len(same) == 3 and output.channels[0].endswith("_x")
+    stem = output.channels[0].removesuffix("_x")
+    unit, scale = "" if output.units[0] == "1" else output.units[0], 1.0
+    if unit and 0 < value.max() < 0.1:
+        scale, unit = (1e3, f"m{unit}") if value.max() >= 1e-4 else (1e6, f"µ{unit}")
+    return Dots(
+        pos=pos,
+        normal=normal,
+        size=size,
+        value=scale * value,
+        scale=scale,
+        vector=in_world(sim.model, pose, bodies, np.zeros_like(pos), read)[1] if is_vector else None,
+        quantity=f"|{stem}|" if len(same) > 1 else stem,
+        unit=unit,
+    )
+
+
+def touched(
+    touch: TactileModule, sim: Simulator, output: Output, readings: Mapping[str, Tensor], env: int
+) -> Bool[Array, " taxel"] | None:
+    """Return which taxels of a reading with noise would read something without it; None if the reading has no noise.
+
+    Args:
+        touch: The module; what it remembers is neither read nor changed.
+        sim: The scene, at the instant of the reading.
+        output: Which reading.
+        readings: All readings: where the clean one is among them, it is that one which counts.
+        env: Which environment.
+    """
+    sensor = touch.plan.sensor_of(output.name)
+    if sensor.noise is None or output.name != sensor.name:
+        return None
+    if (clean := readings.get(f"{sensor.name}/clean")) is not None:
+        return np.array(last_step(clean)[env].detach().cpu().numpy().any(axis=1))
+    state = sim.state()
+    memory = Memory(touch.plan.sensors).tensors(sim.num_envs, state.dt, touch.dtype, touch.device)
+    tensors = {name: torch.as_tensor(getattr(state, name), device=touch.device) for name in touch.inputs.fields}
+    with torch.no_grad():
+        signal = touch.core(tensors, memory)[0][f"{sensor.name}/signal"]
+    return np.array(signal[env].cpu().numpy().any(axis=0))
+
+
+def in_world(
+    model: mujoco.MjModel, pose: Pose, bodies: Iterable[str], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"]
+) -> tuple[Float[Array, "taxel 3"], Float[Array, "taxel 3"]]:
+    """Return positions and normals in the world of taxels given in the frames of their bodies, which go by name."""
+    body = np.array([model.body(name).id for name in bodies], dtype=np.int64)
+    rotation = Rotation.from_quat(pose.quat[body], scalar_first=True)
+    return pose.pos[body] + rotation.apply(np.array(pos)), rotation.apply(np.array(normal))  # SciPy wants writable arrays

@@ -1,0 +1,143 @@
+"""A hand as lines of text: forces on its fingertips with bars, joint angles, currents, temperatures, errors, age and rate."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.log.log import Fault
+from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, JOINTS
+from tgdsl.view.table import LiveTable
+
+BAR = 32
+"""Width of a full bar [characters]."""
+_PARTS = " ▏▎▍▌▋▊▉"
+_RATE_OVER_S = 1.0
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """How the readings come.
+
+    Attributes:
+        rate: Readings per second, over the last second; NaN before the second reading.
+        num_faults: Failures so far.
+        fault: The failure since the last reading; None if there was none.
+    """
+
+    rate: float
+    num_faults: int
+    fault: Fault | None
+
+
+class PulseCounter:
+    """Counts readings and failures as they come."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._times: deque[float] = deque()
+        self._num_faults = 0
+        self._fault: Fault | None = None
+
+    def add(self, event: Reading | Fault) -> Pulse:
+        """Take a reading or a failure and return how they come."""
+        if isinstance(event, Fault):
+            self._fault, self._num_faults = event, self._num_faults + 1
+            now = event.time
+        else:
+            self._fault, now = None, event.received_at
+            self._times.append(now)
+        while self._times and self._times[0] < now - _RATE_OVER_S:
+            self._times.popleft()
+        elapsed = self._times[-1] - self._times[0] if self._times else 0.0
+        return Pulse((len(self._times) - 1) / elapsed if elapsed > 0 else math.nan, self._num_faults, self._fault)
+
+
+class HandView:
+    """Draws a hand over itself on a terminal as readings and failures come; elsewhere only its last state is printed."""
+
+    def __init__(self, calibration: Calibration | None, title: str):
+        """Start with nothing.
+
+        Args:
+            calibration: What the hand's counts mean; None: they stay counts.
+            title: What to write above.
+        """
+        self._calibration = calibration or Calibration.none()
+        self._title = title
+        self._table, self._pulses = LiveTable(), PulseCounter()
+        self._lines = [title, "not one reading came"]
+        self._reading: Reading | None = None
+
+    def show(self, event: Reading | Fault, now: float | None = None) -> None:
+        """Take a reading or a failure, and draw if it is time to.
+
+        Args:
+            event: What came.
+            now: The time on its clock [s]; default: that of this moment.
+        """
+        pulse = self._pulses.add(event)
+        if not isinstance(event, Fault):
+            self._reading = event
+        if self._reading is not None:
+            age_s = self._reading.age_s(time.monotonic() if now is None else now)
+            self._lines = [self._title, *hand_lines(self._reading, self._calibration, pulse, age_s)]
+        self._table.show(self._lines)
+
+    def end(self) -> None:
+        """Draw the last state."""
+        self._table.show(self._lines, is_last=True)
+
+
+def bar(part: float, width: int = BAR) -> str:
+    """Return a bar that is full at 1, in eighths of a character; beyond 1 it is full."""
+    eighths = round(8 * width * min(max(part, 0.0), 1.0))
+    return "█" * (eighths // 8) + (_PARTS[eighths % 8] if eighths % 8 else "")
+
+
+def hand_lines(reading: Reading, calibration: Calibration, pulse: Pulse, age_s: float) -> list[str]:
+    """Return a hand's state as lines of text.
+
+    Bars are full at what 255 counts along the sensor's z mean.
+
+    Args:
+        reading: The newest reading.
+        calibration: What its counts mean.
+        pulse: How the readings come.
+        age_s: How old the reading is [s].
+    """
+    status = f"reading {reading.sequence}   age {1e3 * age_s:.0f} ms   {pulse.rate:.0f}/s   {pulse.num_faults} failures"
+    trouble = f"NO NEW READING: {pulse.fault.kind}: {pulse.fault.message}" if pulse.fault is not None else ""
+    return [status, trouble, *_tip_lines(reading, calibration), "", *_joint_lines(reading)]
+
+
+def _tip_lines(reading: Reading, calibration: Calibration) -> list[str]:
+    state = reading.state
+    force = calibration.apply(state.total_force)
+    full = float(FORCE_MAX[2]) * calibration.scale[:, 2]
+    lines = [f"{'fingertip':<18}{'x':>9}{'y':>9}{'z':>9}{'|force|':>10} {calibration.units:<7}{'°C':>4}"]
+    for i, name in enumerate(FINGERS):
+        size = float(np.linalg.norm(force[i]))
+        flags = [] if not state.is_total_saturated[i].any() else ["SATURATED"]
+        num_taxels = int(state.is_taxel_saturated[i].any(axis=-1).sum())
+        flags += [f"{num_taxels} taxels saturated"] if num_taxels else []
+        numbers = "".join(f"{value:>9.2f}" for value in force[i])
+        end = f"{bar(size / full[i]):<{BAR}} {', '.join(flags)}"
+        lines.append(f"{name:<18}{numbers}{size:>10.2f} {'':<7}{state.total_temperature[i]:>4}  {end}".rstrip())
+    return lines
+
+
+def _joint_lines(reading: Reading) -> list[str]:
+    state = reading.state
+    lines = [f"{'joint':<18}{'rad':>9}{'mA':>9}{'°C':>9}  errors of its three boards"]
+    for i, name in enumerate(JOINTS):
+        errors = "–" if not state.joint_error[i].any() else " ".join(f"{code:#06x}" for code in state.joint_error[i])
+        numbers = f"{state.position[i]:>9.3f}{state.current[i]:>9}{state.joint_temperature[i] & 0xFF:>9}"
+        lines.append(f"{name.replace('_joint', ' '):<18}{numbers}  {errors}")
+    return lines

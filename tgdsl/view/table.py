@@ -1,0 +1,77 @@
+"""Readings as a table of text: one row per link, one column per sensor."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import TextIO
+
+import numpy as np
+from torch import Tensor
+
+from tgdsl.console.tables import TaxelTable
+from tgdsl.module.history import last_step
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+
+
+def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) -> list[str]:
+    """Return the readings of one environment, link by link.
+
+    Each reading has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
+    of taxels in contact; any other vector, and any other channel, as the largest magnitude. Readings of bodies show the
+    link's body; those of joints and actuators are of no link, and are left out.
+    """
+    taxels = touch.taxels
+    outputs = [output for output in touch.outputs if output.rows in ("taxel", "body")]
+    links = list(dict.fromkeys(link for sensor in taxels.values() for link in sensor["link"]))
+    header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in outputs]
+    rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = [
+        "  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))
+        for row in [header, *rows]
+    ]
+    return [lines[0], "  ".join("─" * width for width in widths), *lines[1:]]
+
+
+def _summary_unit(output: Output) -> str:
+    return "taxels" if output.channels == ("contact",) else output.units[0]
+
+
+def _cell(taxels: TaxelTable, output: Output, readings: Mapping[str, Tensor], link: str, env: int) -> str:
+    own = taxels["link"] == link
+    if not own.any():
+        return "–"
+    values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
+    values = values[[output.bodies.index(taxels["body"][own][0])]] if output.rows == "body" else values[own]
+    if output.channels == ("contact",):
+        return f"{int(values.sum())}/{len(values)}"
+    if output.channels[:3] == ("force_x", "force_y", "force_z"):
+        return f"{np.linalg.norm(values[:, :3].sum(axis=0)):.3f}"
+    is_vector = output.channels[0].endswith("_x")
+    return f"{np.linalg.norm(values[:, : 3 if is_vector else 1], axis=1).max():.2e}"
+
+
+class LiveTable:
+    """A table that is drawn over itself on a terminal; elsewhere only its last state is printed."""
+
+    def __init__(self, stream: TextIO | None = None, period: float = 0.1):
+        """Draw to a stream (default: standard output), at most once per period [s]."""
+        self._stream = stream or sys.stdout
+        self._period = period
+        self._drawn = 0
+        self._last = 0.0
+
+    def show(self, lines: list[str], is_last: bool = False) -> None:
+        """Draw the table if it is time to, or if it is the last one."""
+        is_terminal = self._stream.isatty()
+        if not is_last and (not is_terminal or time.monotonic() - self._last < self._period):
+            return
+        self._last = time.monotonic()
+        if is_terminal and self._drawn:
+            self._stream.write(f"\x1b[{self._drawn}A\x1b[J")
+        self._stream.write("\n".join(lines) + "\n")
+        self._stream.flush()
+        self._drawn = len(lines)
