@@ -23,11 +23,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import tgdsl
-from tgdsl.compiler.felt import FeltGeom
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.quantities.moments.fields import moment_sums
-from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 
 SCENE = """
@@ -102,7 +101,7 @@ def converged(state: SceneState, num_taxels: int) -> Tensor:
     """Return the normal force of the first environments' probes, −k ρ S0 [N], from a sum over points every 0.1 mm."""
     assert state.body_pos is not None and state.body_quat is not None
     geom = Geom(0, "", "", "cube", "box", np.full(3, 0.02), np.zeros(3), np.eye(3), True)
-    surface = outer_surface([FeltGeom(geom, None)], 1e-4).quadrature(1e-4)
+    surface = outer_surface([SurfaceGeom(geom, None)], 1e-4).quadrature(1e-4)
     place, turn = state.body_pos[:TRUE_ENVS].double().cpu().numpy(), state.body_quat[:TRUE_ENVS].double().cpu().numpy()
     cube, pad = 0, 1  # the bodies are sorted by name
     forces = []

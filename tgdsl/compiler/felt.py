@@ -17,33 +17,12 @@ from tgdsl.plan.plan import ContactPart
 from tgdsl.quantities.contact_depth.bake import bake
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
 from tgdsl.schema.select import matching
-from tgdsl.surfaces.geom import Geom
-from tgdsl.surfaces.surface import Surface
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
 
 HULL_POINTS = 2000
 """Points of a convex hull whose distance to the mesh is looked at."""
 Report = Callable[[str, str], None]
 """Called with what is wrong with an object, and a hint."""
-
-
-@dataclass(frozen=True, eq=False)
-class FeltGeom:
-    """A geom that can be felt.
-
-    Attributes:
-        geom: The compiled geom.
-        surface: Its triangles in its own frame; None for a primitive.
-        mesh: The mesh whose convex hull the surface is, in the same frame; None if it is none.
-    """
-
-    geom: Geom
-    surface: Surface | None
-    mesh: Surface | None = None
-
-    @property
-    def shape(self) -> str:
-        """The primitive's type, or `mesh`."""
-        return self.geom.shape if self.surface is None else "mesh"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +53,7 @@ class FeltBody:
     """
 
     body: str
-    variants: tuple[tuple[FeltGeom, ...], ...]
+    variants: tuple[tuple[SurfaceGeom, ...], ...]
     is_sized: bool
     bodies: tuple[int, ...]
     touched: frozenset[int]
@@ -150,14 +129,14 @@ def contact_parts(scene: Model, felt: FeltBody, report: Report) -> tuple[Contact
     return tuple(parts) or (ContactPart("body", felt.body),)
 
 
-def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[FeltGeom, ...]:
+def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[SurfaceGeom, ...]:
     felt = []
     for geom in geoms:
         if geom.shape == "mesh":
             mesh = scene.mesh(geom)
-            felt.append(FeltGeom(geom, scene.hull(geom), mesh) if target.surface == "collision" else FeltGeom(geom, mesh))
+            felt.append(SurfaceGeom(geom, scene.hull(geom), mesh) if target.surface == "collision" else SurfaceGeom(geom, mesh))
         elif geom.shape in SHAPES:
-            felt.append(FeltGeom(geom, None))
+            felt.append(SurfaceGeom(geom, None))
         else:
             what = f'{geom.shown} of body "{body}" is of type {geom.shape}, which cannot be felt'
             report(what, f"types that can: {', '.join(SHAPES)}, mesh")
@@ -178,7 +157,7 @@ def _chosen(own: tuple[Geom, ...], body: str, target: ObjectSpec, report: Report
     return named
 
 
-def settle(felt: FeltGeom, target: ObjectSpec, margin: float, name: str) -> Settled:
+def settle(felt: SurfaceGeom, target: ObjectSpec, margin: float, name: str) -> Settled:
     """Bake a mesh, or keep its triangles, as the object's query says; a primitive needs neither.
 
     Args:
@@ -205,7 +184,7 @@ def settle(felt: FeltGeom, target: ObjectSpec, margin: float, name: str) -> Sett
     return Settled(baked.method, arrays, {**accuracy, "tolerance": target.tolerance, "cell": baked.cell})
 
 
-def _warn_of_hull(felt: FeltGeom, margin: float, name: str) -> None:
+def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
     """MuJoCo collides convex hulls: say so where a hull stands further off the mesh than any probe reaches."""
     hull = felt.surface
     if hull is None or felt.mesh is None:

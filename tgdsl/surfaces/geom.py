@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.surfaces.surface import Surface
+
 
 @dataclass(frozen=True, eq=False)
 class Geom:
@@ -48,3 +50,23 @@ class Geom:
     def shown(self) -> str:
         """How a message names it."""
         return f'geom "{self.name or self.mesh}"' if self.names else f"unnamed {self.shape} geom {self.id}"
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceGeom:
+    """A geom whose distance, area or points are wanted: a primitive, or triangles.
+
+    Attributes:
+        geom: The compiled geom.
+        surface: Its triangles in its own frame; None for a primitive.
+        mesh: The mesh whose convex hull the surface is, in the same frame; None if it is none.
+    """
+
+    geom: Geom
+    surface: Surface | None
+    mesh: Surface | None = None
+
+    @property
+    def shape(self) -> str:
+        """The primitive's type, or `mesh`."""
+        return self.geom.shape if self.surface is None else "mesh"

@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from scipy.special import elliprg
 
-from tgdsl.compiler.felt import FeltGeom
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.shapes import SHAPES
+from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.solid import Solid, halved
 
 SECTIONS = 128
@@ -102,7 +102,7 @@ class Pieces:
         return (weight[:, :, None] * self.corners[piece]).sum(axis=1) + off, piece
 
 
-def outer_surface(geoms: Sequence[FeltGeom], spacing: float) -> Pieces:
+def outer_surface(geoms: Sequence[SurfaceGeom], spacing: float) -> Pieces:
     """Return the outer surface of an object's geoms, planes left out, in pieces not longer than a spacing.
 
     Args:
@@ -129,7 +129,7 @@ class _Geom:
     """Area of the true surface over that of the triangles."""
 
     @staticmethod
-    def of(felt: FeltGeom, spacing: float) -> _Geom:
+    def of(felt: SurfaceGeom, spacing: float) -> _Geom:
         geom = felt.geom
         solid = None if felt.surface is None else Solid(felt.surface, leaf=spacing / CUT)
         corners = _triangles(felt.shape, geom.size, spacing) if solid is None else solid.corners

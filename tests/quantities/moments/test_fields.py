@@ -6,14 +6,13 @@ import torch
 from scipy.integrate import quad
 from surfaces import box, surface_of
 
-from tgdsl.compiler.felt import FeltGeom
 from tgdsl.errors import BakeError
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments import fields as moments
 from tgdsl.quantities.moments.clouds import sample_cloud, sample_points
 from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
 from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments
-from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 
 R = 0.01
@@ -29,7 +28,7 @@ def cache(tmp_path_factory, monkeypatch):
 def felt(shape, size, pos=(0, 0, 0), surface=None):
     whole = np.array([*size, 0, 0][:3], float)
     kind = "mesh" if surface is not None else shape
-    return FeltGeom(Geom(0, "", "", "body", kind, whole, np.array(pos, float), np.eye(3), True), surface)
+    return SurfaceGeom(Geom(0, "", "", "body", kind, whole, np.array(pos, float), np.eye(3), True), surface)
 
 
 CUBE, BALL, CAN = felt("box", [0.02] * 3), felt("sphere", [0.02]), felt("cylinder", [0.012, 0.02])

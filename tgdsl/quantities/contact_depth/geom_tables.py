@@ -6,15 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltGeom, Settled
+from tgdsl.compiler.felt import Settled
 from tgdsl.compiler.variants import aligned
+from tgdsl.surfaces.geom import SurfaceGeom
 
-Placed = tuple[FeltGeom, Settled]
+Placed = tuple[SurfaceGeom, Settled]
 Rows = Sequence[Sequence[Placed | None]]
 
 
 def placed_geoms(
-    variants: Sequence[Sequence[FeltGeom]], settled: Sequence[Sequence[Settled]]
+    variants: Sequence[Sequence[SurfaceGeom]], settled: Sequence[Sequence[Settled]]
 ) -> tuple[tuple[str, ...], list[list[Placed | None]]]:
     """Return how the distance to each geom of an object is found, and the geoms that its variants have there."""
     shapes, tables = aligned([[part.shape for part in variant] for variant in settled])

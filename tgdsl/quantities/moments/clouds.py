@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from tgdsl.compiler.felt import FeltGeom
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
 from tgdsl.quantities.moments.fields import AREA_RADIUS, moments_key, surface_area
+from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 
 SLACK = 1e-6
@@ -47,7 +47,7 @@ class Cloud:
     cell: float
 
 
-def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:
+def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.ndarray, "n 3"], float]:
     """Return points drawn alike from all of an object's outer surface [m], always the same ones, and its whole area [m²].
 
     Points that are near each other mostly follow each other, so that those in contact are in few runs. Kept in the user's cache
@@ -73,13 +73,13 @@ def sample_points(geoms: Sequence[FeltGeom], count: int) -> tuple[Float[np.ndarr
     )
 
 
-def _extent(felt: FeltGeom) -> float:
+def _extent(felt: SurfaceGeom) -> float:
     """Return about how long a geom is [m]."""
     return float(np.ptp(felt.surface.vertices, axis=0).max() if felt.surface is not None else 2 * felt.geom.size.max())
 
 
 def sample_cloud(
-    geoms: Sequence[FeltGeom], radius: float, count: int, budget: int = 64 * 2**20, radius_noise: float = 0.0
+    geoms: Sequence[SurfaceGeom], radius: float, count: int, budget: int = 64 * 2**20, radius_noise: float = 0.0
 ) -> Cloud:
     """Return points drawn alike from all of an object's outer surface (the paper's backend), always the same ones.
 
@@ -112,7 +112,7 @@ def _unpacked_cloud(found: Mapping[str, np.ndarray]) -> Cloud:
     return Cloud(points, float(found["weight"]), lists, (x, y, z), found["origin"], float(found["cell"]))
 
 
-def _sample(geoms: Sequence[FeltGeom], radius: float, count: int, budget: int, radius_noise: float) -> Cloud:
+def _sample(geoms: Sequence[SurfaceGeom], radius: float, count: int, budget: int, radius_noise: float) -> Cloud:
     pieces = outer_surface(geoms, radius / 4)
     if not len(pieces.area):
         raise BakeError("there is no surface to sample: planes are exact")

@@ -22,11 +22,11 @@ import torch
 from jaxtyping import Float
 from scipy.ndimage import spline_filter
 
-from tgdsl.compiler.felt import FeltGeom
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments.moments import MomentField, field_moments
+from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.quadrature import Pieces, Quadrature, outer_surface
 
 FORMAT = b"tgdsl moments 2"
@@ -86,7 +86,7 @@ class BakedField:
     errors: FieldErrors
 
 
-def surface_area(geoms: Sequence[FeltGeom]) -> float:
+def surface_area(geoms: Sequence[SurfaceGeom]) -> float:
     """Return the area of an object's outer surface, planes left out [m²]."""
     return cache.cached(
         moments_key(geoms, b"area", AREA_RADIUS),
@@ -97,7 +97,7 @@ def surface_area(geoms: Sequence[FeltGeom]) -> float:
 
 
 def bake_field(
-    geoms: Sequence[FeltGeom],
+    geoms: Sequence[SurfaceGeom],
     radius: float,
     tolerance: float = 5e-3,
     gradient_tolerance: float | None = None,
@@ -133,7 +133,7 @@ def bake_field(
     )
 
 
-def moments_key(geoms: Sequence[FeltGeom], what: bytes, *limits: float | int) -> str:
+def moments_key(geoms: Sequence[SurfaceGeom], what: bytes, *limits: float | int) -> str:
     """Return the key of what is computed of some geoms."""
     arrays = [np.array(limits, float)]
     for felt in geoms:
@@ -172,7 +172,7 @@ class Truth(NamedTuple):
     gradients: Float[np.ndarray, "n 4 3"] | None
 
 
-def _bake(geoms: Sequence[FeltGeom], radius: float, limits: Limits, with_slope: bool) -> BakedField:
+def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slope: bool) -> BakedField:
     tolerance, gradient_tolerance, budget = limits
     least = 4.0 if gradient_tolerance is None else float(np.clip(1 / gradient_tolerance, 4, GRADIENT_FINENESS))
     # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.

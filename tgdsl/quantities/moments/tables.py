@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.compiler.felt import FeltBody, FeltGeom
+from tgdsl.compiler.felt import FeltBody
 from tgdsl.errors import BakeError, LowerError
 from tgdsl.plan.plan import Pair, PlannedMoments
 from tgdsl.quantities.moments.clouds import sample_cloud
 from tgdsl.quantities.moments.fields import FieldErrors, bake_field, surface_area
 from tgdsl.sensors.base import MomentsRequest
+from tgdsl.surfaces.geom import SurfaceGeom
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +68,13 @@ def moment_tables(felt: FeltBody, request: MomentsRequest, radii: Sequence[float
     return MomentTables(tuple(radii), area, arrays, tuple(accuracy))
 
 
-def _planes(geoms: Sequence[FeltGeom]) -> dict[str, np.ndarray]:
+def _planes(geoms: Sequence[SurfaceGeom]) -> dict[str, np.ndarray]:
     pos, rotation = [part.geom.pos for part in geoms], [part.geom.rotation for part in geoms]
     return {"plane_pos": np.reshape(pos, (-1, 3)), "plane_rotation": np.reshape(rotation, (-1, 9))}
 
 
 def _fields(
-    variants: Sequence[tuple[FeltGeom, ...]], request: MomentsRequest, radii: Sequence[float]
+    variants: Sequence[tuple[SurfaceGeom, ...]], request: MomentsRequest, radii: Sequence[float]
 ) -> tuple[dict[str, np.ndarray], list[Mapping[str, float]]]:
     """Return the fields of all variants and radii, one after the other, and their accuracy."""
     baked, left = [], request.max_bytes
@@ -107,7 +108,7 @@ def _measured(errors: FieldErrors) -> dict[str, float]:
     return {name: value for name, value in dataclasses.asdict(errors).items() if value is not None}
 
 
-def _clouds(variants: Sequence[tuple[FeltGeom, ...]], request: MomentsRequest, radius: float) -> dict[str, np.ndarray]:
+def _clouds(variants: Sequence[tuple[SurfaceGeom, ...]], request: MomentsRequest, radius: float) -> dict[str, np.ndarray]:
     """Return the points of all variants and their lists; the last row is out of reach of everything."""
     budget, noise = request.max_bytes // len(variants), request.radius_noise
     clouds = [sample_cloud(geoms, radius, request.num_points, budget, noise) for geoms in variants]

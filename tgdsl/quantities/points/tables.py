@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltBody, FeltGeom, Settled
+from tgdsl.compiler.felt import FeltBody, Settled
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import BakeError, LowerError
 from tgdsl.layout.layout import Layout
@@ -14,8 +14,9 @@ from tgdsl.plan.plan import Pair, PlannedPoints, PlannedSkin
 from tgdsl.quantities.contact_depth.geom_tables import Placed, accuracy, is_centred, placed_geoms
 from tgdsl.quantities.moments.clouds import sample_points
 from tgdsl.sensors.base import PointsRequest
+from tgdsl.surfaces.geom import SurfaceGeom
 
-Skin = tuple[tuple[FeltGeom, ...], tuple[Settled, ...]]
+Skin = tuple[tuple[SurfaceGeom, ...], tuple[Settled, ...]]
 """A link's own geoms, and how the distance to each is found."""
 
 
@@ -41,10 +42,10 @@ def cloud(felt: FeltBody, num_points: int) -> dict[str, np.ndarray]:
     }
 
 
-def own_geoms(resolved: Resolved, link: str) -> tuple[FeltGeom, ...]:
+def own_geoms(resolved: Resolved, link: str) -> tuple[SurfaceGeom, ...]:
     """Return the geoms that a link's taxels sit on: meshes as they are, not their convex hulls."""
     geoms = resolved.patches[link].geoms
-    return tuple(FeltGeom(geom, resolved.robot.mesh(geom) if geom.shape == "mesh" else None) for geom in geoms)
+    return tuple(SurfaceGeom(geom, resolved.robot.mesh(geom) if geom.shape == "mesh" else None) for geom in geoms)
 
 
 def skin_rows(skins: Mapping[str, Skin]) -> tuple[tuple[str, ...], list[list[Placed | None]]]:
