@@ -14,7 +14,8 @@ from tgdsl.compiler.scene import instrument, scene_file
 from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import save_plan
-from tgdsl.plan.plan import Inputs, Pair, contact_sensor_names
+from tgdsl.plan.inputs import Inputs, contact_sensor_names
+from tgdsl.quantities.pairs import Pair
 from tgdsl.scene.scene import scene_model
 
 ROBOTS = Path(__file__).parents[2] / "robots"

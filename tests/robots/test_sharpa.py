@@ -190,9 +190,9 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte():
 @pytest.mark.parametrize("resolution", COUNTS)
 def test_counts_are_the_papers(document, resolution):
     plan = compile_plan(document, {"resolution": resolution})
-    layout = plan.layout()
-    per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.links)}
-    assert {group: sum(per_link[name] for name in names) for group, names in plan.groups.items()} == COUNTS[resolution]
+    layout = plan.layout
+    per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
+    assert {group: sum(per_link[name] for name in names) for group, names in plan.layout.groups.items()} == COUNTS[resolution]
     wanted = PER_LINK[resolution]
     for name, count in per_link.items():
         whole = name.removeprefix("right_")
@@ -206,8 +206,8 @@ def test_counts_are_the_papers(document, resolution):
 def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
     """MuJoCo collides convex hulls: they may leave out a little of a pad, and only the palm's hollow is spanned by one."""
     plan = compile_plan(document, {"resolution": "high"})
-    layout, robot = plan.layout(), load_model(MODEL)
-    for i, link in enumerate(plan.links):
+    layout, robot = plan.layout, load_model(MODEL)
+    for i, link in enumerate(plan.layout.links):
         pos = layout.pos[layout.link_id == i]
         geoms = robot.touchable(link.body)
         surface = robot.surface(geoms)
@@ -228,11 +228,11 @@ def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
 def test_pads_face_away_from_the_bone(document):
     """In the straight hand all fingers' taxels look out of the palm, as the palm's own do; a thumb's look along its pad."""
     plan = compile_plan(document, {"resolution": "high"})
-    layout, hand = plan.layout(), mujoco.MjModel.from_xml_path(str(MODEL))
+    layout, hand = plan.layout, mujoco.MjModel.from_xml_path(str(MODEL))
     data = mujoco.MjData(hand)
     mujoco.mj_forward(hand, data)
     thumb = data.body("right_thumb_DP").xmat.reshape(3, 3)[:, 1]
-    for i, link in enumerate(plan.links):
+    for i, link in enumerate(plan.layout.links):
         chosen = layout.link_id == i
         normal = layout.normal[chosen] @ data.body(link.body).xmat.reshape(3, 3).T
         outward = thumb if "thumb" in link.name else np.array([1.0, 0.0, 0.0])

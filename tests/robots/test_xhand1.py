@@ -65,9 +65,9 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte(tmp_path):
 @pytest.mark.parametrize("resolution", COUNTS)
 def test_counts_are_the_papers(resolution):
     plan = compile_plan(EXAMPLE, {"resolution": resolution})
-    layout = plan.layout()
-    per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.links)}
-    assert {group: sum(per_link[name] for name in names) for group, names in plan.groups.items()} == COUNTS[resolution]
+    layout = plan.layout
+    per_link = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(plan.layout.links)}
+    assert {group: sum(per_link[name] for name in names) for group, names in plan.layout.groups.items()} == COUNTS[resolution]
     np.testing.assert_allclose(np.linalg.norm(layout.normal, axis=1), 1, atol=1e-12)
     np.testing.assert_allclose((layout.normal * layout.tangent).sum(axis=1), 0, atol=1e-12)
 

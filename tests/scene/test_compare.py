@@ -14,7 +14,8 @@ from tgdsl.compiler.variants import NewBody, OwnObjects, with_bodies
 from tgdsl.errors import RobotError
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan
-from tgdsl.plan.plan import Inputs, Pair
+from tgdsl.plan.inputs import Inputs
+from tgdsl.quantities.pairs import Pair
 from tgdsl.scene.compare import PLACES, differing
 from tgdsl.scene.scene import compiled, scene_model
 

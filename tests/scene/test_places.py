@@ -18,7 +18,8 @@ from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.files.files import robots_folder
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan
-from tgdsl.plan.plan import Asset, Inputs
+from tgdsl.plan.inputs import Inputs
+from tgdsl.plan.scene import Asset
 from tgdsl.scene.scene import portable, scene_model
 
 SCENE = """<mujoco>

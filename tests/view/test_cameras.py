@@ -64,7 +64,7 @@ def cameras(touch, sim) -> tuple[Dots, Camera, Camera]:
     dots = dots_of(touch, sim, touch.outputs[0], touch(state)["depth"], 0)
     pose, palm = Pose(*sim.body_poses(0)), sim.model.body("palm").id
     hand = solid_of(sim.model, pose, {palm, sim.model.body("tip").id})
-    chosen = best_camera(dots, hand, sim.model, touch.plan.layout(), pose, palm)
+    chosen = best_camera(dots, hand, sim.model, touch.plan.layout, pose, palm)
     return dots, camera_for(dots, pose.pos[palm]), chosen
 
 
@@ -74,7 +74,7 @@ def test_a_fingertip_is_not_drawn_from_behind(tmp_path):
     sim.step()
     dots, first, chosen = cameras(touch, sim)
     assert in_view(sim, dots, first) == 0
-    layout, pose = touch.plan.layout(), Pose(*sim.body_poses(0))
+    layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
     most = max(in_view(sim, dots, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
     assert in_view(sim, dots, chosen) >= max(most, 1)
 
@@ -123,7 +123,7 @@ def test_views_that_are_none(view, message):
 def test_angles_turn_about_the_hand(tmp_path):
     """By the definition: round the up axis from the mean normal, then up."""
     touch, sim = finger(tmp_path, [-1, 0, 0])
-    layout, pose = touch.plan.layout(), Pose(*sim.body_poses(0))
+    layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
     for around, rise in ((0, 0), (90, 0), (0, 90), (35, 20), (200, -40)):
         toward = camera_of(f"{around},{rise}", sim.model, [layout], pose, 1).toward
         a, r = np.radians([around, rise])

@@ -305,9 +305,9 @@ def test_a_document_has_the_taxels_of_its_sensors_at_its_resolution(folder: Path
 def test_the_layout_drawn_is_the_layout_compiled(folder: Path) -> None:
     plan = tgdsl.compile(folder / "hand.yaml").plan
     drawn = layouts(folder / "hand.yaml")[1]["many"]
-    assert drawn.links == plan.layout().links
+    assert drawn.links == plan.layout.links
     for name in ("link_id", "pos", "normal", "tangent", "radius", "area", "cell"):
-        np.testing.assert_array_equal(getattr(drawn, name), getattr(plan.layout(), name))
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(plan.layout, name))
 
 
 def test_mistakes_of_documents(folder: Path, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ class Compile:
         with StatusLine() as progress:
             plan = compile_plan(self.document, parsed_overrides(self.set), progress=progress)
         size = save_plan(plan, with_folder(out))
-        layout = plan.layout()
+        layout = plan.layout
         sensors = ", ".join(f"{s.name} ({s.kind}, {s.rows[1] - s.rows[0]})" for s in plan.sensors)
         print(f"{layout.num_taxels} taxels on {len(layout.links)} links at resolution {plan.origin.resolution}")
         print(f"sensors: {sensors}")

@@ -168,4 +168,4 @@ class Render:
         resolution = plan.origin.resolution
         if self.set or self.layout or set(self.resolutions) - {resolution}:
             raise TgdslError(f'an artefact has the layout and resolution it was compiled with, "{resolution}", and no other')
-        return scene_model(plan.scene), {resolution: plan.layout()}
+        return scene_model(plan.scene), {resolution: plan.layout}

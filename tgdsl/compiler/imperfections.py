@@ -14,12 +14,12 @@ from tgdsl.layout.layout import Layout, Link
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import select
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Lowered, ProbeSpec
+from tgdsl.sensors.base import Axis, Lowered, SensorSpec
 from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
 from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise
 
 
-def measured_spec(spec: ProbeSpec, knobs: Sequence[Knobs]) -> ProbeSpec:
+def measured_spec(spec: SensorSpec, knobs: Sequence[Knobs]) -> SensorSpec:
     """Return the spec of the measured reading: knobs may set what is a field of the sensor's own.
 
     Raises:
@@ -69,10 +69,11 @@ def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Lin
 
 def imperfections(
     name: str,
-    spec: ProbeSpec,
+    spec: SensorSpec,
     kind: Kind,
     knobs: Sequence[Knobs],
     lowered: Lowered,
+    rows: Axis,
     layout: Layout,
     named: Mapping[str, NoiseSpec],
 ) -> LoweredNoise | None:
@@ -84,6 +85,7 @@ def imperfections(
         kind: Its kind.
         knobs: The knobs of each of its links.
         lowered: The sensor, lowered.
+        rows: What its reading has rows of.
         layout: Its taxels.
         named: The noise profiles of the document.
 
@@ -103,11 +105,13 @@ def imperfections(
             Knobs.model_validate({"release_threshold": release}).over(own) if own.release_threshold is None else own
             for own in sets
         ]
-    first_link = [[link.body for link in layout.links].index(body) for body in layout.bodies]
-    which = of_link[layout.link_id] if lowered.rows == "taxel" else of_link[first_link]
+    if rows.link_id is None and len(different) > 1:
+        what = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
+        raise LowerError(what, field="noise", hint="leave `links` of the noise out")
+    which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
     channels = [channel.name for channel in lowered.signal or lowered.channels]
     sets = [_without_idle(name, kind, own) for own in sets]
-    noise = lower_noise(sets, which, channels, layout, lowered.rows == "taxel")
+    noise = lower_noise(sets, which, channels, layout, rows.name == "taxel")
     return noise if noise.terms else None
 
 

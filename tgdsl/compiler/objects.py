@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Set
 from dataclasses import replace
 
-from tgdsl.compiler.felt import FeltBody, felt_body
+from tgdsl.compiler.sensed import sensed_object
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.errors import did_you_mean
 from tgdsl.formats.robot import Model
-from tgdsl.plan.plan import SceneObject
+from tgdsl.plan.scene import SceneObject
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.yaml import Path
+from tgdsl.surfaces.sensed import SensedObject
 
 
 def own_objects(loaded: Loaded, scene: Model, links: Set[str]) -> tuple[Model, OwnObjects]:
@@ -64,12 +65,12 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
     return tuple(new)
 
 
-def felt_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, FeltBody]:
+def sensed_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, SensedObject]:
     """Return the objects that some sensor feels."""
-    felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.feels}
+    felt = {name for sensor in loaded.spec.sensors.values() for name in sensor.objects}
     with_geoms: dict[str, SceneObject] = {target.name: target for target in own.objects if target.types}
     is_faulty = bool(loaded.problems)
-    objects: dict[str, FeltBody] = {}
+    objects: dict[str, SensedObject] = {}
     for name, target in loaded.spec.objects.items():
         path: Path = ("objects", name, "body" if target.body is not None else "geom")
         body = target.body_of(name)
@@ -84,7 +85,7 @@ def felt_objects(loaded: Loaded, scene: Model, own: OwnObjects) -> dict[str, Fel
             loaded.problems.append(loaded.problem(at, what, hint))
 
         variants = variant_scenes(scene, with_geoms[name], own.meshes.contents) if target.compounds else []
-        found = felt_body(body, target, scene, variants, _others(loaded, body), report)
+        found = sensed_object(name, body, target, scene, variants, _others(loaded, body), report)
         if name in felt:
             objects[name] = found
     return objects

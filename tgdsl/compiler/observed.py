@@ -14,7 +14,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.observations import observations
 from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
 from tgdsl.observations.proprioception import QUANTITIES, JointObservation, JointSpec
-from tgdsl.plan.plan import PlannedObservation, PlannedReading, PlannedSensor
+from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
@@ -42,7 +42,6 @@ def observed(
     resolved: Resolved,
     sensors: Sequence[PlannedSensor],
     layouts: Mapping[str, Layout],
-    arrays: dict[str, np.ndarray],
 ) -> Observed:
     """Return a document's observations; what is wrong with one is noted among the document's problems.
 
@@ -51,7 +50,6 @@ def observed(
         resolved: Its meaning on the robot.
         sensors: The planned sensors.
         layouts: The taxels of each, by its name.
-        arrays: Takes what is folded for an observation.
     """
     specs = [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
     own = robot_joints(resolved.robot, resolved.scene)
@@ -67,13 +65,13 @@ def observed(
     terms: list[PlannedObservation] = []
     for group, i, spec in specs:
         if isinstance(spec, OfReading):
-            terms += _of_reading(loaded, group, i, spec, found, arrays)
+            terms += _of_reading(loaded, group, i, spec, found)
         elif isinstance(spec, JointObservation):
             rows = joints if QUANTITIES[spec.type].rows == "joint" else actuators
-            terms.append(_of_joints(group, i, spec, chosen[group, i], rows, arrays))
+            terms.append(_of_joints(group, i, spec, chosen[group, i], rows))
         else:
             count = observations.HAND_ONLY.get(spec.type, 0)
-            terms.append(PlannedObservation(group, i, spec.type, None, (), (), count))
+            terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
     types = {spec.type for _, _, spec in specs}
     return Observed(tuple(terms), _proprioception(types, joints, actuators, own), joints, actuators)
 
@@ -84,7 +82,6 @@ def _of_reading(
     i: int,
     spec: ReadingSpec,
     found: Mapping[str, tuple[PlannedReading, Layout]],
-    arrays: dict[str, np.ndarray],
 ) -> list[PlannedObservation]:
     """Return the observation of a sensor's reading, or nothing if it is wrong."""
     path: Path = ("observations", group, i)
@@ -103,13 +100,11 @@ def _of_reading(
             loaded.problems.append(loaded.problem(path, what, has))
             return []
     constants = observations.lower(spec, layout)
-    for name, value in constants.items():
-        arrays[f"observations/{group}/{i}/{name}"] = value
     channels = tuple(reading.channels.index(channel) for channel in wanted)
     per_call = observations.num_features(spec.type, len(channels), reading.num_rows, len(layout.links))
     axes = spec.axes if isinstance(spec, observations.AggForceObservation) else ""
     count = max(reading.steps, 1) * per_call
-    return [PlannedObservation(group, i, spec.type, spec.of, channels, tuple(sorted(constants)), count, axes)]
+    return [PlannedObservation(group, i, spec.type, spec.of, channels, count, dict(sorted(constants.items())), axes)]
 
 
 def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: PlannedReading) -> tuple[str, ...]:
@@ -182,11 +177,8 @@ def _of_joints(
     spec: JointSpec,
     chosen: Sequence[str],
     wanted: Sequence[str],
-    arrays: dict[str, np.ndarray],
 ) -> PlannedObservation:
     """Return the observation of a reading of joints or actuators."""
-    constants: tuple[str, ...] = ()
-    if list(chosen) != list(wanted):
-        constants = ("rows",)
-        arrays[f"observations/{group}/{i}/rows"] = np.array([wanted.index(name) for name in chosen], dtype=np.int64)
-    return PlannedObservation(group, i, spec.type, spec.type, (0,), constants, len(chosen))
+    is_all = list(chosen) == list(wanted)
+    constants = {} if is_all else {"rows": np.array([wanted.index(name) for name in chosen], dtype=np.int64)}
+    return PlannedObservation(group, i, spec.type, spec.type, (0,), len(chosen), constants)

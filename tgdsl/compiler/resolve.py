@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl.compiler.felt import FeltBody
-from tgdsl.compiler.objects import felt_objects, own_objects
+from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
@@ -22,8 +21,10 @@ from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
-from tgdsl.surfaces.geom import Geom
+from tgdsl.sensors.base import SensorSpec
+from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.region import cut
+from tgdsl.surfaces.sensed import SensedObject
 from tgdsl.surfaces.surface import Surface
 
 
@@ -50,16 +51,18 @@ class Resolved:
         robot: The robot's own model.
         unused: What has taxels or can be felt but is not needed, and why.
         patches: The links that carry taxels.
+        on_links: The sensors that have a place on each link, whatever its taxels.
     """
 
     layout: Layout
     links: dict[str, tuple[str, ...]]
-    objects: dict[str, FeltBody]
+    objects: dict[str, SensedObject]
     own: OwnObjects
     scene: Model
     robot: Model
     unused: tuple[tuple[str, str], ...]
     patches: Mapping[str, Patch]
+    on_links: frozenset[str] = frozenset()
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -72,6 +75,20 @@ class Resolved:
             return cut(surface, region) if region else surface
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
+
+    def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
+        """Return the geoms that a link's taxels sit on: meshes as they are, not their convex hulls."""
+        geoms = self.patches[link].geoms
+        return tuple(SurfaceGeom(geom, self.robot.mesh(geom) if geom.shape == "mesh" else None) for geom in geoms)
+
+    def layout_on(self, sensor: str) -> tuple[np.ndarray, Layout]:
+        """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
+        names = self.links[sensor]
+        if sensor in self.on_links:
+            links = tuple(Link(name, name) for name in names)
+            return np.zeros(0, dtype=np.int64), Layout.of_links(links, self.layout.groups)
+        taxels = self.layout.taxels_of(names)
+        return taxels, self.layout.take(taxels)
 
 
 def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
@@ -89,7 +106,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     robot, scene = _models(loaded)
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
-    objects: dict[str, FeltBody] = {}
+    objects: dict[str, SensedObject] = {}
     own = OwnObjects()
     if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
         _check_groups(loaded.layout, robot, loaded.problems)
@@ -100,10 +117,12 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
         scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
-        objects = felt_objects(loaded, scene, own)
+        objects = sensed_objects(loaded, scene, own)
     loaded.raise_problems()
     assert robot is not None and scene is not None and loaded.layout is not None
-    needed = {name for names in links.values() for name in names} if links else {patch.link.name for patch in patches}
+    on_links = frozenset(name for name, sensor in loaded.spec.sensors.items() if not sensor.is_on_taxels)
+    needed = {link for name, own in links.items() for link in own if name not in on_links}
+    needed = needed if links else {patch.link.name for patch in patches}
     layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
@@ -112,7 +131,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     welded = {scene.compiled.body(i).name for felt in objects.values() for i in felt.bodies}
     others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {patch.link.name: patch for patch in patches})
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {p.link.name: p for p in patches}, on_links)
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
@@ -243,6 +262,9 @@ def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: l
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
         _check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
+        if not sensor.is_on_taxels:
+            links[name] = _links_chosen(loaded, layout, robot, sensor, path)
+            continue
         missing: list[Problem] = []
         chosen = select(sensor.links, candidates, layout.spec.groups, _reporter(loaded, path, missing), elsewhere=known)
         if missing:
@@ -256,6 +278,17 @@ def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: l
             loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
         links[name] = tuple(patches[i].link.name for i in chosen)
     return links
+
+
+def _links_chosen(loaded: Loaded, layout: LoadedLayout, robot: Model, sensor: SensorSpec, path: Path) -> tuple[str, ...]:
+    """Return the bodies of a sensor that has a place on each link."""
+    bodies = [body for body in robot.bodies if body != "world"]
+    own = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
+    before = len(loaded.problems)
+    chosen = select(sensor.links, own, layout.spec.groups, _reporter(loaded, path, loaded.problems))
+    if not chosen and len(loaded.problems) == before:
+        loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
+    return tuple(bodies[i] for i in chosen)
 
 
 def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patch]) -> None:
@@ -276,6 +309,8 @@ def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[P
             what = f'link "{patch.link.name}": {error.what}'
             loaded.problems.append(layout.problem(patch.path, what, error.hint))
     loaded.raise_problems()
+    if not parts:  # all sensors are on links, whatever their taxels
+        return Layout.of_links((), {})
     counts = [len(part.pos) for part in parts]
     return Layout(
         links=tuple(patch.link for patch in patches),

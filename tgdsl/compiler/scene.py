@@ -13,7 +13,8 @@ import mujoco
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.robot import Model
-from tgdsl.plan.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
+from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
+from tgdsl.plan.scene import Asset, SceneFile
 from tgdsl.scene.compare import differing
 from tgdsl.scene.places import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.scene.scene import compiled, muted_mujoco, portable

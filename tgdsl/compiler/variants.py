@@ -13,7 +13,8 @@ import mujoco
 from tgdsl.errors import RobotError
 from tgdsl.files.files import is_file
 from tgdsl.formats.robot import Model
-from tgdsl.plan.plan import Asset, SceneGeom, SceneObject
+from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
+from tgdsl.quantities.geoms.baking import aligned
 from tgdsl.scene.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
@@ -35,32 +36,6 @@ class Meshes:
         key = f"{digest[:32]}{path.suffix.lower()}"
         self.assets[key], self.contents[key] = Asset(key, portable(path), digest), content
         return key
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], list[list[int | None]]]:
-    """Give the members of several rows common columns, each for one kind, the order within each row kept.
-
-    Args:
-        rows: The kinds of each row's members.
-
-    Returns:
-        The kind of each column; and for each row the index of its member in each column, None where it has none.
-    """
-    columns: list[str] = []
-    tables: list[list[int | None]] = []
-    for row in rows:
-        table: list[int | None] = [None] * len(columns)
-        after = 0
-        for member, kind in enumerate(row):
-            place = next((i for i in range(after, len(columns)) if columns[i] == kind), None)
-            if place is None:
-                place = len(columns)
-                columns.append(kind)
-                for other in (*tables, table):
-                    other.append(None)
-            table[place], after = member, place + 1
-        tables.append(table)
-    return tuple(columns), tables
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,14 @@ class Layout:
     area: Float[np.ndarray, " taxel"]
     cell: Int[np.ndarray, "taxel 2"]
 
+    @staticmethod
+    def of_links(links: tuple[Link, ...], groups: Mapping[str, tuple[str, ...]]) -> Layout:
+        """Return the layout of links that carry no taxels, for sensors that have a place on each link."""
+        none, names = np.zeros((0, 3)), {link.name for link in links}
+        kept = {group: own for group, members in groups.items() if (own := _only(members, names))}
+        no_cells = np.zeros((0, 2), dtype=np.int64)
+        return Layout(links, kept, np.zeros(0, dtype=np.int64), none, none, none, none[:, 0], none[:, 0], no_cells)
+
     @property
     def bodies(self) -> tuple[str, ...]:
         """The links' bodies, each once, in order."""
@@ -59,7 +67,12 @@ class Layout:
     @property
     def body_id(self) -> Int[np.ndarray, " taxel"]:
         """Index into `bodies` of each taxel; ascending."""
-        return np.array([self.bodies.index(link.body) for link in self.links], dtype=np.int64)[self.link_id]
+        return self.link_body_id[self.link_id]
+
+    @property
+    def link_body_id(self) -> Int[np.ndarray, " link"]:
+        """Index into `bodies` of each link."""
+        return np.array([self.bodies.index(link.body) for link in self.links], dtype=np.int64)
 
     @property
     def num_taxels(self) -> int:

@@ -15,9 +15,11 @@ from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.files.files import write_whole
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
+from tgdsl.quantities.base import Quantity
+from tgdsl.quantities.known import QUANTITIES
 from tgdsl.scene.places import check_scene
 from tgdsl.sensors import Kind
-from tgdsl.sensors.known import known_kinds
+from tgdsl.sensors.known import known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of
 
 METADATA_KEY = "tgdsl"
@@ -60,7 +62,8 @@ def load(
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
-    return TactileModule(load_plan(path), known_kinds(kinds), dtype).to(device)
+    known = known_kinds(kinds)
+    return TactileModule(load_plan(path, quantities_of(known)), known, dtype).to(device)
 
 
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
@@ -70,8 +73,12 @@ def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
     return len(content)
 
 
-def load_plan(path: str | PathLike[str]) -> Plan:
+def load_plan(path: str | PathLike[str], quantities: Sequence[Quantity] = QUANTITIES) -> Plan:
     """Read a plan. Only the artefact itself is opened: no file that it names.
+
+    Args:
+        path: The artefact.
+        quantities: The quantities that it may ask for.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
@@ -88,7 +95,7 @@ def load_plan(path: str | PathLike[str]) -> Plan:
     for array in arrays.values():
         array.flags.writeable = False
     try:
-        plan = Plan.from_json(metadata[METADATA_KEY], arrays)
+        plan = Plan.from_json(metadata[METADATA_KEY], arrays, quantities)
         check_scene(plan.scene)
         return plan
     except ArtifactError as error:

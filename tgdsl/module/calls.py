@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 
-from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.plan import Plan
+from tgdsl.quantities.base import Quantity
 from tgdsl.tensors.fusion import of_its_own
 from tgdsl.tensors.graphed import Graphed
 
@@ -63,20 +63,18 @@ class Calls:
         return {"_wanted": self._wanted, "compiled": {}, "graphed": {}}
 
 
-def inductor_options(plan: Plan) -> dict[str, bool]:
-    """Return what is asked of Inductor for a plan.
+def inductor_options(plan: Plan, quantities: Sequence[Quantity]) -> dict[str, bool]:
+    """Return what is asked of Inductor for a plan and the quantities that it asks for.
 
     Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
     taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what
     there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find a
     tile takes too many registers.
     """
-    answers = [answer for query in plan.queries for answer in query.answers]
     is_slight = (
-        all(set(answer.needs) <= {"contacts", "distance"} for answer in answers)
-        and not any(answer.moments or answer.points for answer in answers)
+        all(quantity.is_light(plan.quantities[quantity.name]) for quantity in quantities)
         and not any(sensor.noise for sensor in plan.sensors)
-        and all(target.num_pairs == 1 and set(target.shapes) <= SHAPES.keys() for target in plan.objects)
+        and all(target.num_pairs == 1 for target in plan.objects)
     )
     return {"assert_indirect_indexing": "variant" in plan.inputs.fields, "triton.prefer_nd_tiling": is_slight}
 

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from tgdsl.errors import TgdslError
-from tgdsl.plan.plan import PlannedSensor
+from tgdsl.plan.sensors import PlannedSensor
+from tgdsl.sensors.base import Context
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
 
@@ -26,7 +27,8 @@ class Clock(nn.Module):
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
     (env,): `step` (calls so far), `episode` (resets), `age` (calls since the last reset); and of the module's dtype `ages`
-    (env, call), how long before the last call each one was [s], itself first.
+    (env, call), how long before the last call each one was [s], itself first, and `time` (env,), of the last call since the
+    reset [s].
 
     Attributes:
         home: Has device and dtype of counts that are loaded before the start.
@@ -35,7 +37,7 @@ class Clock(nn.Module):
     def __init__(self, sensors: Sequence[PlannedSensor]):
         """Note which sensors want to know."""
         super().__init__()
-        self._sensors = [sensor for sensor in sensors if sensor.is_timed]
+        self._sensors = [sensor for sensor in sensors if sensor.wants_clock]
         self._has_history = any(sensor.windows for sensor in sensors)
         self._drawing = list(dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams))
         self._seed, self._first_env = 0, None
@@ -64,6 +66,8 @@ class Clock(nn.Module):
             self.register_buffer(name, torch.zeros((), **whole))
         for name in ("step", "episode", "age"):
             self.register_buffer(name, torch.zeros(num_envs, **whole))
+        if any(sensor.is_timed for sensor in self._sensors):
+            self.register_buffer("time", torch.zeros(num_envs, dtype=like.dtype, device=like.device))
         if calls:
             self.register_buffer("ages", torch.zeros(num_envs, calls, dtype=like.dtype, device=like.device))
         # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
@@ -131,9 +135,30 @@ class Clock(nn.Module):
         return nows
 
     @staticmethod
+    def context(sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
+        """Return when a sensor's kind is called; nothing of it if the kind does not want to know.
+
+        Args:
+            sensor: The sensor.
+            memory: What `tensors` returned.
+            dt: Time since the last call [s].
+            substep: Which of its substeps it is.
+        """
+        if not sensor.is_timed:
+            return Context()
+        assert dt is not None
+        count = max(sensor.substeps, 1)
+        age, own = memory["clock/age"][:, None], dt / count
+        time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * own)
+        is_first = (age == 0) & (substep == 0)
+        return Context(own, memory["clock/step"][:, None], substep, time, is_first)
+
+    @staticmethod
     def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:
         """Return the counts after a call."""
         counts = {name: clock[name] + 1 for name in ("clock/step", "clock/age") if name in clock}
+        if "clock/time" in clock and dt is not None:
+            counts["clock/time"] = torch.where(clock["clock/age"] == 0, 0.0, clock["clock/time"] + dt)
         if "clock/ages" in clock and dt is not None:
             ages = clock["clock/ages"]
             counts["clock/ages"] = torch.cat([torch.zeros_like(ages[:, :1]), ages[:, :-1] + dt], dim=1)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from tgdsl.module.state import SHAPES, SceneState, shape_of
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 
 
 def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, spread: float) -> SceneState:
@@ -44,6 +46,10 @@ def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, 
         values |= _contacts(values, inputs, spread)
     if "dt" in inputs.fields:
         values["dt"] = 0.01
+    if inputs.substeps > 1:
+        one = dataclasses.replace(inputs, substeps=1, fields=tuple(name for name in inputs.fields if name != "dt"))
+        seeds = torch.randint(2**62, (inputs.substeps - 1,), generator=generator).tolist()
+        values["substeps"] = tuple(example_state(one, num_envs, own, dtype, spread) for own in seeds)
     return SceneState(**values)
 
 

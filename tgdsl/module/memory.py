@@ -15,11 +15,11 @@ from torch import Tensor, nn
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.clock import Clock
-from tgdsl.plan.plan import PlannedMemory, PlannedSensor
+from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
 from tgdsl.tensors.fusion import stored
 
 WINDOW, KEPT = "history/", "kept/"
-"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, channel, row), the last one."""
+"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, …, channel, row), the last one."""
 
 
 class Memory(nn.Module):
@@ -112,7 +112,7 @@ class Memory(nn.Module):
             with torch.inference_mode(False), torch.no_grad():
                 for name, (reading, _) in self._last.items():
                     if name not in stacks:
-                        copy = reading.transpose(1, 2).clone(memory_format=torch.contiguous_format)
+                        copy = reading.transpose(-2, -1).clone(memory_format=torch.contiguous_format)
                         self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
         if self.num_kept not in (None, num_envs):
             raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")

@@ -6,9 +6,9 @@ felt objects, `taxel` taxels of one sensor, `channel` numbers per taxel, `step` 
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,20 +19,21 @@ from tgdsl.console.tables import TaxelTable, TaxelTables
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.module.calls import Calls, has_cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
-from tgdsl.module.history import pushed, reduced
+from tgdsl.module.explain import Explained, explain
+from tgdsl.module.gathering import bind, constant_arrays
+from tgdsl.module.history import reduced
+from tgdsl.module.incoming import Incoming
 from tgdsl.module.memory import KEPT, WINDOW, Memory, chosen_only, store
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
-from tgdsl.module.queries import Queries
-from tgdsl.module.reading import joined_signal, read
+from tgdsl.module.sensing import Sensing, sense
 from tgdsl.module.slot_watch import SlotWatch
 from tgdsl.module.state import SceneState
-from tgdsl.module.taxels import images_of, taxel_table
-from tgdsl.plan.plan import Inputs, Plan
-from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.module.taxels import images_of, row_tables, taxel_table
+from tgdsl.plan.inputs import Inputs
+from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
-from tgdsl.sensors.noise import stages
-from tgdsl.sensors.noise.instant import Now
+from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
 from tgdsl.tensors.env_ids import EnvIds, env_mask
@@ -69,23 +70,17 @@ class TactileModule(nn.Module):
                 hint = did_you_mean(sensor.kind, known, "kinds")
                 raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
         self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
-        self._queries = Queries(plan)
-        self.constants = Constants(self._queries.constants(), dtype)
+        own = quantities_of(kinds)
+        self._quantities = tuple(quantity for quantity in own if quantity.name in plan.quantities)
+        self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
         self.memory = Memory(plan.sensors)
-        self._overwritten = [
-            f"{sensor.name}:{name}"
-            for sensor in plan.sensors
-            if plan.queries[sensor.query].answers[sensor.answer].points is not None
-            for name in sensor.state
-            if "/" not in name
-        ]
+        state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
+        self._overwritten = [name for name, part in state if part.overwritten]
         self.calls = Calls()
-        self._dt: tuple[float, Tensor] | None = None
-        self._warned: set[str] = set()
-        self.slot_watch = SlotWatch(plan.inputs)
+        self.incoming = Incoming(plan)
 
     def __repr__(self) -> str:
-        layout, origin = self.plan.layout(), self.plan.origin
+        layout, origin = self.plan.layout, self.plan.origin
         where = f"{layout.num_taxels} taxels on {len(layout.links)} links of {origin.robot.rpartition('/')[2]}"
         return f"TactileModule({where} at resolution {origin.resolution}, {self.dtype}, {self.device})\n{self.outputs}"
 
@@ -107,7 +102,13 @@ class TactileModule(nn.Module):
     @property
     def taxels(self) -> dict[str, TaxelTable]:
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
-        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in self.plan.sensors})
+        own = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
+        return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in own})
+
+    @property
+    def rows(self) -> dict[str, TaxelTable]:
+        """What the rows of each reading of a sensor are, as tables: of taxels as `taxels` has them, else what the kind says."""
+        return row_tables(self.plan)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -123,6 +124,11 @@ class TactileModule(nn.Module):
     def has_state(self) -> bool:
         """Whether any sensor carries something from one call to the next."""
         return self.memory.is_wanted
+
+    @property
+    def slot_watch(self) -> SlotWatch:
+        """Notices contacts beyond the slots."""
+        return self.incoming.slot_watch
 
     @property
     def num_envs(self) -> int | None:
@@ -194,15 +200,8 @@ class TactileModule(nn.Module):
 
     def _tensors(self, state: SceneState) -> tuple[dict[str, Tensor], int]:
         """Return the fields of a state that are wanted, and the number of environments."""
-        if not isinstance(state, SceneState):
-            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
-            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(self.inputs.fields)}")
-        tensors = state.checked(self.inputs, self.device)
-        if state.dt is not None and "dt" in self.inputs.fields:
-            tensors["dt"] = self._dt_tensor(state.dt)
-        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
-            self.slot_watch.note(tensors)
-            self.slot_watch.warn()
+        self.constants.refresh()
+        tensors = self.incoming.tensors(state, self.dtype, self.device)
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
             held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
@@ -237,8 +236,9 @@ class TactileModule(nn.Module):
         updated = chosen_only(memory, updated, mask)
         for name, reading in readings.items():
             if f"{KEPT}{name}" in memory:
-                made = torch.where(mask[:, None, None], reading.transpose(1, 2), memory[f"{KEPT}{name}"])
-                readings[name] = made.transpose(1, 2)
+                chosen = mask.view(-1, *[1] * (reading.ndim - 1))
+                made = torch.where(chosen, reading.transpose(-2, -1), memory[f"{KEPT}{name}"])
+                readings[name] = made.transpose(-2, -1)
             elif f"{WINDOW}{name}" in memory:
                 readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
         store(memory, updated | _kept(readings, memory))
@@ -265,31 +265,8 @@ class TactileModule(nn.Module):
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
-        nows, knobs = self._circumstances(tensors, memory)
-        answers = self._queries.answers(self.constants, tensors, nows, knobs)
-        readings: dict[str, Tensor] = {}
-        joined: dict[tuple[str, ...], Tensor] = {}
-        updated = self.memory.clock.after(memory, tensors.get("dt"))
-        for sensor in self.plan.sensors:
-            felt, probes = answers[sensor.query][sensor.answer]
-            own = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
-            constants = self.constants.under(sensor.folder, sensor.constants)
-            kind, signal = self._kinds[sensor.name], None
-            if sensor.joined:
-                if sensor.joined not in joined:
-                    joined[sensor.joined] = self._joined_signal(sensor.joined, felt, probes)
-                signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
-            found, new = read(sensor, kind, felt, probes, constants, knobs[sensor.name], own, nows.get(sensor.name), signal)
-            updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
-            for reading in sensor.windows:
-                assert sensor.history is not None
-                path = f"{WINDOW}{reading.name}"
-                updated[path] = pushed(memory[path], found[reading.name], memory["clock/age"])
-                found[reading.name] = reduced(updated[path], sensor.history.reduce)
-            readings |= found
-        for reading in self.plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
-            readings[reading.name] = tensors[reading.name].to(self.dtype, copy=True).unsqueeze(2)
-        return readings, updated
+        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock)
+        return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the observation groups, each the concatenation of its terms, every term flattened channel-major.
@@ -297,6 +274,7 @@ class TactileModule(nn.Module):
         Raises:
             ObservationError: If a reading that is observed is missing or of another shape, or only the real hand has it.
         """
+        self.constants.refresh()
         return observe(self.plan, self.constants, readings)
 
     def images(
@@ -383,7 +361,7 @@ class TactileModule(nn.Module):
 
     def inductor_options(self) -> dict[str, bool]:
         """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
-        return inductor_options(self.plan)
+        return inductor_options(self.plan, self._quantities)
 
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03
@@ -400,55 +378,12 @@ class TactileModule(nn.Module):
 
     def explain(self) -> str:
         """Return an account of what is computed, what was dropped and why, and what it costs."""
-        from tgdsl.module.explain import explain
-
-        return explain(self)
-
-    def _circumstances(
-        self, tensors: dict[str, Tensor], memory: dict[str, Tensor]
-    ) -> tuple[dict[str, Now], dict[str, dict[str, Tensor]]]:
-        """Return by sensor when it is read, where that matters, and the values of its noise."""
-        nows = self.memory.clock.nows(memory, tensors.get("dt"))
-        knobs: dict[str, dict[str, Tensor]] = {}
-        for sensor in self.plan.sensors:
-            names = () if sensor.noise is None else sensor.noise.constants
-            constants = self.constants.under(f"sensors/{sensor.name}/noise", names)
-            knobs[sensor.name] = stages.knob_values(constants, nows.get(sensor.name))
-        return nows, knobs
-
-    def _joined_signal(self, names: Sequence[str], felt: Felt, probes: Probes) -> Tensor:
-        by_name = {sensor.name: sensor for sensor in self.plan.sensors}
-        sensors = [by_name[name] for name in names]
-        constants = [self.constants.under(sensor.folder, sensor.constants) for sensor in sensors]
-        return joined_signal(self._kinds[names[0]], sensors, felt, probes, constants)
+        return explain(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
 
     def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
         """Put the memory itself in the place of stacks that are declared as views."""
         views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
         return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
-
-    def _dt_tensor(self, dt: float) -> Tensor:
-        """Return dt as a tensor that is written only when it changes.
-
-        Raises:
-            StateError: If it is no time.
-        """
-        if not 0 < dt < math.inf:
-            raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
-        if self._dt is None or self._dt[0] != dt:
-            self._look_at_rates(dt)
-        if self._dt is None or self._dt[0] != dt or self._dt[1].device != self.device or self._dt[1].dtype != self.dtype:
-            with torch.inference_mode(False):
-                self._dt = dt, torch.tensor(dt, dtype=self.dtype, device=self.device)
-        return self._dt[1]
-
-    def _look_at_rates(self, dt: float) -> None:
-        """Warn of sensors that would take samples more often than they are called, the first time."""
-        for sensor in self.plan.sensors:
-            if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:
-                self._warned.add(sensor.sensor)
-                what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
-                warnings.warn(f"{what}: it takes a sample at every call", stacklevel=3)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
         """Move or cast all tensors; a captured graph has read the old ones.
@@ -470,4 +405,4 @@ class TactileModule(nn.Module):
 
 def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return what is kept of readings that are handed out, if anything is."""
-    return {f"{KEPT}{name}": made.transpose(1, 2) for name, made in readings.items() if f"{KEPT}{name}" in memory}
+    return {f"{KEPT}{name}": made.transpose(-2, -1) for name, made in readings.items() if f"{KEPT}{name}" in memory}

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from tgdsl.errors import ObservationError, did_you_mean
 from tgdsl.observations import observations
-from tgdsl.plan.plan import Plan, PlannedReading
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedReading
 from tgdsl.tensors.buffers import Constants
 
 
@@ -66,7 +67,7 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
     for term in plan.observations:
         features = torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)
         if term.reading is not None:
-            folded = constants.under(f"observations/{term.group}/{term.index}", term.constants)
+            folded = constants.tree["observations"][term.key]
             reading = readings[term.reading]
             steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
             features = torch.cat([observations.observe(term.type, step, term.channels, folded) for step in steps], dim=1)

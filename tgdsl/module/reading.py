@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.plan.plan import PlannedSensor
-from tgdsl.quantities.contact_depth.query import Felt, Probes
+from tgdsl.plan.sensors import PlannedSensor
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Constants
+from tgdsl.sensors.base import Constants, Context
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.tensors.fusion import stored
@@ -23,15 +24,14 @@ Tensors = dict[str, Tensor]
 
 
 def joined_signal(
-    kind: Kind, sensors: Sequence[PlannedSensor], felt: Felt, probes: Probes, constants: Sequence[Constants]
+    kind: Kind, sensors: Sequence[PlannedSensor], gathered: Gathered, constants: Sequence[Constants]
 ) -> Float[Tensor, "env channel taxel"]:
     """Return the signals of sensors that are computed as one, one sensor's taxels after the other's.
 
     Args:
         kind: Their kind.
         sensors: The sensors.
-        felt: What the probes of all of them feel.
-        probes: The probes.
+        gathered: What they asked for, of the taxels of all of them.
         constants: What was folded for each of them: scalars.
     """
     of_taxels: Tensors = {}
@@ -39,16 +39,16 @@ def joined_signal(
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
         rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, stored(torch.stack(rows)).unbind(), strict=True))
-    found, _ = kind.forward(felt, probes, of_taxels, {})
+    found, _ = kind.forward(gathered, Context(), of_taxels, {})
     return _stacked(found, "signal", sensors[0].signal)
 
 
 def read(
     sensor: PlannedSensor,
     kind: Kind,
-    felt: Felt,
-    probes: Probes,
-    constants: Tensors,
+    gathered: Gathered,
+    context: Context,
+    constants: Constants,
     knobs: Tensors,
     memory: Tensors,
     now: Now | None,
@@ -62,8 +62,8 @@ def read(
     Args:
         sensor: The sensor.
         kind: Its kind.
-        felt: What its probes feel.
-        probes: Its probes.
+        gathered: What it asked for.
+        context: When its kind is called.
         constants: What its kind folded.
         knobs: Values of its noise, see `stages.knob_values`.
         memory: What it remembers, by name.
@@ -71,15 +71,15 @@ def read(
         joined: Its signal, if that was computed with others'.
     """
     terms = () if sensor.noise is None else sensor.noise.terms
-    like = felt.depth if joined is None else joined[:, 0]
-    gain = stages.gain(knobs, now, like) if "gain" in terms and now is not None else None
-    if gain is not None and kind.gains_depth:
-        felt = felt._replace(depth=gain * felt.depth)
-    found, new = ({}, {}) if joined is not None else kind.forward(felt, probes, constants, _own(memory))
+    has_gain = "gain" in terms and now is not None
+    if has_gain and kind.gains_depth:
+        felt = gathered[ContactDepth]
+        gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, now, felt.depth) * felt.depth))
+    found, new = ({}, {}) if joined is not None else kind.forward(gathered, context, constants, _own(memory))
     new = dict(new)
     signal = clean = _stacked(found, "signal", sensor.signal) if joined is None else joined
-    if gain is not None and not kind.gains_depth:
-        signal = gain[:, None] * clean
+    if has_gain and not kind.gains_depth:
+        signal = stages.gain(knobs, now, clean[:, 0])[:, None] * clean
     if terms:
         past = {name.removeprefix("noise/"): value for name, value in memory.items() if name.startswith("noise/")}
         signal, noted = stages.disturb(signal, terms, knobs, past, now)
@@ -103,6 +103,33 @@ def read(
     if now is not None and now.period is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
     return readings, new
+
+
+def block(
+    sensor: PlannedSensor,
+    kind: Kind,
+    gathered: Sequence[Gathered],
+    contexts: Sequence[Context],
+    constants: Constants,
+    memory: Tensors,
+) -> tuple[Tensors, Tensors]:
+    """Return the reading of a sensor that is advanced at each substep, (env, sample, row, channel), and its new memory.
+
+    Args:
+        sensor: The sensor.
+        kind: Its kind.
+        gathered: What it asked for, at each substep.
+        contexts: When its kind is called.
+        constants: What its kind folded.
+        memory: What it remembers, by name.
+    """
+    samples, state = [], _own(memory)
+    for own, context in zip(gathered, contexts, strict=True):
+        found, new = kind.forward(own, context, constants, state)
+        state = {**state, **new}
+        made = _stacked(found, "signal", sensor.signal)
+        samples.append(made if made.ndim == 4 else made[:, None])
+    return {sensor.name: torch.cat(samples, dim=1).transpose(2, 3)}, dict(state)
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:

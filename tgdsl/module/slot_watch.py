@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.errors import listed
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 
 TOLERANCE = 1e-3
 """Part of a pair's force that slots may lack unnoticed: far above what single precision makes of a sum."""

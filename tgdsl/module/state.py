@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import StateError
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 
 SHAPES: dict[str, tuple[str | int, ...]] = {
     "body_pos": ("body", 3),
@@ -68,6 +68,8 @@ class SceneState:
         joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
         last_action: Control of each actuator that acted at that instant, in its own unit; before any, that of the start.
         dt: Time since the last state [s].
+        substeps: The states after each physics step since the last call but for the last one, which this state is; only if
+            `inputs.substeps` is more than 1. Right after a reset they are all as this state.
     """
 
     body_pos: Float[Tensor, "env body 3"] | None = None
@@ -87,6 +89,7 @@ class SceneState:
     joint_effort: Float[Tensor, "env joint"] | None = None
     last_action: Float[Tensor, "env actuator"] | None = None
     dt: float | None = None
+    substeps: tuple[SceneState, ...] = ()
 
     def to(self, *args: Any, **kwargs: Any) -> SceneState:
         """Return the state with `torch.Tensor.to` applied to every tensor; a dtype applies to what is not an integer."""
@@ -94,10 +97,16 @@ class SceneState:
         moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
         if moved["variant"] is not None:
             moved["variant"] = moved["variant"].to(values["variant"].dtype)
+        moved["substeps"] = tuple(part.to(*args, **kwargs) for part in self.substeps)
         return SceneState(**moved)
 
-    def checked(self, inputs: Inputs, device: torch.device) -> dict[str, Tensor]:
+    def checked(self, inputs: Inputs, device: torch.device, with_dt: bool = True) -> dict[str, Tensor]:
         """Return the tensors that a module wants, after a look at their shapes.
+
+        Args:
+            inputs: What the module wants.
+            device: Where it is.
+            with_dt: Whether a time must be there, if it is wanted.
 
         Raises:
             StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
@@ -105,6 +114,8 @@ class SceneState:
         tensors: dict[str, Tensor] = {}
         for name in inputs.fields:
             value = getattr(self, name)
+            if value is None and name == "dt" and not with_dt:
+                continue
             if value is None:
                 raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
             if name != "dt":

@@ -45,6 +45,23 @@ def taxel_table(layout: Layout) -> TaxelTable:
     return table.view(TaxelTable)
 
 
+def row_tables(plan: Plan) -> dict[str, TaxelTable]:
+    """Return what the rows of each reading of a sensor are: of taxels `taxel_table`, else the columns that its kind declares."""
+    found = {}
+    for sensor in plan.sensors:
+        for reading, axis in zip(sensor.readings, sensor.axes, strict=True):
+            if axis.name == "taxel":
+                found[reading.name] = taxel_table(plan.layout_of(sensor))
+                continue
+            columns = [(name, np.array(texts)) for name, texts in axis.texts.items()] + list(axis.numbers.items())
+            dtype: list[Any] = [(name, column.dtype, column.shape[1:]) for name, column in columns]
+            table = np.empty(axis.size, dtype=dtype or [("row", np.int64)])
+            for name, column in columns or [("row", np.arange(axis.size))]:
+                table[name] = column
+            found[reading.name] = table.view(TaxelTable)
+    return found
+
+
 def images_of(
     plan: Plan, name: str, readings: Mapping[str, Tensor]
 ) -> tuple[dict[str, Float[Tensor, "env channel row column"]], dict[str, Bool[Tensor, "row column"]]]:

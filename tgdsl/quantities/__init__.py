@@ -1,1 +1,27 @@
-"""What kinds ask of a scene, one folder each."""
+"""What kinds ask of a scene, one folder each: see `base`."""
+
+from tgdsl.quantities.base import Gathered, Planning, Quantity, Request, Scene, Use
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.known import QUANTITIES, known_quantities
+from tgdsl.quantities.moments import MomentsRequest
+from tgdsl.quantities.motion import LinkMotion
+from tgdsl.quantities.points import Points
+from tgdsl.quantities.reference import ReferenceScene
+
+__all__ = [
+    "QUANTITIES",
+    "ContactDepth",
+    "Contacts",
+    "Gathered",
+    "LinkMotion",
+    "MomentsRequest",
+    "Planning",
+    "Points",
+    "Quantity",
+    "ReferenceScene",
+    "Request",
+    "Scene",
+    "Use",
+    "known_quantities",
+]

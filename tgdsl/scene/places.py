@@ -14,7 +14,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from tgdsl.errors import ArtifactError, listed
-from tgdsl.plan.plan import Asset, SceneFile
+from tgdsl.plan.scene import Asset, SceneFile
 
 ROBOTS = "robots:"
 """How the place of a file begins that comes with tgdsl."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.files.files import robots_folder
-from tgdsl.plan.plan import Asset, SceneFile, SceneGeom, SceneObject
+from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.places import ROBOTS, located
 
 INHERITED = (

@@ -235,11 +235,11 @@ def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
     by_name = {kind.name: kind for kind in kinds}
     for name, sensor in spec.sensors.items():
         path: Path = ("sensors", name)
-        for i, target in enumerate(sensor.feels):
+        for i, target in enumerate(sensor.objects):
             if objects is not None and target not in objects:
                 hint = did_you_mean(target, objects, "objects")
                 problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
-            elif target in sensor.feels[:i]:
+            elif target in sensor.objects[:i]:
                 problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
         problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
     for name in QUANTITIES.keys() & set(sensors):

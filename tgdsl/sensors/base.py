@@ -1,27 +1,26 @@
 """What a sensor kind is: a spec, an equation, and how it is lowered and computed.
 
 A kind is one file that holds, in this order: what it measures, its spec, `reference` (the definition, float64), `lower`
-(constants and state, no physics), `forward` (batched, in component planes), and last a `Kind` that ties them together.
+(constants, state and requests, no physics), `forward` (batched, in component planes), and last a `Kind` that ties them together.
 
-Shapes: `env` environments, `taxel` taxels of one sensor, `body` bodies that carry them.
+Shapes: `env` environments, `taxel` taxels of one sensor, `body` bodies that carry it, `row` rows of a reading.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
+from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
 from tgdsl.surfaces.surface import Surface
 
@@ -64,6 +63,24 @@ class SensorSpec(SpecModel):
     """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
     history: History | None = None
     """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
+    is_on_taxels: ClassVar[bool] = True
+    """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Objects that the sensor feels; none by default."""
+        return ()
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
+        return False
+
+
+class LinkSpec(SensorSpec):
+    """A sensor that has a place on each link, whether the link has taxels or not."""
+
+    is_on_taxels: ClassVar[bool] = False
 
 
 class ProbeSpec(SensorSpec):
@@ -73,9 +90,9 @@ class ProbeSpec(SensorSpec):
     """Objects that the probes can feel."""
 
     @property
-    def is_gated(self) -> bool:
-        """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
-        return False
+    def objects(self) -> tuple[str, ...]:
+        """Objects that the sensor feels."""
+        return self.feels
 
 
 class ContactProbeSpec(ProbeSpec):
@@ -105,47 +122,41 @@ class Memory:
 
     Attributes:
         rest: Its value at rest.
-        shape: Its shape; None: (taxel,); "points": one row of all points of `Felt.points`, one after the other.
+        shape: Its shape; None: (row,) of the kind's own reading; a type of request: as many rows as its value has.
+        overwritten: Whether a kernel may write the new state over the old; it is then left out of what `forward` returns.
     """
 
     rest: float = 0.0
-    shape: tuple[int, ...] | Literal["points"] | None = None
+    shape: tuple[int, ...] | type[Request] | None = None
+    overwritten: bool = False
 
 
-@dataclass(frozen=True)
-class MomentsRequest:
-    """How moments of objects' surfaces are found.
-
-    Attributes:
-        backend: "field": from a baked field; "points": by a sum over sampled points. Planes are exact in both.
-        num_points: Points of each object.
-        tolerance: Root mean square error of a field as a fraction of full scale.
-        gradient_tolerance: Error that 99.9 % of S0's gradients by place may have, as a fraction of the largest; None: any.
-        max_bytes: Largest size of all fields of an object, or of its lists of points [bytes].
-        with_area: Whether the area of the felt objects is wanted, so that there must be one.
-        radius_noise: By how much radii may differ from the probes' own [m]; set by the compiler.
-    """
-
-    backend: Literal["field", "points"]
-    num_points: int
-    tolerance: float
-    gradient_tolerance: float | None
-    max_bytes: int
-    with_area: bool
-    radius_noise: float = 0.0
-
-
-@dataclass(frozen=True)
-class PointsRequest:
-    """Points that are sampled on the outer surface of each object and measured against the links' own surfaces.
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """What the rows of a reading are.
 
     Attributes:
-        num_points: Points of each object.
-        range: Distance from a link's surface up to which readings tell it apart [m].
+        name: What one is called: "taxel", "body", "voxel", "sample", …
+        size: How many there are.
+        table: Columns of a table for users, a row for each: texts, or arrays (row, …).
+        link_id: Which of the layout's links each row is on, for noise that differs between links; None: they are on none.
     """
 
-    num_points: int
-    range: float
+    name: str
+    size: int
+    table: Mapping[str, Sequence[str] | np.ndarray] = field(default_factory=dict)
+    link_id: Int[np.ndarray, " row"] | None = None
+
+
+def taxel_axis(layout: Layout) -> Axis:
+    """Return a row for each taxel."""
+    return Axis("taxel", layout.num_taxels, {}, layout.link_id)
+
+
+def body_axis(layout: Layout) -> Axis:
+    """Return a row for each body that carries the sensor, in order."""
+    first = [[link.body for link in layout.links].index(body) for body in layout.bodies]
+    return Axis("body", len(layout.bodies), {"body": layout.bodies}, np.array(first, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,32 +167,54 @@ class Lowered:
         channels: What the sensor's own reading holds, in order.
         constants: Arrays that `forward` gets as tensors.
         state: What is carried from one call to the next.
-        rows: What the reading has one row of: "taxel", or "body" for each body that carries taxels, in order.
-        reports: Further readings, with a row per body: `<sensor>/<name>` holds these channels.
-        needs: Optional parts of `Felt` that `forward` reads: "normal", "motion", "distance", "frame", "contacts", "moments",
-            "points".
-        range: Distance from an object's surface up to which readings tell it apart [m], if more than the probe's radius.
-        radius: How far from each taxel objects are felt [m], (taxel,); default: the probes' radii. Inactive ones feel nothing.
-        slots: Contacts per body and object that are wanted, if `needs` has "contacts"; 0: the net force alone.
-        moments: How moments are found, if `needs` has "moments".
-        points: Which points, if `needs` has "points".
+        requests: What is asked of the scene, at most one of each type.
+        rows: What the reading has one row of; None: of each taxel, or of each body if the kind is not on taxels.
+        reports: Further readings: `<sensor>/<name>` holds these channels, with a row per body.
         notes: What an account of the sensor says of its parameters, line by line.
         signal: What `forward` returns, if the kind decides: what noise acts on.
+        substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
+            or of so many times `samples`. 0: it is called once per call, with the state of the last one.
+        samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
     """
 
     channels: tuple[Channel, ...]
     constants: Mapping[str, np.ndarray] = field(default_factory=dict)
     state: Mapping[str, Memory] = field(default_factory=dict)
-    rows: Literal["taxel", "body"] = "taxel"
+    requests: tuple[Request, ...] = ()
+    rows: Axis | None = None
     reports: Mapping[str, tuple[Channel, ...]] = field(default_factory=dict)
-    needs: frozenset[str] = frozenset()
-    range: float = 0.0
-    radius: Float[np.ndarray, " taxel"] | None = None
-    slots: int = 0
-    moments: MomentsRequest | None = None
-    points: PointsRequest | None = None
     notes: tuple[str, ...] = ()
     signal: tuple[Channel, ...] | None = None
+    substeps: int = 0
+    samples: int = 0
+
+
+class Context(NamedTuple):
+    """When a kind is called. Only a kind that `is_timed` is told; to others all of it is None.
+
+    Attributes:
+        dt: Time since the last call, or the last substep [s], a scalar.
+        step: Number of this call of each environment, (env, 1).
+        substep: Which substep of the call this is, from 0.
+        time: Time since each environment's reset [s], (env, 1); 0 at the first call after it.
+        is_first: Whether it is the first call after each environment's reset, (env, 1).
+    """
+
+    dt: Tensor | None = None
+    step: Tensor | None = None
+    substep: int = 0
+    time: Tensor | None = None
+    is_first: Tensor | None = None
+
+
+class ReferenceContext(NamedTuple):
+    """The same for one environment, in numbers."""
+
+    dt: float
+    step: int
+    substep: int
+    time: float
+    is_first: bool
 
 
 SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
@@ -189,6 +222,8 @@ SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
+Planes = Mapping[str, Tensor]
+Reading = Float[np.ndarray, "row channel"]
 
 
 @dataclass(frozen=True)
@@ -197,12 +232,13 @@ class Kind:
 
     Attributes:
         spec: Its pydantic model; `kind` is a `Literal` with the kind's name.
-        lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels. May raise `LowerError`.
-        forward: `(felt, probes, constants, state) → (planes by channel name, new state)`: planes (env, taxel) or, of what has
-            a row per body, (env, body), at least those of the channels; pure, traceable; the new state is like the old. Where
-            all channels are one tensor (env, channel, row) already it stands for them, as "signal", or of a report as
-            "<report>/signal". A kernel may write new state of points over the old; it is then left out of what is returned.
-        reference: `(spec, layout, touch, state) → (reading (row, channel), new state)` for one environment, in NumPy.
+        lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels, or no taxels and its links. May
+            raise `LowerError`.
+        forward: `(gathered, context, constants, state) → (planes by channel name, new state)`: planes (env, row), at least those
+            of the channels; pure, traceable; the new state is like the old. Where all channels are one tensor (env, channel, row)
+            already it stands for them, as "signal", or of a report as "<report>/signal".
+        reference: `(spec, layout, gathered, context, state) → (reading (row, channel), new state)` for one environment, in NumPy:
+            what was asked for is what the quantities' references return; of a block it is called once per sample.
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
             `forward` returns is then the signal, which noise disturbs first.
         knobs: Names of the noise knobs that it has.
@@ -210,17 +246,21 @@ class Kind:
         idle_knobs: Those of its knobs that change nothing in what it reads.
         is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
             computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
+        is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
+        quantities: Quantities of its own that it asks for, which no installed package brings.
     """
 
-    spec: type[ProbeSpec]
+    spec: type[SensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
-    forward: Callable[[Felt, Probes, Constants, State], tuple[Mapping[str, Tensor], State]]
-    reference: Callable[[Any, Layout, Touch, ReferenceState], tuple[Float[np.ndarray, "row channel"], dict[str, np.ndarray]]]
-    decide: Callable[[Mapping[str, Tensor], Constants, State], tuple[Mapping[str, Tensor], State]] | None = None
+    forward: Callable[[Gathered, Context, Constants, State], tuple[Planes, State]]
+    reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], tuple[Reading, dict[str, np.ndarray]]]
+    decide: Callable[[Planes, Constants, State], tuple[Planes, State]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()
     is_pointwise: bool = False
+    is_timed: bool = False
+    quantities: tuple[Quantity, ...] = ()
 
     @property
     def name(self) -> str:

@@ -20,15 +20,18 @@ from torch import Tensor
 
 from tgdsl.fields.models import Radius, Usual
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Channel,
     Constants,
     ContactProbeSpec,
+    Context,
     Kind,
     Lowered,
     Memory,
+    ReferenceContext,
     ReferenceState,
     State,
     SurfaceOf,
@@ -62,13 +65,14 @@ class ContactSpec(ContactProbeSpec):
 
 
 def reference(
-    spec: ContactSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: ContactSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return y (taxel, 1), and the new bit where there is memory."""
-    bit = touch.depth > spec.threshold
+    depth = gathered[ContactDepth].depth
+    bit = depth > spec.threshold
     if spec.release == spec.threshold:
         return bit[:, None].astype(np.float64), {}
-    bit |= (state["bit"] == 1.0) & (touch.depth > spec.release)
+    bit |= (state["bit"] == 1.0) & (depth > spec.release)
     return bit[:, None].astype(np.float64), {"bit": bit.astype(np.float64)}
 
 
@@ -76,15 +80,16 @@ def lower(spec: ContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """The bit is state only where the two thresholds differ."""
     constants = {"threshold": scalar(spec.threshold)}
     channels, signal = (Channel("contact", "1"),), (Channel("depth", "m"),)
+    requests = (ContactDepth(spec.objects, spec.is_gated),)
     if spec.release == spec.threshold:
-        return Lowered(channels, constants, signal=signal)
+        return Lowered(channels, constants, requests=requests, signal=signal)
     constants["release_threshold"] = scalar(spec.release)
-    return Lowered(channels, constants, state={"bit": Memory()}, signal=signal)
+    return Lowered(channels, constants, state={"bit": Memory()}, requests=requests, signal=signal)
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the depth plane [m], which is what noise acts on."""
-    return {"depth": felt.depth}, {}
+    return {"depth": gathered[ContactDepth].depth}, {}
 
 
 def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:

@@ -21,9 +21,21 @@ import numpy as np
 from torch import Tensor
 
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    ContactProbeSpec,
+    Context,
+    Kind,
+    Lowered,
+    ReferenceContext,
+    ReferenceState,
+    State,
+    SurfaceOf,
+)
 from tgdsl.sensors.noise import TAXEL
 
 
@@ -35,20 +47,20 @@ class ContactDepthSpec(ContactProbeSpec):
 
 
 def reference(
-    spec: ContactDepthSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: ContactDepthSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return d (taxel, 1) [m]."""
-    return touch.depth[:, None], {}
+    return gathered[ContactDepth].depth[:, None], {}
 
 
 def lower(spec: ContactDepthSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
     """Depth needs neither normals nor constants."""
-    return Lowered(channels=(Channel("depth", "m"),))
+    return Lowered((Channel("depth", "m"),), requests=(ContactDepth(spec.objects, spec.is_gated),))
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the depth plane [m]."""
-    return {"depth": felt.depth}, {}
+    return {"depth": gathered[ContactDepth].depth}, {}
 
 
 CONTACT_DEPTH = Kind(ContactDepthSpec, lower, forward, reference, knobs=TAXEL, is_pointwise=True)

@@ -48,10 +48,24 @@ from torch import Tensor
 from tgdsl.fields.models import NonNegative, Positive
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.contacts.contacts import Contacts
-from tgdsl.quantities.reference import ReferenceContacts, Touch
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf, scalar
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.contacts import ContactPoints, Contacts
+from tgdsl.quantities.contacts.reference import ReferenceContacts
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    ContactProbeSpec,
+    Context,
+    Kind,
+    Lowered,
+    ReferenceContext,
+    ReferenceState,
+    State,
+    SurfaceOf,
+    scalar,
+)
 from tgdsl.sensors.noise import FORCE
 
 
@@ -98,9 +112,10 @@ class KinematicTaxelSpec(ContactProbeSpec):
 
 
 def reference(
-    spec: KinematicTaxelSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: KinematicTaxelSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6)."""
+    touch = gathered[ContactDepth]
     forces, torques, num = np.zeros_like(layout.pos), np.zeros_like(layout.pos), layout.num_taxels
     pressed, shear, spin = np.zeros(num), np.zeros_like(layout.pos), np.zeros(num)
     for j, (d, m) in enumerate(zip(touch.depth, touch.normal, strict=True)):
@@ -111,8 +126,7 @@ def reference(
             spin[j] = spec.shear_sign * spec.spin_damping * (touch.angular[j] @ m)
     limit = np.full(num, np.inf)
     if spec.balance == "solver":
-        assert touch.contacts is not None
-        pressed, limit = reference_balance(pressed, layout.body_id, touch.contacts)
+        pressed, limit = reference_balance(pressed, layout.body_id, gathered[Contacts])
     if spec.friction_cone is not None:
         limit = spec.friction_cone * np.maximum(0.0, pressed)
     for j, (x, m) in enumerate(zip(layout.pos, touch.normal, strict=True)):
@@ -161,23 +175,23 @@ def lower(spec: KinematicTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lo
             constants["about_link"] = scalar(1.0)
     if spec.friction_cone is not None:
         constants["friction_cone"] = scalar(spec.friction_cone)
-    needs = {"normal"}
-    if spec.normal_damping or spec.shear_damping or ("torque" in spec.outputs and spec.spin_damping):
-        needs.add("motion")
+    motion = bool(spec.normal_damping or spec.shear_damping or ("torque" in spec.outputs and spec.spin_damping))
+    depth = ContactDepth(spec.objects, spec.is_gated, normal=True, motion=motion)
     if spec.balance == "none":
-        return Lowered(tuple(channels), constants, needs=frozenset(needs))
+        return Lowered(tuple(channels), constants, requests=(depth,))
     member = layout.body_id[:, None] == np.arange(len(layout.bodies))
     constants |= {"member": member.astype(np.float64), "body": layout.body_id}
     if "spin_damping" in constants:
         constants["patch"] = np.maximum(layout.radius, 0.0)
-    return Lowered(tuple(channels), constants, needs=frozenset({*needs, "contacts"}), slots=spec.slots)
+    return Lowered(tuple(channels), constants, requests=(depth, Contacts(spec.objects, slots=spec.slots)))
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the force planes [N] and, if wanted, the torque planes [N·m].
 
     Where nothing is touched, depth, normal and motion are all zero, and so is every term.
     """
+    felt = gathered[ContactDepth]
     assert felt.normal is not None
     stiffness = planes.power(felt.depth, constants["depth_exponent"])
     pressed, shear, limit = constants["normal_stiffness"] * stiffness, None, None
@@ -186,8 +200,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
         pressed = pressed + constants["normal_damping"] * stiffness * approach
         shear = planes.scale(constants["shear_damping"], planes.sub(felt.velocity, planes.scale(approach, felt.normal)))
     if "member" in constants:
-        assert felt.contacts is not None
-        pressed, limit = _balanced(pressed, felt.contacts, constants)
+        pressed, limit = _balanced(pressed, gathered[Contacts], constants)
     if "friction_cone" in constants:
         limit = constants["friction_cone"] * pressed.clamp(min=0)
     force = planes.scale(pressed, felt.normal)
@@ -196,7 +209,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     readings = {f"force_{axis}": plane for axis, plane in zip("xyz", force, strict=True)}
     if "spin_damping" in constants:
         none = felt.depth * 0.0  # not-a-number where the pose is
-        torque = planes.cross(probes.pos, force) if "about_link" in constants else (none, none, none)
+        torque = planes.cross(felt.pos, force) if "about_link" in constants else (none, none, none)
         if felt.angular is not None:
             spin = constants["spin_damping"] * planes.dot(felt.angular, felt.normal)
             if "patch" in constants and limit is not None:
@@ -219,7 +232,7 @@ def _within(limit: Tensor, shear: planes.Vec) -> planes.Vec:
     return planes.scale(torch.where(is_outside, limit / torch.where(is_outside, size, 1.0), 1.0), shear)
 
 
-def _balanced(pressed: Tensor, contacts: Contacts, constants: Constants) -> tuple[Tensor, Tensor]:
+def _balanced(pressed: Tensor, contacts: ContactPoints, constants: Constants) -> tuple[Tensor, Tensor]:
     """Return normal forces that sum to the solver's on each body [N], and the limits of friction [N]: (env, taxel)."""
     along = planes.dot(contacts.force, contacts.normal)
     across = planes.sub(contacts.force, planes.scale(along, contacts.normal))

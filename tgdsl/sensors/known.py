@@ -8,14 +8,14 @@ A package brings a kind by an entry point, in its pyproject.toml:
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 
-from tgdsl.errors import TgdslError
+from tgdsl.errors import LowerError, TgdslError
+from tgdsl.files.plugins import known
+from tgdsl.quantities.base import Quantity
+from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
-from tgdsl.sensors.base import Kind, Lowered
+from tgdsl.sensors.base import Kind, Lowered, SensorSpec
 
 GROUP = "tgdsl.kinds"
 """Group of the entry points by which packages bring kinds."""
@@ -32,22 +32,25 @@ def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
     Raises:
         TgdslError: If two kinds have one name, or a kind that is given is none.
     """
-    found: dict[str, tuple[Kind, str]] = {}
-    own = [(kind, "tgdsl") for kind in KINDS]
-    for kind, whence in (*own, *_installed(), *((kind, "`kinds`") for kind in given)):
-        if wrong := _wrong(kind):
-            raise TgdslError(f"{whence}: {wrong}")
-        other, first = found.setdefault(kind.name, (kind, whence))
-        if other is not kind:
-            raise TgdslError(f'two kinds are called "{kind.name}": one of {first}, one of {whence}; rename or remove one')
-    return tuple(kind for kind, _ in found.values())
+    return known(GROUP, "sensor kind", "kinds", KINDS, given, _wrong)
 
 
-def check_names(kind: Kind, lowered: Lowered) -> None:
-    """Refuse a kind whose channels or reports have names that readings need for something else.
+def quantities_of(kinds: Sequence[Kind]) -> tuple[Quantity, ...]:
+    """Return all quantities that kinds may ask for: those that are known, and those that kinds bring themselves.
 
     Raises:
-        TgdslError: With the kind and the name.
+        TgdslError: If two quantities have one name.
+    """
+    own = {id(quantity): quantity for kind in kinds for quantity in kind.quantities}
+    return known_quantities(tuple(own.values()))
+
+
+def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
+    """Refuse what a kind may not say of a sensor: names that readings need for something else, requests that contradict.
+
+    Raises:
+        TgdslError: With the kind and what is wrong.
+        LowerError: If the document asks of a block what a block has not.
     """
     channels = [*lowered.channels, *(lowered.signal or ()), *(c for report in lowered.reports.values() for c in report)]
     if any(channel.name == "signal" for channel in channels):
@@ -56,28 +59,17 @@ def check_names(kind: Kind, lowered: Lowered) -> None:
     for name, what in (("signal", "the reading before its noise"), ("clean", "the reading without noise")):
         if name in lowered.reports:
             raise TgdslError(f'kind "{kind.name}" has a report called "{name}"; rename it: "<sensor>/{name}" is {what}')
-
-
-@cache
-def _installed() -> tuple[tuple[Kind, str], ...]:
-    """Return the kinds of installed packages, and which package each is of."""
-    found = []
-    for point in sorted(entry_points(group=GROUP), key=lambda point: (_package(point), point.name)):
-        try:
-            kind = point.load()
-            wrong = _wrong(kind)
-        except Exception as error:  # whatever another package's code raises
-            wrong = f"{type(error).__name__}: {error}"
-        if wrong:
-            message = f'the sensor kind "{point.name}" of {_package(point)} ({point.value}) is left out: {wrong}'
-            warnings.warn(message, stacklevel=3)
-        else:
-            found.append((kind, _package(point)))
-    return tuple(found)
-
-
-def _package(point: EntryPoint) -> str:
-    return "an unknown package" if point.dist is None else f"{point.dist.name} {point.dist.version}"
+    types = [type(request) for request in lowered.requests]
+    if twice := [kind.__name__ for kind in types if types.count(kind) > 1]:
+        raise TgdslError(f'kind "{kind.name}" makes the request {twice[0]} twice; expected at most one of each type')
+    if (lowered.substeps or lowered.samples) and not (lowered.substeps and not kind.knobs and kind.decide is None):
+        what = "a block of samples wants `substeps` above 0, `knobs=frozenset()` and no `decide`"
+        raise TgdslError(f'kind "{kind.name}": {what}: noise, rates and thresholds are of single readings')
+    if lowered.substeps and (spec.rate is not None or spec.history is not None):
+        field = "rate" if spec.rate is not None else "history"
+        raise LowerError("this sensor reads a block of samples at each call", field, f"leave `{field}` out")
+    if lowered.substeps and lowered.reports:
+        raise TgdslError(f'kind "{kind.name}" has reports and reads blocks; a block has none')
 
 
 def _wrong(kind: object) -> str:

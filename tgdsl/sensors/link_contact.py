@@ -23,9 +23,23 @@ from torch import Tensor
 from tgdsl.fields.models import NonNegative
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    Context,
+    Kind,
+    Lowered,
+    ProbeSpec,
+    ReferenceContext,
+    ReferenceState,
+    State,
+    SurfaceOf,
+    body_axis,
+    scalar,
+)
 
 
 class LinkContactSpec(ProbeSpec):
@@ -40,33 +54,31 @@ class LinkContactSpec(ProbeSpec):
 
 
 def reference(
-    spec: LinkContactSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: LinkContactSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return c [1] and f [N] of the outputs asked for: (body, channel)."""
-    assert touch.contacts is not None
-    net = touch.contacts.net
+    net = gathered[Contacts].net
     is_touched = np.linalg.norm(net, axis=1) > spec.threshold
     parts = {"contact": is_touched[:, None].astype(np.float64), "force": net}
     return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
-    """The net force alone is wanted: no slots, and no probe reaches anywhere."""
+    """The net force alone is wanted: no slots, and no probe."""
     channels: list[Channel] = []
     if "contact" in spec.outputs:
         channels.append(Channel("contact", "1"))
     if "force" in spec.outputs:
         channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
     constants = {"threshold": scalar(spec.threshold)}
-    nowhere = np.full(layout.num_taxels, -np.inf)
-    needs, force = frozenset({"contacts"}), tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
-    return Lowered(tuple(channels), constants, rows="body", needs=needs, radius=nowhere, signal=force)
+    force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
+    requests = (Contacts(spec.objects),)
+    return Lowered(tuple(channels), constants, requests=requests, rows=body_axis(layout), signal=force)
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the force planes [N], by body, which are what noise acts on."""
-    assert felt.contacts is not None
-    return {f"force_{axis}": plane for axis, plane in zip("xyz", felt.contacts.net, strict=True)}, {}
+    return {f"force_{axis}": plane for axis, plane in zip("xyz", gathered[Contacts].net, strict=True)}, {}
 
 
 def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:

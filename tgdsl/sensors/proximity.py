@@ -24,7 +24,6 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
 from pydantic import Field, StrictInt
 from torch import Tensor
 
@@ -32,15 +31,17 @@ from tgdsl.fields.models import Area, NonNegative, Positive, Quantity
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.moments import MomentsRequest, SurfaceMoments
+from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
     Channel,
     Constants,
+    Context,
     Kind,
     Lowered,
-    MomentsRequest,
     ProbeSpec,
+    ReferenceContext,
     ReferenceState,
     State,
     SurfaceOf,
@@ -88,11 +89,10 @@ class ProximitySpec(ProbeSpec):
 
 
 def reference(
-    spec: ProximitySpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: ProximitySpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return (f [N], τ [N·m]) of the outputs asked for, (taxel, 3) or (taxel, 6)."""
-    near = touch.moments
-    assert near is not None
+    near = gathered[MomentsRequest]
     area = near.area.sum() if spec.reference_area is None else spec.reference_area
     rho, rows = spec.density / area, []
     for t, (x, a) in enumerate(zip(layout.pos, layout.normal, strict=True)):
@@ -125,23 +125,29 @@ def lower(spec: ProximitySpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     if "torque" in spec.outputs:
         channels += [Channel(f"torque_{axis}", "N·m") for axis in "xyz"]
         constants |= {"about_link": scalar(1.0)} if spec.torque_about == "link" else {}
-    needs = {"moments"}
-    if spec.shear_damping and ("force" in spec.outputs or "about_link" in constants):
-        needs.add("motion")
-    limits = (spec.tolerance, spec.gradient_tolerance, spec.max_bytes)
-    request = MomentsRequest(spec.backend, spec.points, *limits, with_area=spec.reference_area is None)
-    return Lowered(tuple(channels), constants, needs=frozenset(needs), moments=request)
+    request = MomentsRequest(
+        objects=spec.objects,
+        backend=spec.backend,
+        num_points=spec.points,
+        tolerance=spec.tolerance,
+        gradient_tolerance=spec.gradient_tolerance,
+        max_bytes=spec.max_bytes,
+        with_area=spec.reference_area is None,
+        motion=bool(spec.shear_damping and ("force" in spec.outputs or "about_link" in constants)),
+    )
+    return Lowered(tuple(channels), constants, requests=(request,))
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the force planes [N] and the torque planes [N·m]; what is not asked for is not used."""
     normal = planes.split(constants["normal"].T)
-    zero = torch.zeros_like(felt.depth)
+    felt = gathered[MomentsRequest]
+    zero = felt.none
     mass, first, slip = zero, (zero, zero, zero), (zero, zero, zero)
     for name, near in felt.moments.items():
         mass, first = mass + near.mass, planes.add(first, near.first)
         if name in felt.motions:
-            slip = planes.add(slip, _slip(felt, name, probes, constants["is_absolute"]))
+            slip = planes.add(slip, _slip(felt, name, constants["is_absolute"]))
     area = constants["area"] if "area" in constants else sum(felt.area.values(), start=zero[:1, :1])
     stiffness, damping = constants["stiffness"] / area, constants["damping"] / area
     # Less its part along the normal. Without the inner product, which all three components would share, a compiler that fuses
@@ -150,14 +156,14 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     force = planes.add(planes.scale(stiffness * mass, normal), planes.scale(damping, slip))
     torque = planes.scale(stiffness, planes.cross(first, normal))
     if "about_link" in constants:
-        torque = planes.add(torque, planes.cross(probes.pos, force))
+        torque = planes.add(torque, planes.cross(felt.pos, force))
     return {f"{n}_{axis}": p for n, v in (("force", force), ("torque", torque)) for axis, p in zip("xyz", v, strict=True)}, {}
 
 
-def _slip(felt: Felt, name: str, probes: Probes, is_absolute: Tensor) -> Vec:
+def _slip(felt: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
     """Return Σ of an object [m⁴/s]."""
     near, motion = felt.moments[name], felt.motions[name]
-    velocity = planes.add(motion.linear, planes.cross(motion.angular, probes.pos))
+    velocity = planes.add(motion.linear, planes.cross(motion.angular, felt.pos))
     omega = planes.add(motion.angular, planes.scale(is_absolute, motion.turn))
     return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
 

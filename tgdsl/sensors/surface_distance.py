@@ -25,9 +25,22 @@ from torch import Tensor
 from tgdsl.fields.models import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, ProbeSpec, ReferenceState, State, SurfaceOf, scalar
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    Context,
+    Kind,
+    Lowered,
+    ProbeSpec,
+    ReferenceContext,
+    ReferenceState,
+    State,
+    SurfaceOf,
+    scalar,
+)
 from tgdsl.sensors.noise import PROBE
 
 
@@ -43,14 +56,15 @@ class SurfaceDistanceSpec(ProbeSpec):
 
 
 def reference(
-    spec: SurfaceDistanceSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: SurfaceDistanceSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return y of all objects, then u of all objects: (taxel, object) or (taxel, 4 object) [m]."""
-    distance = np.minimum(touch.distance, spec.max_range)
+    met = gathered[ContactDepth]
+    distance = np.minimum(met.distance, spec.max_range)
     if not spec.nearest:
         return distance, {}
-    in_range = (touch.distance <= spec.max_range)[..., None]
-    vector = np.where(in_range, -distance[..., None] * touch.outward, 0.0)
+    in_range = (met.distance <= spec.max_range)[..., None]
+    vector = np.where(in_range, -distance[..., None] * met.outward, 0.0)
     return np.concatenate([distance, vector.reshape(len(vector), -1)], axis=1), {}
 
 
@@ -60,14 +74,15 @@ def lower(spec: SurfaceDistanceSpec, layout: Layout, surface_of: SurfaceOf) -> L
     if spec.nearest:
         channels += [Channel(f"nearest_{name}_{axis}", "m") for name in spec.feels for axis in "xyz"]
     constants = {"max_range": scalar(spec.max_range)}
-    return Lowered(tuple(channels), constants, needs=frozenset({"distance"}), range=spec.max_range)
+    request = ContactDepth(spec.objects, spec.is_gated, range=spec.max_range, distance=True)
+    return Lowered(tuple(channels), constants, requests=(request,))
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the distance planes, and the vectors' planes, by object [m]."""
     max_range = constants["max_range"]
     readings: dict[str, Tensor] = {}
-    for name, (distance, gradient) in felt.distances.items():
+    for name, (distance, gradient) in gathered[ContactDepth].distances.items():
         capped = torch.minimum(distance, max_range)
         readings[f"distance_{name}"] = capped
         reach = torch.where(distance > max_range, 0.0, -capped)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,21 +13,31 @@ from tgdsl.tensors.devices import check_dtype
 
 
 class Constants(nn.Module):
-    """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
+    """Arrays as buffers, by name. A change of dtype starts from the arrays' own float64, so that nothing is rounded twice.
 
-    def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
+    Attributes:
+        tree: What was made of the buffers by `bind`, and is made again when they are replaced.
+    """
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype, bind: Callable[[Callable[[str], Tensor]], Any]):
         """Make a buffer of each array, floats in `dtype`.
+
+        Args:
+            arrays: The arrays by name.
+            dtype: Dtype of the floats.
+            bind: Makes of a function from names to tensors what is read at run time.
 
         Raises:
             TgdslError: If no module can be of that dtype.
         """
         check_dtype(dtype)
         super().__init__()
-        self._counts = {name: tuple(array[0].tolist()) for name, array in arrays.items() if name.endswith("/num")}
         with torch.inference_mode(False):  # whoever builds a module there may want derivatives later
             self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
             for name, exact in self._exact.items():
                 self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
+        self._bind = bind
+        self._rebind()
 
     @property
     def dtype(self) -> torch.dtype:
@@ -46,13 +57,14 @@ class Constants(nn.Module):
         """Return whether there is an array of a path."""
         return name in self._buffers
 
-    def counts(self, name: str) -> tuple[int, int, int]:
-        """Return the first row of a table of node counts, `<path>/num`, as numbers that become part of compiled code."""
-        return self._counts[name]
+    def refresh(self) -> None:
+        """Bind again if some buffer is another tensor than before, as under `torch.func.functional_call`."""
+        if any(self._buffers[name] is not tensor for name, tensor in self._bound.items()):
+            self._rebind()
 
-    def under(self, prefix: str, names: Sequence[str]) -> dict[str, Tensor]:
-        """Return some of the arrays below a path, by their own names."""
-        return {name: self[f"{prefix}/{name}"] for name in names}
+    def _rebind(self) -> None:
+        self._bound = dict(self._buffers)
+        self.tree = self._bind(self.__getitem__)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Constants:
         before = dict(self._buffers)
@@ -63,4 +75,5 @@ class Constants(nn.Module):
             is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
             if is_untouched:
                 self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
+        self._rebind()
         return self

@@ -24,7 +24,8 @@ from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.plan.plan import SLOT_FIELDS, Plan
+from tgdsl.plan.plan import Plan
+from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
 from tgdsl.testing.reference import ReferenceModule, assert_agrees

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.module.state import SHAPES, SceneState
-from tgdsl.plan.plan import SLOT_FIELDS
+from tgdsl.quantities.contacts import SLOT_FIELDS
 
 
 def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:

@@ -135,12 +135,12 @@ def scene_of(
         view: From where; default: see `cameras.best_camera`.
     """
     model, pose = sim.model, Pose(*sim.body_poses(env))
-    carriers = {model.body(link.body).id for link in touch.plan.links}
+    carriers = {model.body(link.body).id for link in touch.plan.layout.links}
     framed, robot = robot_bodies(model, carriers)
     felt = {model.body(target.body).id for target in touch.plan.objects}
     hand, objects = (solid_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
-    layout, top = touch.plan.layout(), min(framed)
+    layout, top = touch.plan.layout, min(framed)
     camera = best_camera(dots, hand, model, layout, pose, top) if view is None else camera_of(view, model, [layout], pose, top)
     box = _window(camera.project(hand.corners[frame] if frame.any() else dots.pos[:, None]), camera.project(objects.corners))
     screen = screen_for(camera, box, width, height)

@@ -297,7 +297,7 @@ def world_points(sim, table: np.ndarray) -> np.ndarray:
 
 def test_what_a_hand_is_taken_for(odd, touch):
     hand, folder = odd
-    groups = touch.plan.layout().groups
+    groups = touch.plan.layout.groups
     assert set(groups["tips"]) == set(hand.tips)
     assert groups.get("palm", ()) == hand.palm
     assert set(groups["fingers"]) == set(hand.fingers)
@@ -449,7 +449,7 @@ def test_names_that_yaml_and_selections_could_misread(tmp_path, here):
     (tmp_path / "hand.xml").write_text(f"<mujoco><worldbody>{parts}</worldbody></mujoco>", encoding="utf-8")
     code, _, error = here(tmp_path, "layout", "new", "hand.xml", "--density", "1/cm2")
     assert code == 0, error
-    groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout().groups
+    groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout.groups
     assert groups == {"tips": tuple(names), "fingers": tuple(names), "hand": tuple(names)}
 
 

@@ -9,7 +9,7 @@ from warp_cases import warp
 import tgdsl
 from tgdsl.errors import RobotError, SimulationError, SpecError
 from tgdsl.formats.usd.export.writer import export_usd
-from tgdsl.plan.plan import ContactPart
+from tgdsl.plan.inputs import ContactPart
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
 G = 9.81

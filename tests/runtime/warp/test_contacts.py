@@ -15,7 +15,8 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.plan.plan import Pair, contact_sensor_names
+from tgdsl.plan.inputs import contact_sensor_names
+from tgdsl.quantities.pairs import Pair
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.runtime.warp.lane import libraries
 

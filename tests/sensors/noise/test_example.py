@@ -75,7 +75,7 @@ def test_readings_are_of_the_quantisers_steps(touch, readings):
         share = readings[name].double() / step
         assert (share - share.round()).abs().max() < 1e-3, name
     share = readings["worn"].double() / 1e-2
-    is_palm = torch.from_numpy(np.isin(touch.taxels["worn"]["link"], touch.plan.groups["palm"]))
+    is_palm = torch.from_numpy(np.isin(touch.taxels["worn"]["link"], touch.plan.layout.groups["palm"]))
     assert 0 < is_palm.sum() < len(is_palm)
     assert (share - share.round())[..., ~is_palm, :].abs().max() < 1e-3
     assert ((share - share.round()).abs() > 1e-2)[..., is_palm, :].float().mean() > 0.8

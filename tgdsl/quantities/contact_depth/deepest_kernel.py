@@ -25,8 +25,8 @@ from torch.library import triton_op, wrap_triton
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.shapes_kernel import TIE, chosen, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back
-from tgdsl.quantities.contact_depth.query import Pairs
 from tgdsl.quantities.contact_depth.search import Tables
+from tgdsl.quantities.pairs import Pairs
 
 BLOCK = 64
 """Probes of a program, which is one warp: two for each of its lanes."""

@@ -15,8 +15,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
-from tgdsl.quantities.contact_depth.query import Felt, FeltObject, Pairs, Probes
-from tgdsl.quantities.contacts.contacts import Contacts
+from tgdsl.quantities.contact_depth.query import Probes
+from tgdsl.quantities.contact_depth.request import Penetration
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import Pairs
 from tgdsl.tensors.fusion import takes_kernel
 
 THRESHOLD = 5
@@ -45,31 +47,29 @@ class Tables(NamedTuple):
     geoms: Float[Tensor, "case geom row"]
 
 
-def is_searchable(shapes: Collection[str], needs: Collection[str]) -> bool:
+def is_searchable(shapes: Collection[str], wants: Collection[str]) -> bool:
     """Return whether the kernel can answer: enough geoms, all of shapes that it knows, and nothing but normal and motion."""
-    is_known = all(shape in SHAPES for shape in shapes) and all(need in ("normal", "motion", "contacts") for need in needs)
+    is_known = all(shape in SHAPES for shape in shapes) and all(want in ("normal", "motion") for want in wants)
     return is_known and len(shapes) >= THRESHOLD
 
 
 def search(
     pairs: Pairs,
     probes: Probes,
-    objects: Sequence[FeltObject],
+    objects: Sequence[Geoms],
     known: Mapping[str, Tensor],
     reach: Float[Tensor, "object *env taxel"],
-    needs: Collection[str],
-    contacts: Contacts | None = None,
-) -> Felt | None:
-    """Return what `query.feel` would, found by one kernel; None where that cannot run.
+    wants: Collection[str],
+) -> Penetration | None:
+    """Return what `query.penetration` would, found by one kernel; None where that cannot run.
 
     Args:
         pairs: Relative poses of all pairs of the plan.
         probes: The probes.
         objects: The objects that are felt, the first of equals first; they are searchable.
         known: Their tables by name, as `Tables` has them: `pair`, and the others where they are the same at all calls.
-        reach: As `query.feel` has it.
-        needs: As `query.feel` has them.
-        contacts: Handed through.
+        reach: As `query.penetration` has it.
+        wants: As `query.penetration` has them.
     """
     motion = () if pairs.motion is None else (*pairs.motion.linear, *pairs.motion.angular)
     geoms = [part for target in objects for part in (target.size, target.pos, target.rotation)]
@@ -80,15 +80,15 @@ def search(
     spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(objects)
     found = deepest(pairs, probes.pos, Tables(known["pair"], spheres, geoms), reach)
     velocity = angular = None
-    if "motion" in needs and pairs.motion is not None:
+    if "motion" in wants and pairs.motion is not None:
         own, is_met = found.pair.clamp(min=0).long(), found.pair >= 0
         x, y, z, u, v, w = (torch.where(is_met, part.gather(1, own), 0.0) for part in motion)
         velocity, angular = planes.add((x, y, z), planes.cross((u, v, w), probes.pos)), (u, v, w)
-    normal = found.normal if "normal" in needs else None
-    return Felt(found.depth, normal, velocity, angular, {}, {}, contacts, {}, {}, {}, {})
+    normal = found.normal if "normal" in wants else None
+    return Penetration(probes.pos, found.depth, normal, velocity, angular, {}, {})
 
 
-def geom_tables(objects: Sequence[FeltObject]) -> tuple[Tensor, Tensor]:
+def geom_tables(objects: Sequence[Geoms]) -> tuple[Tensor, Tensor]:
     """Return the tables of objects and of their geoms, `Tables.spheres` and `Tables.geoms`.
 
     They are made of few operations, as each is a kernel of a microsecond where objects differ between environments.

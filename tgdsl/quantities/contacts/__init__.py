@@ -1,1 +1,27 @@
 """Contacts: the solver's, on the bodies that carry a sensor."""
+
+from tgdsl.quantities.base import Quantity
+from tgdsl.quantities.contacts.gathering import gather
+from tgdsl.quantities.contacts.part import SLOT_FIELDS, ContactsPart
+from tgdsl.quantities.contacts.planning import plan
+from tgdsl.quantities.contacts.reference import reference
+from tgdsl.quantities.contacts.request import ContactPoints, Contacts
+
+__all__ = ["CONTACTS", "SLOT_FIELDS", "ContactPoints", "Contacts"]
+
+
+def _fields(part: ContactsPart) -> set[str]:
+    return {"contact_netforce", *(["contact_found", *SLOT_FIELDS] if part.slots else [])}
+
+
+CONTACTS = Quantity(
+    name="contacts",
+    request=Contacts,
+    part=ContactsPart,
+    plan=plan,
+    gather=gather,
+    reference=reference,
+    fields=_fields,
+    is_light=lambda part: True,
+    explain=lambda part, use, objects: ["the solver's contacts"],
+)

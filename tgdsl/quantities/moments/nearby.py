@@ -14,8 +14,9 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Rot, Vec
-from tgdsl.quantities.contact_depth.query import Felt, Motion, Pairs, Probes, gathered
 from tgdsl.quantities.moments.moments import MomentField, Moments, PointCloud, cloud_moments, field_moments, plane_moments
+from tgdsl.quantities.moments.request import SurfaceMoments
+from tgdsl.quantities.pairs import Motion, PairedObject, Pairs, gathered
 from tgdsl.tensors.fusion import takes_kernel
 
 
@@ -30,10 +31,8 @@ class MomentSource(NamedTuple):
     """One object, and how its moments are found.
 
     Attributes:
-        name: Its name.
-        first_pair: Index of its first pair.
-        num_pairs: Number of its pairs.
-        pair: Index of each probe's pair among them.
+        target: The object.
+        pair: Index of each probe's pair among its own.
         radius: Sensing radius of each probe towards it [m], (taxel,) or (env, taxel); 0 where the probe is inactive or is on
             the object itself.
         shift: By how much that is more than the radius that a field is of [m], (env, taxel); None: nothing.
@@ -42,9 +41,7 @@ class MomentSource(NamedTuple):
         area: Area of its outer surface, planes left out [m²].
     """
 
-    name: str
-    first_pair: int
-    num_pairs: int
+    target: PairedObject
     pair: Int[Tensor, " taxel"]
     radius: Float[Tensor, "*env taxel"]
     shift: Float[Tensor, "env taxel"] | None
@@ -53,29 +50,36 @@ class MomentSource(NamedTuple):
     area: Float[Tensor, "case 1"]
 
 
-def with_moments(felt: Felt, pairs: Pairs, probes: Probes, sources: Sequence[MomentSource]) -> Felt:
-    """Return an answer with moments, motions and areas of objects added. Moments are never gated."""
+def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> SurfaceMoments:
+    """Return the moments of objects about probes, their motions if pairs have them, and their areas.
+
+    Args:
+        pairs: Relative poses of all pairs of the plan.
+        pos: Where the probes are in their links' frames [m], planes (taxel,).
+        sources: The objects.
+    """
     found: dict[str, Moments] = {}
     motions: dict[str, Motion] = {}
     for source in sources:
-        own = slice(source.first_pair, source.first_pair + source.num_pairs)
-        found[source.name] = _felt_moments(pairs, own, probes, source)
+        name, own = source.target.name, source.target.pairs
+        found[name] = _felt_moments(pairs, own, pos, source)
         if pairs.motion is not None:
             linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
-            motions[source.name] = Motion(linear, angular, turn)
-    return felt._replace(moments=found, motions=motions, area={source.name: source.area for source in sources})
+            motions[name] = Motion(linear, angular, turn)
+    none = pairs.offset[0].new_zeros((pairs.offset[0].shape[0], pos[0].shape[0]))
+    return SurfaceMoments(pos, none, found, motions, {source.target.name: source.area for source in sources})
 
 
-def _felt_moments(pairs: Pairs, own: slice, probes: Probes, source: MomentSource) -> Moments:
+def _felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
     """Return the moments of an object at the probes, in their links' frames."""
-    tensors = [source.radius, *probes.pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
+    tensors = [source.radius, *pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
     field = source.surface
     if isinstance(field, MomentField) and not field.is_smooth and not source.planes and takes_kernel(*tensors):
         from tgdsl.quantities.moments.nearby_kernel import felt_moments
 
-        return felt_moments(pairs, own, probes.pos, source.pair, source.radius, source.shift, field)
+        return felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, field)
     rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
-    point = planes.add(planes.rotate(rotation, probes.pos), gathered(pairs.offset, own, source.pair))
+    point = planes.add(planes.rotate(rotation, pos), gathered(pairs.offset, own, source.pair))
     moments = _moments(point, source)
     return Moments(moments.mass, planes.rotate_back(rotation, moments.first))
 

@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.contact_depth.query import Pairs
 from tgdsl.quantities.moments.moments import MomentField, Moments
+from tgdsl.quantities.pairs import Pairs
 
 BLOCK = 128
 """Probes of a program, which has four warps: so each thread loads whole nodes, and none is sent to another one."""

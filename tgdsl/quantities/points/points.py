@@ -16,7 +16,8 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.contact_depth.query import Felt, FeltObject, Pairs, body_distance, united
+from tgdsl.quantities.geoms.distance import Geoms, body_distance, united
+from tgdsl.quantities.pairs import Pairs
 from tgdsl.tensors.fusion import stored, takes_kernel
 
 SMALLEST_TILE, LARGEST_TILE = 32, 128
@@ -42,10 +43,10 @@ class PointSource(NamedTuple):
     tiles: Int[Tensor, "tile 3"]
     points: tuple[Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"], Float[Tensor, "case 1 point"]]
     area: Float[Tensor, "case 1"]
-    links: FeltObject
+    links: Geoms
 
 
-class MetPoints(NamedTuple):
+class LinkPoints(NamedTuple):
     """Points sampled on one object, as the links that they may meet see them; planes (env, link, point), in each link's frame.
 
     Attributes:
@@ -66,24 +67,24 @@ class MetPoints(NamedTuple):
     area: Tensor
 
 
-class Meeting(NamedTuple):
+class ObjectPoints(NamedTuple):
     """The points of one object, and the pairs by which links see them, gated as these are."""
 
     pairs: Pairs
     source: PointSource
 
 
-def are_for_kernel(meeting: Meeting) -> bool:
+def are_for_kernel(own: ObjectPoints) -> bool:
     """Return whether a kernel can take all of it: the links' geoms are grids, on a GPU."""
-    (rotation, offset, _, _), source = meeting.pairs, meeting.source
+    (rotation, offset, _, _), source = own.pairs, own.source
     are_grids = all(isinstance(surface, Grid) for surface in source.links.surfaces)
     return are_grids and takes_kernel(*rotation, *offset, *source.points, source.links.pos, source.links.rotation)
 
 
-def met_points(meeting: Meeting) -> MetPoints:
+def link_points(own: ObjectPoints) -> LinkPoints:
     """Return where the points are, and how deep in the links' surfaces."""
-    pairs, source = meeting
-    if are_for_kernel(meeting):
+    pairs, source = own
+    if are_for_kernel(own):
         return _met_by_kernel(pairs, source)
     rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
     offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
@@ -91,12 +92,7 @@ def met_points(meeting: Meeting) -> MetPoints:
     distance, gradient = body_distance(pos, source.links)
     if pairs.gate is not None:
         distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
-    return MetPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
-
-
-def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Felt:
-    """Return an answer with the points of objects added."""
-    return felt._replace(points={source.object: Meeting(pairs, source) for source in sources})
+    return LinkPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
 
 
 def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tuple[int, int, int]]:
@@ -121,10 +117,10 @@ def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
     return min(max(1 << (most - 1).bit_length(), SMALLEST_TILE), LARGEST_TILE)
 
 
-def _met_by_kernel(pairs: Pairs, source: PointSource) -> MetPoints:
+def _met_by_kernel(pairs: Pairs, source: PointSource) -> LinkPoints:
     """Return the points of one object where all geoms of the links are grids, one geom after the other."""
     from tgdsl.quantities.points.skin_kernel import meet
 
     found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
     distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
-    return MetPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)
+    return LinkPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)

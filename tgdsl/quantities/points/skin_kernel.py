@@ -25,7 +25,8 @@ from torch.library import triton_op, wrap_triton
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec, vec
 from tgdsl.geometry.shapes_kernel import TIE, chosen, direction, is_any, loaded, rotate, rotate_back
-from tgdsl.quantities.contact_depth.query import FeltObject, Pairs
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import Pairs
 
 BLOCK = 32
 """Points that are looked up together, by a program of one warp; two for each lane do not fit into its registers."""
@@ -34,7 +35,7 @@ GEOM, ORIGIN, CELL, FRAME = tl.constexpr(3), tl.constexpr(12), tl.constexpr(15),
 
 
 def meet(
-    pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: FeltObject, g: int
+    pairs: Pairs, pair: Int[Tensor, " link"], points: Vec, links: Geoms, g: int
 ) -> tuple[Vec, Float[Tensor, "env link point"], Vec]:
     """Return the points' places in the links' frames [m], signed distances to their surfaces [m], and unit gradients.
 
@@ -52,7 +53,7 @@ def meet(
     return (x, y, z), distance, vec(gradient)
 
 
-def grid_tables(links: FeltObject, g: int) -> tuple[Float[Tensor, "link 16"], Int[Tensor, "link 4"], Float[Tensor, " node"]]:
+def grid_tables(links: Geoms, g: int) -> tuple[Float[Tensor, "link 16"], Int[Tensor, "link 4"], Float[Tensor, " node"]]:
     """Return what kernels are told of a geom of the links: `frames`, `counts` and `values`, see `launch`."""
     grid = links.surfaces[g]
     assert isinstance(grid, Grid)

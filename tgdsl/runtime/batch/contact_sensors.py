@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from tgdsl.errors import SimulationError, listed
 from tgdsl.module.state import shape_of
-from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
+from tgdsl.plan.inputs import Inputs, contact_sensor_names
+from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.lookup import geoms_of
 
 CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")

@@ -12,7 +12,7 @@ import mujoco.batch
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.batch.contact_sensors import ContactSensors
 from tgdsl.runtime.simulators.lookup import body_id
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 
 MOVED = {"joint_pos": "qpos", "joint_vel": "qvel", "last_action": "ctrl"}
 """Fields of a state that a physics step, or its caller, moves on, and the arrays that they are read from."""

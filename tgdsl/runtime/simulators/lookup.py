@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.plan.plan import ContactPart
+from tgdsl.plan.inputs import ContactPart
 
 
 def body_id(model: mujoco.MjModel, name: str) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 from tgdsl.scene.scene import Choice, SceneModels
 from tgdsl.schema.objects import NUM_SIZES
 

@@ -21,7 +21,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.module.state import shape_of
-from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
+from tgdsl.plan.inputs import Inputs, contact_sensor_names
+from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.runtime.simulators.lookup import body_id, part_geoms
 from tgdsl.runtime.warp.lane import libraries
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.objects import EnvObjects, Values
 from tgdsl.runtime.warp.lane import libraries
 from tgdsl.runtime.warp.worlds import Worlds

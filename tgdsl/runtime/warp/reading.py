@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.joint_fields import JointPlaces
 from tgdsl.runtime.simulators.lookup import body_id
 from tgdsl.runtime.warp.contacts import PairContacts

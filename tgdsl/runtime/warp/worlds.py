@@ -15,7 +15,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.plan.plan import Inputs
+from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.faults import BAD_VALUES
 from tgdsl.runtime.simulators.joint_fields import FORCES, JointPlaces
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from tgdsl.errors import ObservationError
 from tgdsl.observations.observations import HAND_ONLY
 from tgdsl.observations.proprioception import QUANTITIES
-from tgdsl.plan.plan import Plan, PlannedObservation, PlannedSensor
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.wire.errors import MotionError
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, JOINTS

@@ -6,7 +6,7 @@ at a time holds an anchor: the deepest when it was taken, the first among equals
 
     s_i = R_oᵀ (e_i − c_o) − x_i,        t_i = Π_ni(s_i)                                      [m]
 
-R_o, c_o how the object sees the link (`query.Frame`), x_i the taxel's place. With a friction cap, |t_i| ≤ `slip` h_i: beyond it
+R_o, c_o how the object sees the link (`geoms.distance.Frame`), x_i the taxel's place. With a friction cap, |t_i| ≤ `slip` h_i: beyond it
 the skin slides, t_i is scaled back, and the anchor is dragged along by as much.
 
 Shapes: planes (env, taxel); in `reference`, (taxel,) and (taxel, 3).
@@ -23,9 +23,9 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities import reference
-from tgdsl.quantities.contact_depth.query import Felt
-from tgdsl.quantities.reference import Touch
+from tgdsl.geometry.reference import TIE
+from tgdsl.quantities.contact_depth import Penetration
+from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
 """What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""
@@ -47,7 +47,7 @@ class Law(NamedTuple):
     slip: float | Tensor | None
 
 
-def advance(felt: Felt, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Tensor]) -> tuple[Vec, dict[str, Tensor]]:
+def advance(felt: Penetration, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Tensor]) -> tuple[Vec, dict[str, Tensor]]:
     """Return the tangential displacements t [m] and the new anchors."""
     anchor, held_by = (state["anchor_x"], state["anchor_y"], state["anchor_z"]), state["object"]
     zero = torch.zeros_like(felt.depth)
@@ -84,7 +84,7 @@ def capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
 
 
 def advance_reference(
-    touch: Touch, pos: np.ndarray, normal: np.ndarray, law: Law, state: Mapping[str, np.ndarray]
+    touch: ReferencePenetration, pos: np.ndarray, normal: np.ndarray, law: Law, state: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return t (taxel, 3) [m] and the new anchors of one environment, taxel by taxel."""
     found = np.zeros((len(pos), 3))
@@ -112,7 +112,7 @@ def _deepest(depth: np.ndarray, enter: float) -> int:
     """Return the deepest object, the first among equals; −1 if none is deeper than `enter`."""
     chosen, most = -1, enter
     for k, d in enumerate(depth):
-        if d > (most + reference.TIE if chosen >= 0 else most):
+        if d > (most + TIE if chosen >= 0 else most):
             chosen = k
         most = max(most, d)
     return chosen

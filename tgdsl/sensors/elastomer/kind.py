@@ -43,8 +43,10 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.sensors.base import Channel, Constants, Kind, Lowered, Memory, PointsRequest, State, SurfaceOf, scalar
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.points import Points
+from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.point_anchors import Markers
@@ -70,7 +72,8 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants |= {"dilation_strength": scalar(spec.dilation_strength), "depth_exponent": scalar(spec.depth_exponent)}
     reach = np.full(layout.num_taxels, spec.standoff)
     if spec.anchored is None:
-        return Lowered(CHANNELS, constants, radius=reach, notes=spec.notes)
+        depth = ContactDepth(spec.objects, spec.is_gated, radius=reach)
+        return Lowered(CHANNELS, constants, requests=(depth,), notes=spec.notes)
     constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
     if spec.slip is not None:
         constants["slip"] = scalar(spec.slip)
@@ -81,18 +84,16 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
     span = spec.standoff + spec.exit
     if spec.anchored == "taxels":
         state = {name: Memory() for name in anchors.PLANES}
-        return Lowered(
-            CHANNELS, constants, state, needs=frozenset({"distance", "frame"}), range=span, radius=reach, notes=spec.notes
-        )
+        depth = ContactDepth(spec.objects, spec.is_gated, radius=reach, range=span, distance=True, frame=True)
+        return Lowered(CHANNELS, constants, state, requests=(depth,), notes=spec.notes)
     constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
     constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(layout)}
     if spec.model != "paper":
         constants["reference_area"] = scalar(spec.reference_area)
-    state = {name: Memory(shape="points") for name in point_anchors.PLANES}
-    request = PointsRequest(spec.points, span)
-    return Lowered(
-        CHANNELS, constants, state, needs=frozenset({"points"}), range=span, radius=reach, points=request, notes=spec.notes
-    )
+    state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
+    depth = ContactDepth(spec.objects, spec.is_gated, radius=reach, range=span)
+    points = Points(spec.objects, spec.is_gated, num_points=spec.points, range=span)
+    return Lowered(CHANNELS, constants, state, requests=(depth, points), notes=spec.notes)
 
 
 def _flat_links(layout: Layout) -> list[int]:
@@ -102,21 +103,22 @@ def _flat_links(layout: Layout) -> list[int]:
     return [first for first, end in zip(starts, ends, strict=True) if (layout.normal[first:end] == layout.normal[first]).all()]
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the displacement planes [m] and the new anchors."""
     normal = planes.split(constants["normal"].T)
+    felt = gathered[ContactDepth]
     shear, pulls, after = None, None, {}
     if "enter" in constants:
         law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
         if "shear_falloff" in constants:
-            pulls, after = point_anchors.gripped(list(felt.points.values()), law, state)
+            pulls, after = point_anchors.gripped(list(gathered[Points].values()), law, state)
         else:
-            shear, after = anchors.advance(felt, probes.pos, normal, law, state)
+            shear, after = anchors.advance(felt, felt.pos, normal, law, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian
     found = move(felt.depth, shear, normal, constants)
     if pulls is not None:
         flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
-        markers = Markers(probes.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
+        markers = Markers(felt.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
         dragged = point_anchors.drag(pulls, markers, felt.depth.shape[0])
         found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after

@@ -25,8 +25,8 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.points.points import Meeting, MetPoints, are_for_kernel, met_points, tile_size
-from tgdsl.quantities.reference import ReferencePoints
+from tgdsl.quantities.points.points import LinkPoints, ObjectPoints, are_for_kernel, link_points, tile_size
+from tgdsl.quantities.points.reference import ReferencePoints
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import Law, capped
 from tgdsl.tensors.fusion import stored, takes_kernel
@@ -75,16 +75,16 @@ class Pull(NamedTuple):
     count: Tensor | None = None
 
 
-def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
+def gripped(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
     """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
-    if not all(are_for_kernel(meeting) and len(meeting.source.links.shapes) == 1 for meeting in meetings):
-        return advance([met_points(meeting) for meeting in meetings], law, state)
+    if not all(are_for_kernel(own) and len(own.source.links.shapes) == 1 for own in objects):
+        return advance([link_points(own) for own in objects], law, state)
     from tgdsl.quantities.points.skin_kernel import grid_tables
     from tgdsl.sensors.elastomer.grip_kernel import grip
 
     pulls, first = [], 0
     numbers = [part for part in law if isinstance(part, Tensor)]
-    for pairs, source in meetings:
+    for pairs, source in objects:
         places, tables = torch.stack(source.points)[:, :, 0], grid_tables(source.links, 0)
         is_cubic, pose = source.links.shapes[0] == "tricubic", [*pairs.rotation, *pairs.offset]
         planes_of = [state[name] for name in PLANES]
@@ -95,7 +95,7 @@ def gripped(meetings: Sequence[Meeting], law: Law, state: Mapping[str, Tensor]) 
     return pulls, {}
 
 
-def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
+def advance(met: Sequence[LinkPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
     """Return what the points of each object pull with, and the new anchors."""
     pulls, after, start = [], {name: [] for name in PLANES}, 0
     for points in met:

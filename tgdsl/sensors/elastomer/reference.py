@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.base import ReferenceState
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.points import Points
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.elastomer import blocks
 from tgdsl.sensors.elastomer.anchors import Law, advance_reference
 from tgdsl.sensors.elastomer.kernels import Elastic
@@ -23,7 +25,7 @@ Array = np.ndarray
 
 
 def reference(
-    spec: ElastomerSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: ElastomerSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[Float[Array, "taxel 3"], dict[str, Array]]:
     """Return the displacements [m] in the body's frame, without the boundary, and the anchors.
 
@@ -32,6 +34,7 @@ def reference(
     """
     if spec.boundary is not None:
         raise NotImplementedError("the reference has no clamped boundary")
+    touch = gathered[ContactDepth]
     shear, found, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
     law = Law(spec.standoff, spec.enter, spec.exit, spec.slip)
     if spec.anchored == "taxels":
@@ -39,7 +42,7 @@ def reference(
     elif spec.anchored == "points":
         area = None if spec.model == "paper" else spec.reference_area
         args = layout.pos, layout.normal, law, spec.shear_falloff, area, state
-        drag, after = reference_drag(touch.points, *args)
+        drag, after = reference_drag(gathered[Points], *args)
         found = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
     for link in range(len(layout.links)):
         own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))

@@ -38,9 +38,22 @@ from tgdsl.errors import LowerError
 from tgdsl.fields.models import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.base import Channel, Constants, ContactProbeSpec, Kind, Lowered, ReferenceState, State, SurfaceOf
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import (
+    Channel,
+    Constants,
+    ContactProbeSpec,
+    Context,
+    Kind,
+    Lowered,
+    ReferenceContext,
+    ReferenceState,
+    State,
+    SurfaceOf,
+)
 from tgdsl.sensors.force_taxel import footprint
 from tgdsl.sensors.noise import FORCE
 
@@ -76,19 +89,18 @@ class ForceTaxelSpec(ContactProbeSpec):
 
 
 def reference(
-    spec: ForceTaxelSpec, layout: Layout, touch: Touch, state: ReferenceState
+    spec: ForceTaxelSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return f [N] and p [Pa], of the outputs asked for: (taxel, channel)."""
-    force, _, _ = reference_reports(spec, layout, touch)
+    force, _, _ = reference_reports(spec, layout, gathered)
     pressure = np.maximum(0.0, -np.sum(force * layout.normal, axis=1)) / np.where(layout.radius > 0, layout.area, 1.0)
     parts = {"force": force, "pressure": pressure[:, None]}
     return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
-def reference_reports(spec: ForceTaxelSpec, layout: Layout, touch: Touch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def reference_reports(spec: ForceTaxelSpec, layout: Layout, gathered: References) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return f (taxel, 3) [N], missed (body, 3) [N] and residual (body, 3) [N·m]."""
-    contacts = touch.contacts
-    assert contacts is not None
+    contacts, touch = gathered[Contacts], gathered[ContactDepth]
     force, missed, residual = np.zeros((layout.num_taxels, 3)), contacts.net.copy(), np.zeros_like(contacts.net)
     is_active = layout.radius > 0
     depth = np.where(is_active, touch.depth / np.where(is_active, layout.radius, 1.0), 0.0)
@@ -137,13 +149,13 @@ def lower(spec: ForceTaxelSpec, layout: Layout, surface_of: SurfaceOf) -> Lowere
         "missed": tuple(Channel(f"missed_{axis}", "N") for axis in "xyz"),
         "residual": tuple(Channel(f"residual_{axis}", "N·m") for axis in "xyz"),
     }
-    return Lowered(tuple(channels), reports=reports, constants=constants, needs=frozenset({"contacts"}), slots=spec.slots)
+    requests = (ContactDepth(spec.objects, spec.is_gated), Contacts(spec.objects, slots=spec.slots))
+    return Lowered(tuple(channels), constants, requests=requests, reports=reports)
 
 
-def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
-    contacts = felt.contacts
-    assert contacts is not None
+    contacts, felt = gathered[Contacts], gathered[ContactDepth]
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
     shared = footprint.shared_forces(
         bodies,

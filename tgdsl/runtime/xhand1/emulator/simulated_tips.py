@@ -17,7 +17,8 @@ from tgdsl.module.history import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.observations import observations
 from tgdsl.observations.observations import HAND_ONLY
-from tgdsl.plan.plan import Plan, PlannedObservation
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedObservation
 from tgdsl.runtime.xhand1.fingertips import HandTerm
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS
 

@@ -1,78 +1,37 @@
-"""What is felt of an object: its geoms, as primitives with exact distances or as triangle surfaces with a query."""
+"""What is felt of an object: which of its geoms, and which geoms the solver's contacts with it act on."""
 
 from __future__ import annotations
 
-import dataclasses
-import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-
-import igl
-import numpy as np
-import trimesh
+from collections.abc import Callable, Collection, Sequence
 
 from tgdsl.formats.robot import Model
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.plan.plan import ContactPart
-from tgdsl.quantities.contact_depth.bake import bake
+from tgdsl.plan.inputs import ContactPart
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
 from tgdsl.schema.select import matching
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
+from tgdsl.surfaces.sensed import DistanceOptions, SensedObject
 
-HULL_POINTS = 2000
-"""Points of a convex hull whose distance to the mesh is looked at."""
 Report = Callable[[str, str], None]
 """Called with what is wrong with an object, and a hint."""
 
 
-@dataclass(frozen=True, eq=False)
-class Settled:
-    """A felt geom with nothing left to decide.
-
-    Attributes:
-        shape: What computes its distance: a primitive's type, an interpolation of a grid, or `raycast`.
-        arrays: What that needs besides the geom's size and pose, by name.
-        accuracy: What a grid costs, by name; empty for what is exact.
-    """
-
-    shape: str
-    arrays: Mapping[str, np.ndarray]
-    accuracy: Mapping[str, float]
-
-
-@dataclass(frozen=True, eq=False)
-class FeltBody:
-    """An object that can be felt.
-
-    Attributes:
-        body: Its body.
-        variants: The geoms that can be felt of each of its variants; of a single one if it is the same everywhere.
-        is_sized: Whether the size of its geom is part of the state.
-        bodies: Its body and those that are welded to it, by their indices in the scene.
-        touched: Geoms of the scene that the solver's contacts with it act on.
-    """
-
-    body: str
-    variants: tuple[tuple[SurfaceGeom, ...], ...]
-    is_sized: bool
-    bodies: tuple[int, ...]
-    touched: frozenset[int]
-
-
-def felt_body(
+def sensed_object(
+    name: str,
     body: str,
     target: ObjectSpec,
     scene: Model,
     variants: Sequence[tuple[Model, tuple[str, ...]]],
     others: Collection[str],
     report: Report,
-) -> FeltBody:
+) -> SensedObject:
     """Return what is felt of an object: the geoms that collide, those that are seen, those named, or its own.
 
     Bodies that are welded to its body from below are part of it, and the solver's contacts with it are those on its geoms that
     collide. A surface that is only seen has none of its own: contacts with it are those of the whole object.
 
     Args:
+        name: Its name.
         body: Its body.
         target: What the document says of it.
         scene: The scene.
@@ -98,10 +57,18 @@ def felt_body(
                 hint = f"primitives: {', '.join(NUM_SIZES)}"
                 report(f'with `size: per_env` the body "{body}" has one geom, a primitive; found {found}', hint)
                 break
-    return FeltBody(body, tuple(felt), target.size == "per_env", bodies, frozenset(geom.id for geom in touched))
+    return SensedObject(
+        name=name,
+        body=body,
+        variants=tuple(felt),
+        is_sized=target.size == "per_env",
+        bodies=bodies,
+        touched=frozenset(geom.id for geom in touched),
+        distance=DistanceOptions(target.query, target.tolerance, target.max_bytes),
+    )
 
 
-def contact_parts(scene: Model, felt: FeltBody, report: Report) -> tuple[ContactPart, ...]:
+def contact_parts(scene: Model, felt: SensedObject, report: Report) -> tuple[ContactPart, ...]:
     """Return the geoms that contacts with an object act on as MuJoCo's contact sensors can name them.
 
     Args:
@@ -155,47 +122,3 @@ def _chosen(own: tuple[Geom, ...], body: str, target: ObjectSpec, report: Report
         names = sorted({name for geom in own for name in geom.names})
         report(f'no geom or mesh of body "{body}" matches "{target.surface}"', f"it has {', '.join(names)}")
     return named
-
-
-def settle(felt: SurfaceGeom, target: ObjectSpec, margin: float, name: str) -> Settled:
-    """Bake a mesh, or keep its triangles, as the object's query says; a primitive needs neither.
-
-    Args:
-        felt: The geom.
-        target: What the document says of the object.
-        margin: Largest distance from the surface that any sensor asks for [m].
-        name: What warnings call the object or link: "object cube".
-
-    Raises:
-        BakeError: If no grid within the object's budget holds its tolerance.
-    """
-    if felt.surface is None:
-        return Settled(felt.shape, {}, {})
-    _warn_of_hull(felt, margin, name)
-    if target.query == "raycast":
-        arrays = {"vertices": felt.surface.vertices, "faces": felt.surface.faces, "max_distance": np.asarray(2.0 * margin)}
-        return Settled("raycast", arrays, {})
-    baked = bake(felt.surface, margin, target.tolerance, target.max_bytes)
-    if not baked.is_watertight:
-        what = f"{name}: {felt.geom.shown} is not closed; what is inside is decided by its winding number"
-        warnings.warn(what, stacklevel=2)
-    arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
-    accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
-    return Settled(baked.method, arrays, {**accuracy, "tolerance": target.tolerance, "cell": baked.cell})
-
-
-def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
-    """MuJoCo collides convex hulls: say so where a hull stands further off the mesh than any probe reaches."""
-    hull = felt.surface
-    if hull is None or felt.mesh is None:
-        return
-    whole = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
-    sampled = trimesh.sample.sample_surface(whole, HULL_POINTS, seed=0)[0]
-    squared, *_ = igl.point_mesh_squared_distance(np.asarray(sampled), felt.mesh.vertices, felt.mesh.faces)
-    depth = float(np.sqrt(np.max(squared)))
-    if depth > margin:
-        warnings.warn(
-            f"{name}: MuJoCo collides the convex hull of {felt.geom.shown}, up to {1e3 * depth:.1f} mm off the mesh, "
-            "and that hull is felt; `surface` names what to feel instead",
-            stacklevel=2,
-        )

@@ -1,4 +1,4 @@
-"""The solver's contacts on the bodies that carry a sensor, in each body's frame.
+"""From the state of a scene to contacts on the bodies that carry a sensor, in each body's frame.
 
 Shapes: `env` environments, `body` bodies that carry the sensor, `contact` contacts of one body: slot after slot of one object
 after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `slot` contacts per pair, `object` felt objects.
@@ -7,7 +7,6 @@ after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Int
@@ -15,37 +14,22 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.quantities.base import Scene
+from tgdsl.quantities.contacts.part import ContactsPart
+from tgdsl.quantities.contacts.request import ContactPoints
 
 
-class Contacts(NamedTuple):
-    """Contacts on each body, in its frame; planes (env, body, contact), but `net` (env, body). Unused slots are all zero.
-
-    Contacts beyond the slots have no place of their own. What a pair's slots lack of its whole force, r = f_net − Σ_c f_c, acts
-    at the centre of the contacts shown, weighted by their forces: each takes r |f_c| / Σ_c |f_c| on itself, or equal shares
-    where none has a force. The forces then sum to the whole; the moment of r about that centre is not known, nor are torques
-    beyond the slots. Where no contact is shown there is nowhere to act, and `net` alone has r.
-
-    Attributes:
-        pos: Contact points [m].
-        force: Force on the body at each [N].
-        torque: Torque on the body at each [N·m].
-        normal: Unit normal out of the object at each; not-a-number where the state has none beside a force.
-        net: Whole force on the body from the objects felt [N], contacts beyond the slots included.
-    """
-
-    pos: Vec
-    force: Vec
-    torque: Vec
-    normal: Vec
-    net: Vec
+def gather(part: ContactsPart[Tensor], scene: Scene) -> tuple[ContactPoints, ...]:
+    """Return what each use asks for."""
+    return tuple(contacts_of(scene.tensors, use.bodies, use.pairs, scene.dtype) for use in part.uses)
 
 
-def contacts(
+def contacts_of(
     state: Mapping[str, Tensor],
     bodies: Int[Tensor, " body"],
     index: Int[Tensor, "body object"],
     dtype: torch.dtype,
-) -> Contacts:
+) -> ContactPoints:
     """Bring the contacts of a state into the frames of the bodies, in the state's dtype, and then cast them.
 
     Args:
@@ -72,7 +56,7 @@ def contacts(
         away = planes.vec(torch.where(is_used.flatten(2), part, 0.0) for part in planes.sub(pos, origin))
         own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
     pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
-    return Contacts(pos, force, torque, normal, net)
+    return ContactPoints(pos, force, torque, normal, net)
 
 
 def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:

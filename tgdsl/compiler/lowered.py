@@ -1,0 +1,118 @@
+"""From a document's sensors to what their kinds make of them: constants, state, requests and noise; nothing is shared yet."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
+from tgdsl.compiler.resolve import Resolved
+from tgdsl.console.progress import Progress
+from tgdsl.errors import LowerError
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.base import Request
+from tgdsl.schema.load import Loaded
+from tgdsl.schema.yaml import Path
+from tgdsl.sensors import Kind
+from tgdsl.sensors.base import Axis, Lowered, SensorSpec, body_axis, taxel_axis
+from tgdsl.sensors.known import check_lowered
+from tgdsl.sensors.noise.lower import LoweredNoise
+
+
+@dataclass(frozen=True, eq=False)
+class LoweredSensor:
+    """One way to read a sensor, lowered.
+
+    Attributes:
+        name: Its name, see `plan.PlannedSensor`.
+        kind: Its kind.
+        spec: The sensor's spec.
+        taxels: Its taxels, rows of the layout.
+        layout: They, or its links if it is on links.
+        lowered: What its kind says of it.
+        readings: Names of its readings, reports left out.
+        noise: Its imperfections.
+    """
+
+    name: str
+    kind: Kind
+    spec: SensorSpec
+    taxels: np.ndarray
+    layout: Layout
+    lowered: Lowered
+    readings: tuple[str, ...]
+    noise: LoweredNoise | None
+
+    @property
+    def sensor(self) -> str:
+        """The sensor's name in the document."""
+        return self.name.removesuffix("/clean")
+
+    @property
+    def radius_noise(self) -> float:
+        """Largest disturbance of a radius [m]."""
+        return 0.0 if self.noise is None else self.noise.radius
+
+    @property
+    def requests(self) -> tuple[Request, ...]:
+        """What it asks of the scene."""
+        return self.lowered.requests
+
+    @property
+    def rows(self) -> Axis:
+        """What its own reading has rows of."""
+        return rows_of(self.lowered, self.layout, self.spec)
+
+
+def rows_of(lowered: Lowered, layout: Layout, spec: SensorSpec) -> Axis:
+    """Return what a sensor's own reading has rows of: what its kind says, or else its taxels, or its bodies if it is on links."""
+    if lowered.rows is not None:
+        return lowered.rows
+    return taxel_axis(layout) if spec.is_on_taxels else body_axis(layout)
+
+
+def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], progress: Progress) -> tuple[LoweredSensor, ...]:
+    """Lower every sensor of a document.
+
+    Raises:
+        SpecError: If a kind cannot be on its links.
+    """
+    by_name = {kind.name: kind for kind in kinds}
+    sensors: list[LoweredSensor] = []
+    for name, spec in loaded.spec.sensors.items():
+        progress(f"lowering sensor {name}")
+        try:
+            sensors += _ways(loaded, resolved, name, by_name[spec.kind])  # type: ignore[attr-defined]
+        except LowerError as error:
+            path: Path = ("sensors", name, *([error.field] if error.field else []))
+            loaded.problems.append(loaded.problem(path, error.what, error.hint))
+    loaded.raise_problems()
+    return tuple(sensors)
+
+
+def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
+    """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
+    spec = loaded.spec.sensors[name]
+    taxels, layout = resolved.layout_on(name)
+    clean = kind.lower(spec, layout, resolved.surface_of)
+    check_lowered(kind, clean, spec)
+    if spec.readout == "clean":
+        return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
+    knobs = knobs_of(loaded, resolved, name, layout, kind)
+    loaded.raise_problems()
+    noisy = measured_spec(spec, knobs)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
+    rows = rows_of(lowered, layout, spec)
+    noise = imperfections(name, spec, kind, knobs, lowered, rows, layout, loaded.spec.noise)
+    both = spec.readout == "both"
+    apart = noise is not None and (noise.radius > 0 or kind.decide is not None or kind.gains_depth)
+    readings = (name, f"{name}/clean") if both and not apart else (name,)
+    ways = [LoweredSensor(name, kind, spec, taxels, layout, lowered, readings, noise)]
+    if both and apart:
+        again = f"{name}/clean"
+        without = dataclasses.replace(clean, reports={})
+        ways.append(LoweredSensor(again, kind, spec, taxels, layout, without, (again,), None))
+    return ways

@@ -1,0 +1,86 @@
+"""From the state of a scene to what sensors asked for: relative poses of all pairs, then each quantity once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.plan import tree
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedSensor
+from tgdsl.quantities.base import Gathered, Quantity, Scene
+from tgdsl.quantities.pairs import Pairs, PairTable, gates, relate
+from tgdsl.sensors.noise import stages
+from tgdsl.sensors.noise.instant import Now
+
+Tensors = Mapping[str, Tensor]
+Knobs = Mapping[str, Mapping[str, Tensor]]
+"""Values of the sensors' noise, by their names."""
+Tree = Mapping[str, Any]
+"""What `parts` returns, with tensors for arrays."""
+
+
+def parts(plan: Plan) -> dict[str, Any]:
+    """Return what of a plan is read at run time, its arrays being a module's constants."""
+    return {
+        "pairs": plan.pairs,
+        "quantities": plan.quantities,
+        "sensors": {sensor.name: sensor.constants for sensor in plan.sensors},
+        "noise": {sensor.name: sensor.noise.constants for sensor in plan.sensors if sensor.noise is not None},
+        "observations": {term.key: term.constants for term in plan.observations},
+    }
+
+
+def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
+    """Return the arrays of these parts, by the names that the plan gives them."""
+    names, found = {id(array): name for name, array in plan.arrays.items()}, {}
+    tree.mapped(parts(plan), lambda array: found.setdefault(names[id(array)], array))
+    return found
+
+
+def bind(plan: Plan, tensor_of: Callable[[str], Tensor]) -> Tree:
+    """Return these parts with a tensor in the place of each array."""
+    names = {id(array): name for name, array in plan.arrays.items()}
+    return tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]))
+
+
+def scene_of(plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], knobs: Knobs, dtype: torch.dtype) -> Scene:
+    """Return what quantities are gathered from.
+
+    Args:
+        plan: The plan.
+        own: Its parts, bound.
+        tensors: The fields of `SceneState` that `inputs` names.
+        nows: When sensors are read, by their names.
+        knobs: Values of their noise, which may disturb the taxels' radii.
+        dtype: Dtype of what is gathered.
+    """
+    shifts = {}
+    for sensor in plan.sensors:
+        if sensor.noise is not None and "radius_noise" in sensor.noise.terms:
+            half_width = knobs[sensor.name]["radius_noise"]
+            probes = half_width.new_empty(sensor.rows[1] - sensor.rows[0])
+            shifts[sensor.name] = stages.radius_shift(half_width, nows[sensor.name], probes)
+    return Scene(tensors, plan.objects, _pairs(own["pairs"], tensors, dtype) if plan.objects else None, shifts, dtype)
+
+
+def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
+    """Return the values of all uses of each quantity, by its name."""
+    return {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+
+
+def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
+    """Return what a sensor asked for."""
+    own = [quantity for quantity in quantities if quantity.name in sensor.uses]
+    return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in own})
+
+
+def _pairs(table: PairTable[Tensor], tensors: Tensors, dtype: torch.dtype) -> Pairs:
+    """Return the relative poses and motions of all pairs, and which of them may be felt."""
+    gate = gates(tensors["contact_found"], table.gate, dtype) if "contact_found" in tensors else None
+    motion = tensors.get("body_linvel"), tensors.get("body_angvel")
+    return relate(tensors["body_pos"], tensors["body_quat"], table.link, table.object, dtype, *motion, gate)

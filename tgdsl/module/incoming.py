@@ -1,0 +1,91 @@
+"""What comes in with a call: the fields of a state that are wanted, looked at before anything is computed.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from torch import Tensor
+
+from tgdsl.errors import StateError
+from tgdsl.module.slot_watch import SlotWatch
+from tgdsl.module.state import SceneState
+from tgdsl.plan.plan import Plan
+
+
+class Incoming:
+    """Takes states apart for a module, and warns once of what is odd about them."""
+
+    def __init__(self, plan: Plan):
+        """Begin; nothing has come in."""
+        self._plan = plan
+        self._dt: tuple[float, Tensor] | None = None
+        self._warned: set[str] = set()
+        self.slot_watch = SlotWatch(plan.inputs)
+
+    def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
+        """Return the fields of a state that are wanted, by name; those of earlier substeps as `substep/<i>/<field>`.
+
+        Args:
+            state: The state.
+            dtype: Dtype of the module.
+            device: Where it is.
+
+        Raises:
+            StateError: If a field that is wanted is missing, or is not of the right shape, dtype or device.
+        """
+        inputs = self._plan.inputs
+        if not isinstance(state, SceneState):
+            what = f"a module reads a tgdsl.SceneState, found {type(state).__name__}"
+            raise StateError(f"{what}; expected sim.state(), or one that holds {', '.join(inputs.fields)}")
+        tensors = state.checked(inputs, device)
+        if state.dt is not None and "dt" in inputs.fields:
+            tensors["dt"] = self._dt_tensor(state.dt, dtype, device)
+        if not self.slot_watch.is_done and not torch.compiler.is_compiling():
+            self.slot_watch.note(tensors)
+            self.slot_watch.warn()
+        if inputs.substeps > 1:
+            tensors |= self._substeps(state, device, len(tensors["body_pos"]))
+        return tensors
+
+    def _substeps(self, state: SceneState, device: torch.device, num_envs: int) -> dict[str, Tensor]:
+        """Return the fields of earlier substeps."""
+        inputs, found = self._plan.inputs, {}
+        if len(state.substeps) != inputs.substeps - 1:
+            what = f"SceneState.substeps holds {len(state.substeps)} states, expected {inputs.substeps - 1}"
+            raise StateError(
+                f"{what}: this module reads each of {inputs.substeps} physics steps of a call, the last one itself"
+            )
+        for i, part in enumerate(state.substeps):
+            for name, value in part.checked(inputs, device, with_dt=False).items():
+                if len(value) != num_envs:
+                    raise StateError(f"SceneState.substeps[{i}].{name} holds {len(value)} environments, body_pos {num_envs}")
+                found[f"substep/{i}/{name}"] = value
+        return found
+
+    def _dt_tensor(self, dt: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """Return dt as a tensor that is written only when it changes.
+
+        Raises:
+            StateError: If it is no time.
+        """
+        if not 0 < dt < math.inf:
+            raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
+        if self._dt is None or self._dt[0] != dt:
+            self._look_at_rates(dt)
+        if self._dt is None or self._dt[0] != dt or self._dt[1].device != device or self._dt[1].dtype != dtype:
+            with torch.inference_mode(False):
+                self._dt = dt, torch.tensor(dt, dtype=dtype, device=device)
+        return self._dt[1]
+
+    def _look_at_rates(self, dt: float) -> None:
+        """Warn of sensors that would take samples more often than they are called, the first time."""
+        for sensor in self._plan.sensors:
+            if 0 < sensor.period < (1 - 1e-6) * dt and sensor.sensor not in self._warned:
+                self._warned.add(sensor.sensor)
+                what = f'"{sensor.sensor}" has a rate of {1 / sensor.period:g} Hz but is called every {dt:g} s'
+                warnings.warn(f"{what}: it takes a sample at every call", stacklevel=5)

@@ -1,0 +1,64 @@
+"""What a module wants of a scene, and in which order."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from tgdsl.console.tables import listing, spelled
+from tgdsl.quantities.pairs import Pair
+
+
+@dataclass(frozen=True)
+class ContactPart:
+    """Geoms whose contacts are an object's: those of a body, those of a body and of all bodies below it, or a single one."""
+
+    kind: Literal["body", "subtree", "geom"]
+    name: str
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a module wants of a scene, and in which order.
+
+    Attributes:
+        fields: Fields of `SceneState` that are read.
+        bodies: Bodies whose poses (and velocities) are read.
+        pairs: Pairs whose contacts are read.
+        bodies_of: Body of each object named in `pairs`.
+        slots: Contacts per pair of the slotted contact fields; 0 if none is read.
+        objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
+        num_variants: How many variants each of these objects has; 1 if only its size differs.
+        joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
+        actuators: Actuators of the field `last_action`.
+        contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
+        substeps: Physics steps of a call that some sensor is advanced at, each with a state of its own: see `SceneState.substeps`.
+    """
+
+    fields: tuple[str, ...]
+    bodies: tuple[str, ...]
+    pairs: tuple[Pair, ...]
+    bodies_of: Mapping[str, str]
+    slots: int
+    objects: tuple[str, ...] = ()
+    num_variants: tuple[int, ...] = ()
+    joints: tuple[str, ...] = ()
+    actuators: tuple[str, ...] = ()
+    contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
+    substeps: int = 1
+
+    def parts_of(self, name: str) -> tuple[ContactPart, ...]:
+        """Return the geoms whose contacts are an object's; no geom is in two of its parts."""
+        return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
+
+    def __repr__(self) -> str:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return "Inputs\n" + listing((name, spelled(value)) for name, value in values.items() if value and value != 1)
+
+
+def contact_sensor_names(pair: Pair, part: int = 0) -> tuple[str, str]:
+    """Return the names of the contact sensors of a pair and a part of its object: the point slots, and the net force."""
+    end = f"{pair.link}/{pair.object}" + (f"/{part}" if part else "")
+    return f"tgdsl/contact/{end}", f"tgdsl/netforce/{end}"

@@ -1,0 +1,232 @@
+"""What a quantity is: something that kinds of sensors ask of a scene, found once for all that ask alike.
+
+A quantity is one folder. It holds, in this order of use:
+
+    request.py     the typed request, which a kind puts into `Lowered.requests`, and what the kind gets for it
+    planning.py    from requests to its part of the Plan: what is computed beforehand, as typed arrays (`bake.py`, …)
+    gathering.py   from the state of a scene to what was asked for, in torch (and `*_kernel.py`)
+    reference.py   the definition in float64, environment by environment
+
+and ends in a `Quantity` that ties them together and is registered in `quantities/known.py`, or by an entry point.
+
+Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` rows of a sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.console.progress import Progress
+from tgdsl.layout.layout import Layout, Link
+from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
+from tgdsl.surfaces.geom import SurfaceGeom
+from tgdsl.surfaces.sensed import SensedObject
+
+Value = TypeVar("Value")
+Report = Callable[[Sequence[str | int], str, str], None]
+"""Notes a mistake: the place in the document, what is wrong, and a hint."""
+
+
+@dataclass(frozen=True, eq=False)
+class Request(Generic[Value]):
+    """What a kind asks of a scene; `Value` is what its `forward` gets.
+
+    Attributes:
+        objects: Objects that it is asked of; none for what has nothing to do with objects.
+        is_gated: Whether an object counts only while the simulator has it in contact with the link.
+    """
+
+    objects: tuple[str, ...] = ()
+    is_gated: bool = False
+    wants_contacts: ClassVar[bool] = False
+    """Whether the contacts of each link with the objects are read from the state."""
+    is_within_radii: ClassVar[bool] = False
+    """Whether it depends on the taxels' radii, which noise may disturb."""
+
+    @property
+    def num_slots(self) -> int:
+        """Contacts per body and object that are read."""
+        return 0
+
+    def key(self) -> tuple[Any, ...]:
+        """Return what two requests at the same taxels must have in common to be one; by default all of it."""
+        values = ((name, getattr(self, name)) for name in self.__dataclass_fields__)
+        return (type(self), *((name, v.tobytes() if isinstance(v, np.ndarray) else v) for name, v in values))
+
+    def merged(self, other: Request) -> Request:
+        """Return a request for what both ask for; they have one key."""
+        return self
+
+    def join_key(self) -> tuple[Any, ...]:
+        """Return what requests at different taxels must have in common to be joined to one; by default all of it."""
+        return self.key()
+
+    def joined(self, others: Sequence[Request]) -> Request:
+        """Return one request for several sensors' taxels, one after the other, this one's first; they have one join key."""
+        return self
+
+    def wants_distance(self, radius: Float[np.ndarray, " taxel"]) -> bool:
+        """Return whether distances to surfaces are measured for it, for taxels of these radii [m]: work that can be shared."""
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class Use:
+    """A request, and where it is made: one for all sensors that ask alike.
+
+    Attributes:
+        request: What is asked for.
+        sensors: The sensors, by their names in the document.
+        links: The links that carry them.
+        taxels: Their taxels, rows of the layout.
+        pos: Where these are, (3, taxel) in the links' bodies' frames [m]; one array for all uses of the same taxels.
+        radius_noise: Name of the sensor whose noise disturbs the taxels' radii, if any.
+        largest_shift: By how much, at most [m].
+    """
+
+    request: Request
+    sensors: tuple[str, ...]
+    links: tuple[Link, ...]
+    taxels: Int[np.ndarray, " taxel"]
+    pos: Float[np.ndarray, "3 taxel"]
+    radius_noise: str = ""
+    largest_shift: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Planning:
+    """What a quantity plans from.
+
+    Attributes:
+        layout: The taxels of all sensors.
+        sensed: What there is of each object that some sensor senses.
+        pairs: The pairs that may meet, sorted by object and link.
+        contact_pairs: Those of them whose contacts are read, in the order of the state.
+        objects: The objects that have pairs, in the Plan's order.
+        bodies: The bodies whose poses are read, in the order of the state.
+        geoms_of: Returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls.
+        report: Notes a mistake.
+        progress: Is told what is done.
+    """
+
+    layout: Layout
+    sensed: Mapping[str, SensedObject]
+    pairs: tuple[Pair, ...]
+    contact_pairs: tuple[Pair, ...]
+    objects: tuple[PairedObject, ...]
+    bodies: tuple[str, ...]
+    geoms_of: Callable[[str], tuple[SurfaceGeom, ...]]
+    report: Report
+    progress: Progress
+
+    def bodies_of(self, taxels: Int[np.ndarray, " taxel"]) -> list[str]:
+        """Return the body of each taxel."""
+        return [self.layout.links[i].body for i in self.layout.link_id[taxels]]
+
+    def object_id(self, name: str) -> int | None:
+        """Return the place of an object among those that have pairs; None if it has none."""
+        return next((i for i, target in enumerate(self.objects) if target.name == name), None)
+
+    def own_pairs(self, name: str) -> list[Pair]:
+        """Return an object's pairs, in order."""
+        return [pair for pair in self.pairs if pair.object == name]
+
+    def allowed(self, request: Request) -> set[Pair]:
+        """Return the pairs that a request is of: all, or those that can be in contact."""
+        return set(self.contact_pairs if request.is_gated else self.pairs)
+
+    def pair_table(self, names: Sequence[str], taxels: Int[np.ndarray, " taxel"]) -> Int[np.ndarray, "object taxel"]:
+        """Return the index of each taxel's pair with each object among that object's pairs; 0 where there is none."""
+        bodies, table = self.bodies_of(taxels), []
+        for name in names:
+            own = {pair.link: i for i, pair in enumerate(self.own_pairs(name))}
+            table.append([own.get(body, 0) for body in bodies])
+        return np.array(table, dtype=np.int64).reshape(len(names), len(bodies))
+
+
+class Scene(NamedTuple):
+    """What quantities are gathered from, at one instant.
+
+    Attributes:
+        tensors: Fields of `SceneState`, by name.
+        objects: The Plan's objects.
+        pairs: Relative poses of all pairs, in the order of the Plan; None if there are none.
+        radius_shifts: By how much the radii of sensors with such noise are off, by sensor: (env, taxel) [m].
+        dtype: Dtype of what is gathered.
+    """
+
+    tensors: Mapping[str, Tensor]
+    objects: tuple[PairedObject, ...]
+    pairs: Pairs | None
+    radius_shifts: Mapping[str, Tensor]
+    dtype: torch.dtype
+
+    def pairs_for(self, is_gated: bool) -> Pairs:
+        """Return the pairs, with their gate or without."""
+        assert self.pairs is not None
+        return self.pairs if is_gated else self.pairs._replace(gate=None)
+
+    def variant(self, target: PairedObject) -> Int[Tensor, " env"] | None:
+        """Return which variant of an object each environment has; None if all are alike."""
+        return self.tensors["variant"][:, target.varied].long() if target.num_variants > 1 else None
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """A quantity.
+
+    Attributes:
+        name: Its name: that of its folder, and of its part of the Plan.
+        request: The type of its requests.
+        part: The type of its part of the Plan: a frozen dataclass, generic in its arrays (NumPy's in the Plan, torch's at run
+            time).
+        plan: `(planning, uses) → part`. Mistakes go to `planning.report`; what is returned then does not matter.
+        gather: `(part, scene) → values`, one for each use: pure, traceable.
+        reference: `(part, use, scene) → value` in float64 for one environment, see `testing.scene.ReferenceScene`.
+        fields: `(part) → names of the fields of SceneState` that are read.
+        bodies: `(use) → bodies` whose poses are read besides those of pairs.
+        num_rows: `(part, use) → rows` of memory with one per row of the value, for `Memory(rows=…)`.
+        explain: `(part, use, objects of the Plan) → what an account of a sensor says of it`.
+        is_light: `(part) → whether` little is found per taxel, so that kernels may be tiled over environments and taxels.
+        account: `(part, objects of the Plan) → lines by headline`: what was measured of what is computed beforehand.
+    """
+
+    name: str
+    request: type[Request]
+    part: type
+    plan: Callable[[Planning, Sequence[Use]], Any]
+    gather: Callable[[Any, Scene], tuple[Any, ...]]
+    reference: Callable[[Any, int, Any], Any]
+    fields: Callable[[Any], set[str]] = lambda part: set()
+    bodies: Callable[[Use], tuple[str, ...]] = lambda use: ()
+    num_rows: Callable[[Any, int], int] | None = None
+    explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = lambda part, use, objects: []
+    is_light: Callable[[Any], bool] = lambda part: False
+    account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = lambda part, objects: {}
+
+
+class Gathered:
+    """What a sensor asked for, by the type of the request: `gathered[ContactDepth].depth`."""
+
+    def __init__(self, values: Mapping[type[Request], Any]):
+        """Hold values by the types of their requests."""
+        self._values = dict(values)
+
+    def __getitem__(self, request: type[Request[Value]]) -> Value:
+        """Return what came of the sensor's request of a type."""
+        return self._values[request]
+
+    def __contains__(self, request: type[Request]) -> bool:
+        """Return whether the sensor made such a request."""
+        return request in self._values
+
+    def replaced(self, request: type[Request[Value]], value: Value) -> Gathered:
+        """Return the same with another value for a request."""
+        return Gathered({**self._values, request: value})

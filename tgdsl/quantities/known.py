@@ -1,0 +1,47 @@
+"""The quantities that kinds may ask for: those of tgdsl, those that installed packages bring, and those that a caller gives.
+
+A package brings a quantity by an entry point, in its pyproject.toml:
+
+    [project.entry-points."tgdsl.quantities"]
+    my_quantity = "my_package.my_quantity:MY_QUANTITY"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tgdsl.files.plugins import known
+from tgdsl.quantities.base import Quantity, Request
+from tgdsl.quantities.contact_depth import CONTACT_DEPTH
+from tgdsl.quantities.contacts import CONTACTS
+from tgdsl.quantities.moments import MOMENTS
+from tgdsl.quantities.motion import MOTION
+from tgdsl.quantities.points import POINTS
+
+QUANTITIES: tuple[Quantity, ...] = (CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION)
+"""The quantities that come with tgdsl, in the order in which they are planned and gathered."""
+GROUP = "tgdsl.quantities"
+"""Group of the entry points by which packages bring quantities."""
+
+
+def known_quantities(given: Sequence[Quantity] = ()) -> tuple[Quantity, ...]:
+    """Return all quantities: those of tgdsl, of installed packages by package and name, and those that are given.
+
+    An installed quantity that cannot be had is left out, with a warning, the first time.
+
+    Args:
+        given: Quantities of the caller's own. One that an installed package brings too may be among them.
+
+    Raises:
+        TgdslError: If two quantities have one name, or a quantity that is given is none.
+    """
+    return known(GROUP, "quantity", "quantities", QUANTITIES, given, _wrong)
+
+
+def _wrong(quantity: object) -> str:
+    """Return why something is no quantity, or nothing."""
+    if not isinstance(quantity, Quantity):
+        return f"found {type(quantity).__name__}, expected a tgdsl.quantities.Quantity"
+    if not (isinstance(quantity.request, type) and issubclass(quantity.request, Request)):
+        return "its `request` is no type of tgdsl.quantities.Request"
+    return ""

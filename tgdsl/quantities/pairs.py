@@ -1,0 +1,167 @@
+"""Links and objects in pairs: how each object lies and moves as each link sees it.
+
+Shapes: `env` environments, `body` bodies of the state, `pair` (link, object) pairs, `taxel` probes. A pair's planes are small,
+a taxel's are not, so everything that depends on the pair alone is formed first and gathered once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Rot, Vec
+
+Array = TypeVar("Array")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A link's body and an object that its taxels may feel."""
+
+    link: str
+    object: str
+
+
+@dataclass(frozen=True)
+class PairedObject:
+    """An object that some link may meet.
+
+    Attributes:
+        name: Its name.
+        body: Its body.
+        first_pair: Index of its first pair.
+        num_pairs: Number of its pairs.
+        num_variants: Number of its variants; 1 if it is the same in all environments.
+        is_sized: Whether its size is part of the state.
+        varied: Its place among `inputs.objects`, those that differ between environments; −1 if it does not.
+    """
+
+    name: str
+    body: str
+    first_pair: int
+    num_pairs: int
+    num_variants: int
+    is_sized: bool
+    varied: int
+
+    @property
+    def pairs(self) -> slice:
+        """Its pairs."""
+        return slice(self.first_pair, self.first_pair + self.num_pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class PairTable(Generic[Array]):
+    """The Plan's pairs, sorted by object.
+
+    Attributes:
+        link: Index of each pair's link among the bodies of the state, (pair,).
+        object: Index of its object's body.
+        gate: Its place among `inputs.pairs`, whose contacts are read; 0 where no request wants to know.
+    """
+
+    link: Array
+    object: Array
+    gate: Array
+
+
+class Motion(NamedTuple):
+    """Motion of an object relative to a link, in the link's frame, as a velocity field v(x) = linear + angular × x.
+
+    Attributes:
+        linear: Velocity of the object's material at the link's origin, less the link's own [m/s].
+        angular: Relative angular velocity [rad/s].
+        turn: The link's own angular velocity [rad/s].
+    """
+
+    linear: Vec
+    angular: Vec
+    turn: Vec
+
+
+class Pairs(NamedTuple):
+    """What relates each link to each object: planes of shape (env, pair), sorted by object.
+
+    Attributes:
+        rotation: Rotates link vectors into the object's frame.
+        offset: The link's origin in the object's frame [m].
+        motion: Relative motion, if some sensor wants it.
+        gate: 0 where the pair may be felt, −∞ where it may not; None if nothing is gated.
+    """
+
+    rotation: Rot
+    offset: Vec
+    motion: Motion | None
+    gate: Tensor | None
+
+
+def relate(
+    pos: Float[Tensor, "env body 3"],
+    quat: Float[Tensor, "env body 4"],
+    link: Int[Tensor, " pair"],
+    target: Int[Tensor, " pair"],
+    dtype: torch.dtype,
+    linvel: Float[Tensor, "env body 3"] | None = None,
+    angvel: Float[Tensor, "env body 3"] | None = None,
+    gate: Tensor | None = None,
+) -> Pairs:
+    """Form the relative poses and motions of all pairs in the dtype of the state, then cast them.
+
+    Args:
+        pos: World positions of the bodies' frames [m].
+        quat: World orientations, w, x, y, z.
+        link: Body index of each pair's link.
+        target: Body index of each pair's object.
+        dtype: Dtype of the result.
+        linvel: World velocities of the bodies' frame origins [m/s], if motion is wanted.
+        angvel: World angular velocities [rad/s], if motion is wanted.
+        gate: 0 where a pair may be felt, −∞ where it may not; None if nothing is gated.
+
+    Returns:
+        The pairs, in `dtype`.
+    """
+    link_rotation, target_rotation = planes.rotation(quat[:, link]), planes.rotation(quat[:, target])
+    apart = planes.sub(planes.split(pos[:, link]), planes.split(pos[:, target]))
+    rotation = planes.transpose_times(target_rotation, link_rotation)
+    offset = planes.rotate_back(target_rotation, apart)
+    parts = [*rotation, *offset]
+    if linvel is not None and angvel is not None:
+        spin, turn = planes.split(angvel[:, target]), planes.split(angvel[:, link])
+        slide = planes.sub(planes.split(linvel[:, target]), planes.split(linvel[:, link]))
+        parts += planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
+        parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
+        parts += planes.rotate_back(link_rotation, turn)
+    is_moving = len(parts) > 12
+    parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
+    # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
+    parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
+    motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
+    return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])
+
+
+def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
+    """Return a vector of the pairs (env, pair) for each probe: those of an object, and which of them each probe's is."""
+    return planes.vec(at_probes(part, own, pair) for part in vector)
+
+
+def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " taxel"]) -> Float[Tensor, "env taxel"]:
+    """Return a plane of the pairs for each probe; where an object has one pair alone, nothing is looked up."""
+    part = part[:, own]
+    return part.expand(-1, pair.shape[0]) if part.shape[1] == 1 else part[:, pair]
+
+
+def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Float[Tensor, "env pair"]:
+    """Return 0 where a pair is in contact, −∞ where it is not; not-a-number where the state does not know.
+
+    Args:
+        found: The state's `contact_found`.
+        place: Where each pair stands in it.
+        dtype: Dtype of the result.
+    """
+    own = found[:, place]
+    return torch.where(own > 0, 0.0, torch.where(own.isnan(), torch.nan, -torch.inf)).to(dtype)
