@@ -30,7 +30,7 @@ import tyro
 from module import median_ms
 from torch import Tensor
 
-from tgdsl.quantities.reference import Touch
+from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.sensors.elastomer import blocks, operators
 from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance_reference
 from tgdsl.sensors.elastomer.kernels import Skin
@@ -277,7 +277,7 @@ class Cycle:
         found = []
         for s in way * slip * depth:
             moved = np.broadcast_to([-s, 0.0, 0.0], (x.size, 1, 3))
-            touch = Touch(
+            touch = ReferencePenetration(
                 np.maximum(h, 0), 0 * pos, 0 * pos, 0 * pos, -h[:, None], 0 * pos[:, None],
                 np.broadcast_to(np.eye(3), (x.size, 1, 3, 3)), moved,
             )  # fmt: skip

@@ -18,7 +18,6 @@ import tyro
 from module import median_ms
 
 import tgdsl
-from tgdsl.module.explain import operations_per_env
 from tgdsl.module.module import TactileModule
 
 ROOT = Path(__file__).parent.parent
@@ -64,8 +63,8 @@ def main(options: Options) -> None:
     with TemporaryDirectory() as folder:
         names = {"force": ("force",), "depth": ("depth",), "both": ("force", "depth")}
         modules = {name: module(Path(folder), sensors, options.device) for name, sensors in names.items()}
-    assert len(modules["both"].plan.queries) == 1
-    operations = {name: operations_per_env(touch) for name, touch in modules.items()}
+    assert len(modules["both"].plan.quantities["contact_depth"].uses) == 1
+    operations = {name: touch.operations_per_env() for name, touch in modules.items()}
     state = modules["both"].example_state(options.num_envs, dtype=torch.float32, spread=0.01)
     if options.compiled:
         for touch in modules.values():

@@ -9,7 +9,6 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SpecError, StateError, TgdslError
-from tgdsl.module.explain import operations_per_env
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.sensors import KINDS
@@ -127,9 +126,9 @@ def test_only_what_is_needed_is_planned(touch):
 
 
 def test_a_shared_query_costs_once(document):
-    both = operations_per_env(tgdsl.compile(document))
+    both = tgdsl.compile(document).operations_per_env()
     del document["sensors"]["contact"]
-    alone = operations_per_env(tgdsl.compile(document))
+    alone = tgdsl.compile(document).operations_per_env()
     assert both - alone < 0.1 * alone
 
 
@@ -144,7 +143,7 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
         "contact_found",
     ):
         assert part in text
-    assert f"{operations_per_env(touch)} elementary operations" in text
+    assert f"{touch.operations_per_env()} elementary operations" in text
     assert f"{4 * 12 * (6 + 6 + 1)} bytes of readings" in text
 
 

@@ -19,7 +19,7 @@ from tgdsl.console.tables import TaxelTable, TaxelTables
 from tgdsl.errors import StateError, TgdslError, did_you_mean
 from tgdsl.module.calls import Calls, has_cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
-from tgdsl.module.explain import Explained, explain
+from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.history import reduced
 from tgdsl.module.incoming import Incoming
@@ -378,7 +378,14 @@ class TactileModule(nn.Module):
 
     def explain(self) -> str:
         """Return an account of what is computed, what was dropped and why, and what it costs."""
-        return explain(Explained(self.plan, self._quantities, self.constants, self.memory, self.core))
+        return explain(self._explained())
+
+    def operations_per_env(self) -> int:
+        """Return how many elementary operations one environment takes, counted in an eager run."""
+        return operations_per_env(self._explained())
+
+    def _explained(self) -> Explained:
+        return Explained(self.plan, self._quantities, self.constants, self.memory, self.core)
 
     def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
         """Put the memory itself in the place of stacks that are declared as views."""

@@ -71,15 +71,15 @@ def read(
         joined: Its signal, if that was computed with others'.
     """
     terms = () if sensor.noise is None else sensor.noise.terms
-    has_gain = "gain" in terms and now is not None
-    if has_gain and kind.gains_depth:
+    at = now if "gain" in terms else None
+    if at is not None and kind.gains_depth:
         felt = gathered[ContactDepth]
-        gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, now, felt.depth) * felt.depth))
+        gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, at, felt.depth) * felt.depth))
     found, new = ({}, {}) if joined is not None else kind.forward(gathered, context, constants, _own(memory))
     new = dict(new)
     signal = clean = _stacked(found, "signal", sensor.signal) if joined is None else joined
-    if has_gain and not kind.gains_depth:
-        signal = stages.gain(knobs, now, clean[:, 0])[:, None] * clean
+    if at is not None and not kind.gains_depth:
+        signal = stages.gain(knobs, at, clean[:, 0])[:, None] * clean
     if terms:
         past = {name.removeprefix("noise/"): value for name, value in memory.items() if name.startswith("noise/")}
         signal, noted = stages.disturb(signal, terms, knobs, past, now)

@@ -7,7 +7,7 @@ from tgdsl.quantities.known import QUANTITIES, known_quantities
 from tgdsl.quantities.moments import MomentsRequest
 from tgdsl.quantities.motion import LinkMotion
 from tgdsl.quantities.points import Points
-from tgdsl.quantities.reference import ReferenceScene
+from tgdsl.quantities.reference import References, ReferenceScene
 
 __all__ = [
     "QUANTITIES",
@@ -20,6 +20,7 @@ __all__ = [
     "Points",
     "Quantity",
     "ReferenceScene",
+    "References",
     "Request",
     "Scene",
     "Use",

@@ -45,7 +45,9 @@ class ReferenceModule:
                 reading, memory = self.kind.reference(self.spec, self.layout, gathered, context, memory)
                 samples.append(reading)
             memories[env] = memory
-            readings.append(np.concatenate([s if s.ndim == 3 else s[None] for s in samples]) if self.sensor.substeps else samples[0])
+            readings.append(
+                np.concatenate([s if s.ndim == 3 else s[None] for s in samples]) if self.sensor.substeps else samples[0]
+            )
         return np.stack(readings), memories
 
     def remember(self, memory: Memory) -> None:

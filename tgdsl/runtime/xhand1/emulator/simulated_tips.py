@@ -76,7 +76,7 @@ class SimulatedTips:
         for finger, place in self._places.items():
             planned = place.term.planned
             if planned not in features:
-                constants = self._touch.constants.under(f"observations/{planned.group}/{planned.index}", planned.constants)
+                constants = self._touch.constants.tree["observations"][planned.key]
                 reading = last_step(readings[str(planned.reading)])
                 features[planned] = observations.observe(planned.type, reading, planned.channels, constants)[0]
             found[finger] = place.force(features[planned])
