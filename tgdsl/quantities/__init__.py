@@ -1,1 +1,1 @@
-"""What kinds ask of a scene, one folder each."""
+"""Quantities that kinds request of a scene, one folder each."""

@@ -1,1 +1,1 @@
-"""Contact depth: how deep a probe is in which object, which way is out, how that moves."""
+"""Penetration depth of probes into objects, with contact normals and relative motion."""

@@ -1,1 +1,1 @@
-"""Contacts: the solver's, on the bodies that carry a sensor."""
+"""The solver's contacts on the bodies that carry a sensor."""

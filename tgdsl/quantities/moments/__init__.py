@@ -1,1 +1,1 @@
-"""Moments of objects' surfaces about each probe."""
+"""Moments of objects' surfaces within each probe's radius."""

@@ -1,1 +1,1 @@
-"""Points sampled on objects, and how deep they are in links' own surfaces."""
+"""Points sampled on objects, and their signed distances to the links' surfaces."""
