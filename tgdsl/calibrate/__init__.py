@@ -1,1 +1,1 @@
-"""Parameters from recordings."""
+"""Calibration of a real hand, fitted to logs under known forces."""

@@ -1,1 +1,1 @@
-"""From documents and robots to Plans and modules."""
+"""The compiler: from a document and a robot to a Plan."""

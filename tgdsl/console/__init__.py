@@ -1,1 +1,1 @@
-"""What users see in a console: tables, and notes on long work."""
+"""Console output: tables, and progress messages of long work."""

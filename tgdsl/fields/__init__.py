@@ -1,1 +1,1 @@
-"""What every part of a document is made of: quantities with units, regions, and the base of all models."""
+"""Field types of documents: quantities with units, regions, and the base of all models."""

@@ -1,1 +1,1 @@
-"""Files: where they are, written whole or not at all, and what is kept of earlier work."""
+"""Files: paths, atomic writes, and the cache of baked results."""

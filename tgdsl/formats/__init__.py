@@ -1,1 +1,1 @@
-"""Robots in and out: MJCF, URDF, USD."""
+"""Robot formats, import and export: MJCF, URDF, USD."""

@@ -1,1 +1,1 @@
-"""Vectors as planes, primitives, the contact query, and triangle surfaces."""
+"""Vectors as component planes, signed distance of primitives, distance fields, and nearest-triangle queries."""

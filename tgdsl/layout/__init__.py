@@ -1,1 +1,1 @@
-"""Where taxels sit, as numbers."""
+"""The Layout: the taxels of a robot at one resolution, as arrays."""

@@ -1,1 +1,1 @@
-"""The compiled sensor: tensors in, tensors out."""
+"""The compiled module: scene states in, readings and observations out."""

@@ -1,1 +1,1 @@
-"""What a policy reads, made of readings and of joints."""
+"""Observations: features of a policy, computed from readings and joints."""

@@ -1,1 +1,1 @@
-"""Where taxels go on a robot's links."""
+"""Placement of taxels on a robot's links."""

@@ -1,1 +1,1 @@
-"""What to compute, with nothing left to decide."""
+"""The Plan: everything that is to be computed, as immutable data."""

@@ -1,1 +1,1 @@
-"""Simulators and hardware that feed a module, and what shows its readings."""
+"""Sources of scene states: simulators, hardware and logs."""

@@ -1,1 +1,1 @@
-"""Scenes as an artefact carries them."""
+"""The compiled scene that an artefact carries."""

@@ -1,1 +1,1 @@
-"""The grammar: what a document may say, and how it is read."""
+"""The schema of documents: models, YAML with line numbers, error messages, JSON Schema."""

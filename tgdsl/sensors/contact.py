@@ -1,9 +1,9 @@
-"""Contact: one bit per taxel, with a threshold to switch on and a lower one to switch off (a Schmitt trigger).
+"""Contact: one bit per taxel, by two thresholds of the penetration depth (a Schmitt trigger).
 
     y_j(t) = 1  if  d_j(t) > η_on  or  (y_j(t−1) = 1 and d_j(t) > η_off),  else 0             [1]
 
-with d_j the contact depth [m] (see `contact_depth`) and η_off ≤ η_on the release threshold [m]. With η_off = η_on there is
-no memory and no state. After a reset y = 0.
+with d_j the penetration depth of probe j [m] (see `contact_depth`), η_on the threshold and η_off ≤ η_on the release threshold
+[m]; t counts calls. With η_off = η_on the kind has no state. After a reset y = 0.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "ContactProbe". Departures: none.
 """

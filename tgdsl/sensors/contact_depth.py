@@ -1,16 +1,17 @@
-"""Contact depth: how far each probe's sphere reaches into what it touches.
+"""Contact depth: penetration depth of each probe's sphere into the objects that it senses.
 
-    d_j = max_g max(0, R_j − φ_g(q_j))                                                        [m]
+    d_j = max_g max(0, R_j − φ_g(q_j)),    q_j = p_L + R_L x_j                                [m]
 
-with q_j = p_L + R_L x_j the probe's place in the world, R_j its radius [m], and φ_g the signed distance to geom g of the
-objects felt [m]. Inactive probes (R_j = 0) read 0.
+with x_j the probe's position in the frame of its link, p_L and R_L the link's world pose, q_j the probe's world position, R_j
+its radius [m], and φ_g(q) the signed distance to geom g [m], negative inside, over all geoms of the sensed objects whose gate
+is open. Inactive probes (R_j = 0) read 0.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Probe geometry and contact-depth query" (the `sdf` backend) and
 "ContactDepthProbe".
 
 Departures: distances are exact for every MuJoCo primitive, where the paper's implementation interpolates boxes, cylinders
-and capsules on a grid. The gate is an option; the paper's is `contact_pair`. Under that gate a probe of radius R reads up to
-R as soon as any point of its link touches the object: depth is measured from the sphere, not from the skin.
+and capsules on a grid. The gate is an option; the paper's is `contact_pair`. With that gate a probe reads up to R_j as soon
+as any point of its link is in contact with the object: depth is measured from the probe's sphere, not from the link's surface.
 """
 
 from __future__ import annotations

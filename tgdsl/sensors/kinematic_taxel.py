@@ -1,39 +1,41 @@
-"""Kinematic taxel: force and torque from depth, contact normal and relative velocity, without a deformable substrate.
+"""Kinematic taxel: force and torque from penetration depth, contact normal and relative velocity, without a deformable body.
 
     s_j = d_j^α
     f_j = k_n s_j m_j + c_n s_j v_n,j + k_t v_t,j                                             [N]
     τ_j = x_j × f_j + k_ω (ω · m_j) m_j                                                       [N·m]
 
-where d_j > 0, and zero elsewhere. All vectors are in the frame of the taxel's link: d_j contact depth [m] and m_j unit normal
-out of the object (see `contact_depth`), v_j velocity of the object's material at the probe relative to the probe [m/s],
-v_n = (v · m) m and v_t = v − v_n, ω angular velocity of the object relative to the link [rad/s], x_j the probe's place [m].
-Force and torque act on the link, the torque about the link's origin: friction points along the object's motion.
+where d_j > 0, and zero elsewhere. All vectors are in the frame of the taxel's link: d_j penetration depth [m] and m_j unit
+normal out of the object (see `contact_depth`), v_j velocity of the object's material at the probe relative to the probe [m/s],
+v_n = (v · m) m and v_t = v − v_n, ω angular velocity of the object relative to the link [rad/s], x_j position of the probe [m].
+Coefficients: stiffness k_n [N/m^α], normal damping c_n [N·s/m^(1+α)], tangential damping k_t [N·s/m], spin damping k_ω
+[N·m·s/rad], depth exponent α [1]. Force and torque act on the link, the torque about the link's origin: friction points along
+the object's motion.
 
-Options, all off by default, in this order:
+Options, all off by default, applied in this order:
 
     balance solver      f_n,j ← λ_j W,  λ_j = q_j Q/(Q² + ε²),  q_j = max(0, f_n,j),  Q = Σ_j q_j,  W = Σ_c f_c · m_c
                         f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = λ_j Σ_c |f_c − (f_c · m_c) m_c|,  spin within ± l_j R_j
-    friction_cone μ     f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = μ max(0, f_n,j), which takes the place of the l_j above
+    friction_cone μ     f_t,j ← f_t,j min(1, l_j/|f_t,j|),  l_j = μ max(0, f_n,j), which replaces the l_j above
     torque_about taxel  τ_j without x_j × f_j
 
-with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin k_ω (ω · m_j) as above; j the taxels of one body, c the solver's contacts
-on that body with all of the sensor's objects, f_c their forces on it and m_c their normals.
+with f_n,j = f_j · m_j, f_t,j = k_t v_t,j and the spin torque k_ω (ω · m_j) as above; j over the taxels of one body, c over the
+solver's contacts on that body with all objects of the sensor, f_c their forces on the body [N] and m_c their normals; R_j the
+probe's radius [m].
 
-Balanced, the normal forces of a body's taxels sum to the solver's W as magnitudes, each along its own m_j, in the proportions
-of the law above: where normals lean apart, under a ball or beside an edge, their vector sum is smaller. Their friction is that
-of the law up to a limit: the cone of `friction_cone`, or else all together the solver's own, so that a contact without
-friction has none. A taxel's patch is no larger than its probe, so friction twists it with no more than l_j R_j, R_j its radius
-[m]. Nothing grows as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. What pulls has no share of W. ε is the normal force up
-to which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. What
-contacts beyond `slots` carry acts at the centre of the others, and counts. Static friction is not of this law: `force_taxel`
-shares out forces.
+With `balance: solver` the magnitudes of a body's normal forces, each along its own m_j, sum to the solver's W, in the
+proportions of the law above: where normals diverge, under a ball or beside an edge, their vector sum is smaller. Friction
+follows the law up to a limit, the cone of `friction_cone` or else the solver's total tangential force; with the latter a
+frictionless contact has none. The spin torque is limited to l_j R_j: a contact patch is no larger than its probe. Forces stay
+bounded as depth vanishes: |f_n,j| ≤ |W| and |f_t,j| ≤ l_j. A negative (tensile) f_n,j has no share of W. ε is the normal force
+below which a body counts as unloaded [N]: there the taxels' sum fades to zero, and the solver's force is not carried. The
+force of contacts beyond `slots` is included, at the centre of the others. The law has no static friction; `force_taxel` has.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "KinematicTaxel", with its parameters as defaults.
 
 Departures: the paper's tangential and spin terms have the opposite sign, −k_t v_t and −k_ω (ω · m) m, which is the force on
 the object while its normal force is the one on the sensor; `model: paper` keeps them. Velocities are those of the material at
-the probe from the bodies' frame origins, which equals the paper's form from centres of mass. As in the paper the force
-follows depth, not load, unless balanced: summed over a pad it is not the weight of what rests there. The options are ours.
+the probe from the velocities of body frame origins, which equals the paper's form from centres of mass. As in the paper the
+force follows depth, not load, unless balanced: its sum over a pad is not the weight of an object at rest. The options are ours.
 """
 
 from __future__ import annotations

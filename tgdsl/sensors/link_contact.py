@@ -1,11 +1,11 @@
-"""Link contact: what the solver says of each body, whatever its taxels: is it touched, and with which force.
+"""Link contact: per body, the solver's net contact force and a contact bit.
 
     f_b = Σ_o f_bo,   c_b = 1 if |f_b| > threshold, else 0                                    [N], [1]
 
-with f_bo the solver's whole contact force of object o on body b, in the frame of the body: all its contacts, none left out.
-One row per body that carries the sensor, in the order of the layout. Forces of several objects add up before they are compared:
-a body held between two objects that push equally reads their sum, zero, and no contact; give each object a sensor of its own to
-tell them apart. The bit steps, so it has no gradient.
+with f_bo the solver's net contact force of object o on body b [N], over all its contacts (there are no slots), in the frame of
+the body; the threshold in [N]. One row per body that carries the sensor, in the order of the layout. Forces of several objects
+are summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact; to separate
+objects, give each its own sensor. The bit is a step function and has no gradient.
 
 Source: MuJoCo's contact sensor with the reduction `netforce` (XML reference, sensor/contact).
 """

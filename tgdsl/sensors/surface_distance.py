@@ -1,17 +1,17 @@
-"""Surface distance: how far each probe's centre is from the surface of each object, before, in and after contact.
+"""Surface distance: signed distance of each probe's centre to each object's surface, before, in and after contact.
 
-    y_jo = min(min_g φ_g(q_j), r_max)                                                         [m]
-    u_jo = −φ m where φ = min_g φ_g(q_j) ≤ r_max, else 0                                      [m]
+    y_jo = min(φ_jo, r_max),    φ_jo = min_g φ_g(q_j)                                         [m]
+    u_jo = −φ_jo m_jo where φ_jo ≤ r_max, else 0                                              [m]
 
-with q_j the probe's place in the world, g the geoms of object o, φ_g the signed distance [m], negative inside, m its outward
-gradient in the frame of the probe's link, and r_max the range [m]. u points from the probe to the nearest point of the surface.
-There is no gate. Inactive probes (radius 0) read what a probe reads with nothing near: y = r_max and u = 0; the radius of
-others has no effect.
+with q_j the probe's world position, g over the geoms of object o, φ_g the signed distance [m], negative inside, m_jo the
+gradient of φ_jo, which points out of the object, in the frame of the probe's link, and r_max the range [m]. u_jo points from
+the probe to the nearest point of the surface. There is no contact gate. Inactive probes (radius 0) read y = r_max and u = 0;
+the radius of active ones has no effect.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "SurfaceDistanceProbe".
 
-Departures: the range, which makes the reading of a far object independent of how far it is; signed inside; the vector u. Inside
-a compound of overlapping geoms the magnitude is that of the deepest geom alone, which is at most the true one.
+Departures: the range, beyond which the reading is constant; the sign inside; the vector u. Inside a compound of overlapping
+geoms the magnitude is that of the deepest geom alone, which is at most the true one.
 """
 
 from __future__ import annotations

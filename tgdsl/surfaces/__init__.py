@@ -1,1 +1,1 @@
-"""Triangle surfaces on NumPy: rays, solids, samples, regions."""
+"""Triangle surfaces in NumPy: rays, solids, quadrature, regions."""

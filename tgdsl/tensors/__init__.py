@@ -1,1 +1,1 @@
-"""What torch is told: dtypes, devices, buffers, where kernels stand in for operations, CUDA graphs, environments by index."""
+"""PyTorch parts: dtypes, devices, buffers, hints for Inductor, Triton dispatch, CUDA graphs, environment indices."""

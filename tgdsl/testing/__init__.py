@@ -1,4 +1,4 @@
-"""The conformance suite: what every sensor kind must do, for its own tests and for those of plug-in authors to inherit.
+"""The conformance suite: tests that every sensor kind passes; the test class of a kind, your own too, inherits them.
 
     class TestMyKind(KindConformance):
         kind = MY_KIND

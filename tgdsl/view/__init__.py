@@ -1,1 +1,1 @@
-"""Pictures and tables of touch."""
+"""Pictures and tables of readings."""

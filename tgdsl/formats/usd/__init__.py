@@ -1,1 +1,1 @@
-"""Robots and scenes as USD."""
+"""USD stages, imported as MJCF."""

@@ -1,1 +1,1 @@
-"""A first layout for a robot that nobody has described."""
+"""A proposed layout for a robot that has none."""

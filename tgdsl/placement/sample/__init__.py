@@ -1,1 +1,1 @@
-"""Taxels on a link's surface: grids, even samples, points."""
+"""Sampling of taxels on a link's surface: grids, Poisson disks, given points."""

@@ -1,1 +1,1 @@
-"""What simulators of a module's scene have in common."""
+"""Parts that all simulators of a module's scene share."""

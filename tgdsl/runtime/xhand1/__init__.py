@@ -1,1 +1,1 @@
-"""The real XHand1: its protocol on the wire, a driver, an emulator of the hand, and calibration."""
+"""The XHand1: serial protocol, driver, emulator, calibration."""

@@ -1,4 +1,4 @@
-"""Elastomer: what its markers do when the skin is pressed and dragged. See `kind`."""
+"""Elastomer: marker displacement under normal load and shear. See `kind`."""
 
 from tgdsl.sensors.elastomer.kind import ELASTOMER
 from tgdsl.sensors.elastomer.spec import ElastomerSpec

@@ -1,1 +1,1 @@
-"""Force taxels: the solver's contact forces, shared out over the taxels near each contact."""
+"""Force taxel: the solver's contact forces, distributed over the taxels near each contact. See `kind`."""

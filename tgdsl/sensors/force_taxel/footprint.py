@@ -1,30 +1,31 @@
-"""Footprint: which share of a contact's force each taxel near it carries.
+"""Footprint: the fraction of each contact's force that each taxel near it carries.
 
-A solver knows a contact as a point x_c with force f_c and torque τ_c; a skin has taxels around that point. The shares are
+A solver's contact is a point x_c with force f_c and torque τ_c; a sensor has taxels around that point. The weights are
 
-    κ_cj = b_cj max(0, 1 − |x_j − x_c|²/r_f²),   b_cj = −2 n_j · m_c between 0 and 1
+    κ_cj = b_cj max(0, 1 − |x_j − x_c|²/r_f²),   b_cj = −2 n_j · m_c clamped to [0, 1]
     w_cj = (d_j/R_j + 10⁻³) κ_cj²,   λ⁰_cj = w_cj / Σ_j w_cj
     λ_cj ∝ λ⁰_cj exp(β · g_cj),   g_cj = (x_j − x_c) × f̂_c / r_f,   Σ_j λ_cj = 1
-    γ_c = t² (3 − 2t),   t = max_j κ_cj / (3/4) up to 1
+    γ_c = t² (3 − 2t),   t = min(1, max_j κ_cj / (3/4))
 
-d_j depth and R_j radius of the probe, n_j its outward normal, m_c the contact's normal out of the object, r_f the footprint's
-radius [m], f̂_c the force's direction. b_cj says whether the contact is on the taxel's side of the body: wholly where it
-presses within 60° of straight in, not at all from 90° on, as on the back of a finger. γ_c is the fraction of the contact's
-force that the skin captures: of a contact on an active taxel's side all up to half a footprint from that, nothing from a whole
-one. Both fade continuously. β is one vector per body. Of all shares it picks those with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c =
-Σ_c γ_c τ_c and the least relative entropy to λ⁰, contacts weighted by γ_c |f_c|: they never become negative, and a contact that
-is split in two of the same place and direction counts as the one. To first order β is the λ⁰-weighted least-norm correction.
-It is found by Newton's method on the convex dual in a fixed number of steps: with H the mean covariance of g and e the excess
-moment, both over Σ_c γ_c |f_c|,
+with d_j depth [m] and R_j radius [m] of the probe, n_j its outward normal, m_c the contact's normal out of the object, r_f the
+footprint's radius [m], f̂_c = f_c/|f_c|. b_cj selects taxels on the contact's side of the body: 1 where m_c is within 60° of the
+inward normal, 0 from 90° on, as on the back of a finger. γ_c is the captured fraction of the contact's force: 1 up to a
+distance r_f/2 from an active taxel with b_cj = 1, 0 from r_f on. Both are continuous.
+
+β [1] is one vector per body. It selects the weights with Σ_c γ_c Σ_j λ_cj (x_j − x_c) × f_c = Σ_c γ_c τ_c of minimum relative
+entropy to λ⁰, contacts weighted by γ_c |f_c|: they are never negative, and splitting a contact into two at the same point with
+the same direction changes nothing. To first order β is the λ⁰-weighted least-norm correction. It is found by a fixed number of
+Newton steps on the convex dual: with H the mean covariance of g and e the excess moment, both over Σ_c γ_c |f_c| (and e over
+r_f),
 
     s = (H + ε)⁻¹ H (H + ε)⁻¹ e,   β ← β − s / √(1 + s · H s + s · s / 10)
 
-which goes nowhere in directions in which no shares make a moment, as along the row where taxels stand in one, and is damped by
-what it would do to the shares. Where no shares have the moment (the contact lies outside the hull of the taxels that it covers)
-those on its side take more and more of it, and what is left is reported.
+The regularisation ε leaves directions alone in which the weights cannot change the moment, as along a single row of taxels; the
+damping bounds the effect of a step on the weights. Where no weights match the moment (the contact is outside the convex hull of
+the taxels in its footprint) those on its side carry more and more, and the rest is the residual.
 
-Source: the maximum-entropy shape functions of Arroyo & Ortiz, *Int. J. Numer. Meth. Engng* 65 (2006), which meet a moment with
-non-negative shares in the same manner; the footprint as their prior and the moment of a force for that of a place are ours.
+Source: the maximum-entropy shape functions of Arroyo & Ortiz, *Int. J. Numer. Meth. Engng* 65 (2006), which match a first
+moment with non-negative weights; the footprint as prior, and the moment of a force instead of a position, are ours.
 
 Shapes: `*body` bodies, such as (env, body) or (env,); `contact` contacts of a body, `taxel` taxels of that body, both in the
 frame of the body.

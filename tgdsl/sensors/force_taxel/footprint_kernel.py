@@ -1,12 +1,12 @@
-"""The sharing out of `footprint` as one Triton kernel, for a GPU in float32 without derivatives.
+"""`footprint` as one Triton kernel, for a GPU in float32 without gradients.
 
-A program takes one body in a block of environments. Its lanes hold contacts, and the taxels come one after the other: sums over
-taxels need no exchange between lanes. A pass over the taxels sums the moments of the arms x_j − x_c; the mean and covariance of
-the levers g follow from those, as g is linear in the arm. Groups of contacts that are all empty are passed over.
+A program handles one body in a block of environments. Its threads hold contacts and loop over the taxels: sums over taxels
+need no communication between threads. A pass over the taxels accumulates the moments of the lever arms x_j − x_c; the mean and
+covariance of g follow from those, as g is linear in the arm. Groups of contacts that are all empty are skipped.
 
-Covariances are differences of moments, and float32 would lose their digits where few taxels are in reach, all of them on one
-side of the contact. So moments of contacts that stand beside the box of the body's taxels are about the point of that box which
-is next to them.
+Covariances are differences of moments, and float32 would suffer cancellation where few taxels are in the footprint, all of them
+on one side of the contact. So for contacts beside the bounding box of the body's taxels the moments are taken about the nearest
+point of that box.
 
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """

@@ -1,28 +1,29 @@
-"""Force taxel: the solver's contact force on each body, shared out over the taxels near each contact.
+"""Force taxel: the solver's contact force on each body, distributed over the taxels near each contact.
 
     f_j = Σ_c γ_c λ_cj f_c                                                                    [N]
     p_j = max(0, −f_j · n_j) / A_j                                                            [Pa]
     missed = f_net − Σ_j f_j                                                                  [N]
     residual = Σ_c γ_c (x_c × f_c + τ_c) − Σ_j x_j × f_j                                      [N·m]
 
-with c the solver's contacts of the sensor's objects on one body, f_c their forces on the link, τ_c their torques at the
-contact points x_c, f_net their whole; j that body's taxels with place x_j, outward normal n_j and area A_j, all in the link's
-frame. The captured fraction γ_c and the shares λ_cj ≥ 0, which sum to 1, are those of `footprint`: near the contact and on its
-side of the body, by depth, and such that the moment of the taxel forces is that of the contacts as far as shares can meet it.
+with c over the solver's contacts of the sensor's objects on one body: contact points x_c [m], forces f_c [N] and torques τ_c
+[N·m] on the link, net force f_net; j over that body's taxels: positions x_j [m], outward normals n_j, areas A_j [m²]; all in
+the link's frame. The captured fraction γ_c [1] and the weights λ_cj ≥ 0 with Σ_j λ_cj = 1 are those of `footprint`: they favour
+taxels near the contact, on its side of the body and with large depth, and are chosen such that the moment of the taxel forces
+is that of the contacts, as far as non-negative weights can match it.
 
-So Σ_j f_j + missed = f_net always: no load is lost or made up, static shear included. As every f_j is a sum of contact forces
-with weights ≥ 0, it leaves no cone that they share, such as the friction cone of a flat face. A contact that slides off the
-sensor, or around an edge of its body, hands its force to `missed` continuously. So is missed what lies further than a footprint
-from every active taxel, or on the back of the body. What contacts beyond `slots` carry acts at the centre of the others, see
-`quantities.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per body. The residual is a pure
-couple, since the shared forces sum to those they came from: it is the same about any point.
+So Σ_j f_j + missed = f_net always: the load is conserved, static friction included. Each f_j is a sum of contact forces with
+non-negative weights, so it stays in every convex cone that contains these, such as the friction cone of a flat face. As a
+contact slides off the sensor, or around an edge of its body, its force passes continuously to `missed`. So does the force of
+contacts further than a footprint from every active taxel, or on the back of the body. The force of contacts beyond `slots` acts
+at the centre of the others, see `quantities.contacts`. Inactive taxels carry nothing. `missed` and `residual` have one row per
+body. The residual is a pure couple, since the distributed forces sum to the captured ones: it is the same about any point.
 
-Source: a solver's contacts are rigid points; this is the distribution of a resultant on a Winkler foundation, whose pressure is
-proportional to depth (Johnson, *Contact Mechanics*, §4.3), with its moment corrected.
+Source: a solver's contacts are points on rigid bodies; this distributes their resultant as on a Winkler foundation, whose
+pressure is proportional to depth (Johnson, *Contact Mechanics*, §4.3), with the moment corrected.
 
-Limits: depth is that of the object that a probe is deepest in, so two objects within one footprint share their taxels. Shares
-follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; forces there
-begin at what the solver says.
+Limits: depth is that of the object that a probe is deepest in, so two objects within one footprint share their taxels. Weights
+follow depth and distance per taxel, not per area. With the gate `contact_pair` depth jumps where a contact begins; the forces
+still sum to the solver's.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Imperfections of sensors: the knobs (`spec`), what they do (`stages`), and the numbers they draw (`random`)."""
+"""Sensor noise: the knobs (`spec`), the stages (`stages`), and counter-based random numbers (`random`)."""
 
 from tgdsl.sensors.noise.spec import BASE, FORCE, PROBE, PROFILES, TAXEL, Knobs, NoiseField, NoiseSpec, built_in, resolve_noise
 

@@ -1,1 +1,1 @@
-"""Robots out, as USD."""
+"""MJCF and URDF models, exported as USD stages."""

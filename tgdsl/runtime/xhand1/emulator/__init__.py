@@ -1,1 +1,1 @@
-"""An XHand1 that is not there: a hand behind a pseudo-terminal."""
+"""An emulated XHand1 behind a pseudo-terminal."""

@@ -1,1 +1,1 @@
-"""What a hand said, recorded and played again."""
+"""Logs of the XHand1: recording and replay."""

@@ -1,1 +1,1 @@
-"""The XHand1's serial line: bytes, frames, replies, ports."""
+"""The XHand1's serial line: packets, checksums, replies, ports."""
