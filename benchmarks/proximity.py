@@ -24,10 +24,10 @@ from torch import Tensor
 
 import tgdsl
 from tgdsl.compiler.felt import FeltGeom
-from tgdsl.formats.robot import Geom
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.quantities.moments.fields import moment_sums
+from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.quadrature import outer_surface
 
 SCENE = """

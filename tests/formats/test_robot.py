@@ -10,7 +10,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.robot import Geom, Model, load_model, xml_files
+from tgdsl.formats.robot import Model, load_model, xml_files
+from tgdsl.surfaces.geom import Geom
 
 ROBOTS = Path(__file__).parents[2] / "robots"
 TESSELLATION = 0.01

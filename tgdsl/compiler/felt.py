@@ -11,12 +11,13 @@ import igl
 import numpy as np
 import trimesh
 
-from tgdsl.formats.robot import Geom, Model
+from tgdsl.formats.robot import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.plan import ContactPart
 from tgdsl.quantities.contact_depth.bake import bake
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
 from tgdsl.schema.select import matching
+from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
 HULL_POINTS = 2000

@@ -15,13 +15,14 @@ from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection, SpecModel
 from tgdsl.fields.regions import OnGeoms, RegionPart
 from tgdsl.files.files import is_file, robot_names
-from tgdsl.formats.robot import Geom, Model, load_model
+from tgdsl.formats.robot import Model, load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.load import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
+from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.region import cut
 from tgdsl.surfaces.surface import Surface
 

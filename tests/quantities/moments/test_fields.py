@@ -8,12 +8,12 @@ from surfaces import box, surface_of
 
 from tgdsl.compiler.felt import FeltGeom
 from tgdsl.errors import BakeError
-from tgdsl.formats.robot import Geom
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments import fields as moments
 from tgdsl.quantities.moments.clouds import sample_cloud, sample_points
 from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
 from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments
+from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.quadrature import outer_surface
 
 R = 0.01
