@@ -10,7 +10,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.robot import Model, load_model, xml_files
+from tgdsl.formats.mjcf import xml_files
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
 from tgdsl.surfaces.geom import Geom
 
 ROBOTS = Path(__file__).parents[2] / "robots"

@@ -11,7 +11,7 @@ import igl
 import numpy as np
 import trimesh
 
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.plan import ContactPart
 from tgdsl.quantities.contact_depth.bake import bake

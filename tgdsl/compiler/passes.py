@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from tgdsl.compiler.felt import FeltBody, Settled
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout
 from tgdsl.plan.plan import SLOT_FIELDS, ContactPart, Inputs, Pair, PlannedAnswer, PlannedObject, PlannedQuery
 from tgdsl.quantities.contact_depth.geom_tables import accuracy, geom_tables, is_centred, placed_geoms

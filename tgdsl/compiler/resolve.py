@@ -15,7 +15,8 @@ from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection, SpecModel
 from tgdsl.fields.regions import OnGeoms, RegionPart
 from tgdsl.files.files import is_file, robot_names
-from tgdsl.formats.robot import Model, load_model
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.load import Loaded, LoadedLayout

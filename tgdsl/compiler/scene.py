@@ -12,7 +12,7 @@ import mujoco
 
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.plan.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
 from tgdsl.scene.compare import differing
 from tgdsl.scene.places import ENDINGS, FOLDER_ATTRIBUTES

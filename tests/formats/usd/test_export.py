@@ -11,8 +11,7 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.robot import load_model
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model, load_model
 
 XHAND1 = Path(__file__).parents[3] / "robots" / "xhand1" / "xhand1_right.xml"
 TOLERANCE = 1e-6
@@ -65,7 +64,7 @@ ZOO = """
 def exported(folder: Path, text: str, ending: str = ".usda") -> tuple[Usd.Stage, mujoco.MjModel]:
     """Export MJCF; return the stage, and what MuJoCo makes of it."""
     (folder / "robot.xml").write_text(text)
-    export_usd(folder / "robot.xml", folder / f"robot{ending}")
+    export_model(folder / "robot.xml", folder / f"robot{ending}")
     return Usd.Stage.Open(str(folder / f"robot{ending}")), mujoco.MjModel.from_xml_string(text)
 
 
@@ -81,7 +80,7 @@ def zoo(tmp_path_factory) -> tuple[Usd.Stage, mujoco.MjModel]:
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory) -> tuple[Usd.Stage, mujoco.MjModel]:
     out = tmp_path_factory.mktemp("hand") / "hand.usdc"
-    export_usd(XHAND1, out)
+    export_model(XHAND1, out)
     return Usd.Stage.Open(str(out)), mujoco.MjModel.from_xml_path(str(XHAND1))
 
 
@@ -516,7 +515,7 @@ def test_same_input_same_bytes(tmp_path, ending):
     (tmp_path / "robot.xml").write_text(ZOO)
     contents = []
     for name in ("one", "two", "one"):
-        export_usd(tmp_path / "robot.xml", tmp_path / f"{name}{ending}")
+        export_model(tmp_path / "robot.xml", tmp_path / f"{name}{ending}")
         contents.append((tmp_path / f"{name}{ending}").read_bytes())
     assert contents[0] == contents[1] == contents[2]
     assert contents[0].startswith(b"#usda 1.0" if ending == ".usda" else b"PXR-USDC")
@@ -540,7 +539,7 @@ def test_urdf(tmp_path):
         "<joint name='wrist' type='revolute'><parent link='base'/><child link='hand'/><origin xyz='0 0 1' rpy='.1 .2 .3'/>"
         "<axis xyz='0 1 0'/><limit lower='-1' upper='1' effort='3' velocity='1'/></joint></robot>"
     )
-    export_usd(tmp_path / "arm.urdf", tmp_path / "arm.usda")
+    export_model(tmp_path / "arm.urdf", tmp_path / "arm.usda")
     stage, model = Usd.Stage.Open(str(tmp_path / "arm.usda")), load_model(tmp_path / "arm.urdf").compiled
     assert stage.GetDefaultPrim().GetName() == "arm"
     qpos = np.array([0.4])
@@ -573,7 +572,7 @@ HINGES = "<body name='knot'><joint axis='1 0 0'/><joint axis='0 1 0'/><geom size
 def test_refusals(tmp_path, text, out, message):
     (tmp_path / "robot.xml").write_text(text)
     with pytest.raises(RobotError) as caught:
-        export_usd(tmp_path / "robot.xml", tmp_path / out)
+        export_model(tmp_path / "robot.xml", tmp_path / out)
     assert str(caught.value) == message.format(file=tmp_path / "robot.xml", out=tmp_path / out)
     assert [file.name for file in tmp_path.iterdir()] == ["robot.xml"]
 
@@ -581,7 +580,7 @@ def test_refusals(tmp_path, text, out, message):
 def test_without_usd_core(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(RobotError, match="pip install usd-core"):
-        export_usd(XHAND1, tmp_path / "hand.usda")
+        export_model(XHAND1, tmp_path / "hand.usda")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
@@ -593,7 +592,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr("os.replace", full)
     with pytest.raises(RobotError) as caught:
-        export_usd(tmp_path / "robot.xml", tmp_path / "robot.usda")
+        export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert str(caught.value) == f"{tmp_path / 'robot.usda'}: cannot be written: No space left on device"
     assert (tmp_path / "robot.usda").read_bytes() == before
     assert sorted(file.name for file in tmp_path.iterdir()) == ["robot.usda", "robot.xml"]
@@ -661,6 +660,6 @@ TWO = "<body name='a'><joint name='j' {joint}/><geom size='.1'/></body><body nam
 def test_what_is_left_out_is_said(tmp_path, bodies, rest, messages):
     (tmp_path / "robot.xml").write_text(world_of(bodies.replace("{joint}", ""), rest))
     with pytest.warns(UserWarning, match="robot.xml: ") as caught:
-        export_usd(tmp_path / "robot.xml", tmp_path / "robot.usda")
+        export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert [str(warning.message) for warning in caught] == [f"{tmp_path / 'robot.xml'}: {message}" for message in messages]
     assert (tmp_path / "robot.usda").exists()

@@ -13,24 +13,22 @@ The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
 - A joint that closes a loop becomes an equality constraint between sites.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2. Materials' looks, subdivision,
   holes of meshes and what is not drawn by default are left out; whatever else is dropped is warned of.
-- What `usd_export` notes in attributes `tgdsl:` is read back, in SI units and radians whatever those of the stage.
+- What `export` keeps in attributes `tgdsl:` is read back, in SI units and radians whatever those of the stage.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError
-from tgdsl.files.files import naming
+from tgdsl.formats.model import Model
 from tgdsl.formats.usd.filters import exclusions
 from tgdsl.formats.usd.geoms import Geom, Site, read_geoms, read_sites
 from tgdsl.formats.usd.joints import MEETING, Joint, read_joints
@@ -40,8 +38,6 @@ from tgdsl.formats.usd.stage import Matrix, Prim, Stage, opened, unique_names
 from tgdsl.formats.usd.tree import Link, Tree, spanning_tree
 from tgdsl.formats.usd.xml import MeshAssets, add_geom, add_key, add_loop, add_motion, add_site, numbers, posed
 
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-"""Endings of USD files."""
 GRAVITY = 9.81
 """What a stage's scene means by earth gravity [m/s²]."""
 
@@ -73,6 +69,18 @@ class _Robot:
     kinematic: dict[str, bool]
     names: tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]
     free: dict[str, str]
+
+
+def read_usd(path: Path) -> Model:
+    """Read and compile a UsdPhysics stage.
+
+    Raises:
+        RobotError: As `usd_to_mjcf`.
+        ValueError: If MuJoCo cannot compile it.
+    """
+    text = usd_to_mjcf(path)
+    spec = mujoco.MjSpec.from_string(text)
+    return Model(path, spec, spec.compile(), is_urdf=False, mjcf=text)
 
 
 def usd_to_mjcf(path: Path) -> str:
@@ -261,54 +269,3 @@ def _add_loop(
     taken = {site.get("name", "") for element in elements.values() for site in element.iter("site")}
     ends = (elements[joint.bodies[0]], elements[joint.bodies[1]])
     add_loop(equality, ends, joint, robot.names[2][joint.path], taken)
-
-
-def write_mjcf(text: str, out: Path) -> None:
-    """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
-
-    All is written under temporary names first, then renamed, so that nothing half-written is left behind.
-
-    Args:
-        text: What `usd_to_mjcf` returns.
-        out: The MJCF file. It is replaced if it is there, and so are meshes of the same names; other files are left alone.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
-    root, out = ET.fromstring(text), Path(out)
-    folder = out.with_name(f"{out.stem}_assets")
-    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
-        files: list[str] = []
-        for mesh in root.iterfind("asset/mesh[@vertex]"):
-            file = _file_name(mesh.get("name", ""), files)
-            (Path(temporary) / file).write_text(
-                _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")), encoding="utf-8"
-            )
-            mesh.set("file", file)
-        if files:
-            root.findall("compiler")[0].set("meshdir", folder.name)
-        ET.indent(root)
-        draft = Path(temporary) / "model.xml"
-        draft.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-        for file in files:
-            folder.mkdir(exist_ok=True)
-            os.replace(Path(temporary) / file, folder / file)
-        os.replace(draft, out)
-
-
-def _file_name(name: str, taken: list[str]) -> str:
-    """Return a file name for a mesh, and take it; names that only differ in case are one on some file systems."""
-    stem = re.sub(r"[^\w.-]", "_", name) or "mesh"
-    file, number = f"{stem}.obj", 1
-    while file.lower() in map(str.lower, taken):
-        number += 1
-        file = f"{stem}_{number}.obj"
-    taken.append(file)
-    return file
-
-
-def _wavefront(vertices: str, faces: str) -> str:
-    points, corners = vertices.split(), [int(index) + 1 for index in faces.split()]
-    lines = [f"v {' '.join(points[i : i + 3])}" for i in range(0, len(points), 3)]
-    lines += [f"f {' '.join(map(str, corners[i : i + 3]))}" for i in range(0, len(corners), 3)]
-    return "\n".join([*lines, ""])

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tgdsl.errors import RobotError, SampleError, TgdslError
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.placement.propose.anatomy import Hand, hands, robot_tree, scenery
 from tgdsl.placement.propose.closing import Closing
 from tgdsl.placement.sample import spread

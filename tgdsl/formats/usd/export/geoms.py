@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.robot import SHAPE_NAMES
+from tgdsl.formats.model import SHAPE_NAMES
 from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
 from tgdsl.formats.usd.notes import GEOM, MESH, SITE, Notes, notable, plain
 

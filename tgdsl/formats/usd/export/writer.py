@@ -23,33 +23,28 @@ import numpy as np
 
 from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.files import whole_file
-from tgdsl.formats.robot import load_model
+from tgdsl.formats.model import Model
 from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
 from tgdsl.formats.usd.export.joints import BALL, FREE, add_drives, add_joint, joint_of
 from tgdsl.formats.usd.notes import OPTION, flags, notable, plain
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
-ENDINGS = (".usda", ".usdc", ".usd")
 
 
-def export_usd(model_file: Path, out: Path) -> None:
-    """Write a robot or scene file as a UsdPhysics stage; the same input gives the same bytes.
+def write_usd(model: Model, out: Path) -> None:
+    """Write a robot or scene as a UsdPhysics stage; the same input gives the same bytes.
 
     Warns of each thing of the model that USD does not hold, after the file is written.
 
     Args:
-        model_file: An MJCF or URDF file.
+        model: The robot or scene.
         out: The stage to write: `.usda` is text, `.usdc` and `.usd` are binary.
 
     Raises:
-        RobotError: If the model cannot be read, USD cannot express it, or the file cannot be written.
+        RobotError: If USD cannot express the model, or the file cannot be written.
     """
-    if out.suffix not in ENDINGS:
-        raise RobotError(f"{out}: USD files end in {listed(ENDINGS)}")
-    u = usd()
-    model = load_model(model_file)
-    draft = Draft(model_file, model.spec, model.compiled, u.Usd.Stage.CreateInMemory())
+    draft = Draft(model.file, model.spec, model.compiled, usd().Usd.Stage.CreateInMemory())
     _add_scene(draft)
     joints, materials = (draft.path(draft.root, name) for name in ("joints", "materials"))
     _add_bodies(draft, materials)
@@ -57,7 +52,7 @@ def export_usd(model_file: Path, out: Path) -> None:
     _add_filters(draft)
     _write(draft, out)
     for message in (*draft.left_out, *_left_out(draft)):
-        warnings.warn(message, stacklevel=2)
+        warnings.warn(message, stacklevel=3)
 
 
 def _add_scene(draft: Draft) -> None:
