@@ -88,7 +88,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_can_meet_is_what_mujoco_does(tmp_path, case):
+def test_can_collide_is_what_mujoco_does(tmp_path, case):
     text, expected = CASES[case]
     (tmp_path / "scene.xml").write_text(text)
     model = load_model(tmp_path / "scene.xml")
@@ -98,5 +98,5 @@ def test_can_meet_is_what_mujoco_does(tmp_path, case):
     wanted = {model.compiled.body(first).id, model.compiled.body(second).id}
     bodies = [{int(b) for b in model.compiled.geom_bodyid[[c.geom1, c.geom2]]} for c in data.contact]
     assert (wanted in bodies) is expected  # MuJoCo, which is the oracle, agrees with the table
-    assert model.can_meet(first, second) is expected
-    assert model.can_meet(second, first) is expected
+    assert model.can_collide(first, second) is expected
+    assert model.can_collide(second, first) is expected

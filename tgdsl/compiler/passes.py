@@ -157,7 +157,7 @@ def prune(work: Draft) -> list[tuple[str, str]]:
         bodies = set(work.bodies_of(sensor.taxels))
         for target in sensor.feels:
             pairs, felt = {Pair(body, target) for body in bodies}, work.objects[target]
-            meeting = {p for p in pairs if work.scene.can_touch(p.link, felt.touched)}
+            meeting = {p for p in pairs if work.scene.can_collide_with(p.link, felt.touched)}
             if sensor.is_gated or "contacts" in sensor.lowered.needs:
                 gated |= meeting
             itself = {p for p in pairs if work.scene.compiled.body(p.link).id in felt.bodies}

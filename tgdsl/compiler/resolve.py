@@ -24,7 +24,7 @@ from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.geom import Geom
-from tgdsl.surfaces.region import cut
+from tgdsl.surfaces.region import clip
 from tgdsl.surfaces.surface import Surface
 
 
@@ -70,7 +70,7 @@ class Resolved:
         """
         surface = self.robot.surface(self.patches[link].geoms)
         try:
-            return cut(surface, region) if region else surface
+            return clip(surface, region) if region else surface
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 

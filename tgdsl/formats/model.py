@@ -121,11 +121,11 @@ class Model:
             found.append(geom)
         return tuple(found)
 
-    def can_meet(self, first: str, second: str) -> bool:
+    def can_collide(self, first: str, second: str) -> bool:
         """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
-        return self.can_touch(first, [geom.id for geom in self.touchable(second)])
+        return self.can_collide_with(first, [geom.id for geom in self.touchable(second)])
 
-    def can_touch(self, body: str, geoms: Iterable[int]) -> bool:
+    def can_collide_with(self, body: str, geoms: Iterable[int]) -> bool:
         """Return whether MuJoCo can ever report a contact between a body's geoms and some others, by their indices."""
         model = self.compiled
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:

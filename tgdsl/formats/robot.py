@@ -12,7 +12,7 @@ from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mjcf import read_mjcf
 from tgdsl.formats.model import Model
 from tgdsl.formats.urdf import read_urdf
-from tgdsl.formats.usd.export.writer import write_usd
+from tgdsl.formats.usd.export.write import write_usd
 from tgdsl.formats.usd.reader import read_usd
 from tgdsl.scene.scene import muted_mujoco
 

@@ -1,4 +1,7 @@
-"""Triangle surfaces as solids: signed distance to the outer surface, lids for what is open, sharp edges.
+"""Triangle surfaces as solids: signed distance to the outer surface, closed boundary loops, sharp edges.
+
+Distances and winding numbers are libigl's. `igl.signed_distance` takes as long (2.8 s for 860,000 points, signs the same), but
+builds its trees anew at each call, ignores holes, and measures to faces inside other parts too.
 
 Shapes: `n` points, `v` vertices, `f` and `g` faces, `x`, `y`, `z` nodes along the axes.
 """
@@ -222,7 +225,7 @@ def _lids(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
 
 
 def _creases(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sharp edges: vertices and pairs of their indices."""
+    """Return the sharp edges: vertices and pairs of their indices; `igl.sharp_edges` leaves out open and non-manifold ones."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -86,7 +86,7 @@ def test_who_can_meet_whom_is_as_in_mujoco(tmp_path, option):
     model = load_model(tmp_path / "robot.xml")
     bodies = model.bodies[1:]
     pairs = [(a, b) for a in bodies for b in bodies if a < b]
-    assert {frozenset(p) for p in pairs if not model.can_meet(*p)} == {p for p in apart if len(p) == 2 and "world" not in p}
+    assert {frozenset(p) for p in pairs if not model.can_collide(*p)} == {p for p in apart if len(p) == 2 and "world" not in p}
     assert {p for p in apart if "world" in p} == {frozenset(("world", "link1"))}
 
 

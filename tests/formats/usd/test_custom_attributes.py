@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd
 
 from tgdsl.formats.robot import export_model, load_model
-from tgdsl.formats.usd.notes import FLAGS, KNOWN_FLAGS, OPTION
+from tgdsl.formats.usd.custom_attributes import FLAGS, KNOWN_FLAGS, OPTION
 
 MODEL = """
 <mujoco model="notes">
