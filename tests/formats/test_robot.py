@@ -9,8 +9,10 @@ from robot_files import MESH_TOLERANCE, model_of, nearest, trimesh_of, wedge
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
+from tgdsl.formats import robot
 from tgdsl.formats.mjcf import xml_files
-from tgdsl.formats.robot import load_model
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import export_model, load_model
 from tgdsl.surfaces.geom import Geom
 
 ROBOTS = Path(__file__).parents[2] / "robots"
@@ -179,3 +181,25 @@ def test_every_link_of_the_xhand1_has_a_closed_surface_that_matches_its_files():
                 original = trimesh.load_mesh(ROBOTS / "xhand1" / "assets" / f"{geom.mesh}.stl")
                 np.testing.assert_allclose(mesh.volume, original.volume, rtol=1e-4, err_msg=geom.shown)
                 np.testing.assert_allclose(mesh.area, original.area, rtol=1e-4, err_msg=geom.shown)
+
+
+def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch):
+    """Its reader is asked by a file's ending, whatever its case, or by its root element; its writer by the ending of what to write."""
+    model, written = model_of(tmp_path, "<geom size='.1'/>"), {}
+
+    def read(path: Path) -> Model:
+        if not path.is_file():
+            raise FileNotFoundError(2, "gone")
+        return model
+
+    monkeypatch.setitem(robot.READERS, ".toy", read)
+    monkeypatch.setitem(robot.ROOTS, "toy", read)
+    monkeypatch.setitem(robot.WRITERS, ".toy", lambda model, out: written.update({out: model}))
+    (tmp_path / "a.TOY").touch()
+    (tmp_path / "b.xml").write_text("<toy/>")
+    assert load_model(tmp_path / "a.TOY") is load_model(tmp_path / "b.xml") is model
+    with pytest.raises(RobotError) as caught:
+        load_model(tmp_path / "c.toy")
+    assert str(caught.value) == f"{tmp_path / 'c.toy'}: [Errno 2] gone"
+    export_model(tmp_path / "a.TOY", tmp_path / "d.toy")
+    assert written == {tmp_path / "d.toy": model}

@@ -28,7 +28,9 @@ def test_a_rectangle_is_cut_out_of_a_face():
 
 def test_halves_add_up_whatever_the_triangles():
     whole = surface_of(ball(0.01))
-    parts = [clip(whole, READ(bounds(low, high))) for low, high in (([-1, -1, -1], [0.003, 1, 1]), ([0.003, -1, -1], [1, 1, 1]))]
+    parts = [
+        clip(whole, READ(bounds(low, high))) for low, high in (([-1, -1, -1], [0.003, 1, 1]), ([0.003, -1, -1], [1, 1, 1]))
+    ]
     np.testing.assert_allclose(sum(part.face_areas.sum() for part in parts), whole.face_areas.sum(), rtol=1e-9)
     for part in parts:
         assert (part.face_normals @ np.array([0, 0, 1.0]) * part.corners.mean(axis=1)[:, 2] >= -1e-9).all()  # outward still

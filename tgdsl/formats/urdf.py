@@ -1,4 +1,4 @@
-"""URDF made fit for MuJoCo: paths found, fixed links kept, broken inertias mended and named in a warning."""
+"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tgdsl.formats.mjcf import rewrite_meshes
 from tgdsl.formats.model import Model
 
 LEAST_INERTIA = 1e-9
-"""Principal moment given to a link whose inertia is not one of any real body [kg·m²]."""
+"""Least principal moment of a link whose inertia was not physical [kg·m²]."""
 
 
 def read_urdf(path: Path) -> Model:

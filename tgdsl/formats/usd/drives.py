@@ -63,10 +63,7 @@ def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -
     if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
         stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
         return None, own
-    is_angular = kind == "hinge"
-    gain = stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1) if is_angular else 1.0)
-    force = stage.kilograms_per_unit * (stage.metres_per_unit**2 if is_angular else stage.metres_per_unit)
-    unit = math.radians(1) if is_angular else stage.metres_per_unit
+    gain, force, unit = _si_units(stage, is_angular=kind == "hinge")
     most = math.inf if most >= INFINITE else most * force
     own = min(own, damping * gain)
     rest = damping * gain - own
@@ -87,3 +84,11 @@ def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -
         math.inf if order is None else float(order),
     )
     return drive, own
+
+
+def _si_units(stage: Stage, is_angular: bool) -> tuple[float, float, float]:
+    """Return the stage's units of a drive's gains, of its force and of its target, in SI and radians."""
+    if is_angular:
+        torque = stage.kilograms_per_unit * stage.metres_per_unit**2
+        return stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1)), torque, math.radians(1)
+    return stage.kilograms_per_unit, stage.kilograms_per_unit * stage.metres_per_unit, stage.metres_per_unit

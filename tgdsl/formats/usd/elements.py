@@ -153,10 +153,25 @@ def add_actuators_and_key(
         kinematic: Whether each body is kinematic.
         names: Names of the joints.
     """
+    motions = list(motions)
+    qpos, is_needed = _authored_qpos(motions, frames, kinematic)
+    joints = [node.joint for node, _ in motions if node.joint is not None]
+    driven = [(joint.drive, names[joint.path]) for joint in joints if joint.drive is not None]
+    ctrl = [_add_actuator(actuator, drive, name) for drive, name in sorted(driven, key=lambda pair: pair[0].order)]
+    if is_needed or any(ctrl):
+        key = ET.SubElement(keyframe, "key", name="authored", qpos=floats_text(qpos))
+        if ctrl:
+            key.set("ctrl", floats_text(ctrl))
+
+
+def _authored_qpos(
+    motions: Iterable[tuple[TreeNode, tuple[Matrix, float, float] | None]],
+    frames: Mapping[str, Matrix],
+    kinematic: Mapping[str, bool],
+) -> tuple[list[float], bool]:
+    """Return `qpos` in the authored poses, and whether any joint is not at position zero."""
     qpos: list[float] = []
-    ctrl: list[float] = []
     is_needed = False
-    driven: list[tuple[Drive, str]] = []
     for node, authored in motions:
         joint = node.joint
         if joint is None or authored is None:
@@ -170,14 +185,7 @@ def add_actuators_and_key(
             turn = quaternion(_child_turn(node, joint, authored[0]))
             qpos += [*turn]
             is_needed |= bool(np.abs(turn[1:]).max() > REST_TOLERANCE)
-        if joint.drive is not None:
-            driven.append((joint.drive, names[joint.path]))
-    for drive, name in sorted(driven, key=lambda pair: pair[0].order):
-        ctrl.append(_add_actuator(actuator, drive, name))
-    if is_needed or any(ctrl):
-        key = ET.SubElement(keyframe, "key", name="authored", qpos=floats_text(qpos))
-        if ctrl:
-            key.set("ctrl", floats_text(ctrl))
+    return qpos, is_needed
 
 
 def _child_turn(node: TreeNode, joint: Joint, apart: Matrix) -> Matrix:

@@ -1,4 +1,4 @@
-"""Which bodies of a USD stage must not collide: joints, filtered pairs and collision groups, as pairs of bodies."""
+"""Collision filtering of a USD stage (joints, FilteredPairsAPI, CollisionGroup) as pairs of bodies that must not collide."""
 
 from __future__ import annotations
 

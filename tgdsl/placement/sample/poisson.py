@@ -1,6 +1,6 @@
 """Poisson-disk samples of a link's outer surface, chosen from a dense pool of candidates, each with its Voronoi cell's area.
 
-A point is on the outer surface if it is in no solid part (by winding numbers) and is visible from far away: pockets
+A point is on the outer surface if it is in no solid component (by winding numbers) and is visible from far away: pockets
 may be joined to the outside by a pinhole.
 
 Samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one sphere: 84 to
@@ -131,20 +131,20 @@ def _drawn(
 def _on_outer_surface(
     shell: Shell, region: Region, pos: Float[np.ndarray, "n 3"], face: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points of faces are on the outside of the union of all solid parts.
+    """Return which points of faces are on the outside of the union of all solid components.
 
     Where solids touch back to back neither is outside; where their faces coincide and look the same way, only the first
-    part that belongs to the region keeps its points, lest the place count twice.
+    component that belongs to the region keeps its points, lest the place count twice.
     """
     normal = shell.surface.face_normals[face]
     above, below = pos + shell.offset * normal, pos - shell.offset * normal
-    part = shell.part[face]
+    component = shell.component[face]
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
     for solid in np.flatnonzero(shell.is_solid).tolist():
         is_out &= shell.winding(solid, above) < 0.5
-        if is_geom[shell.surface.face_geom[shell.part == solid]].any():
-            later = np.flatnonzero(is_out & (part > solid))
+        if is_geom[shell.surface.face_geom[shell.component == solid]].any():
+            later = np.flatnonzero(is_out & (component > solid))
             is_out[later] = shell.winding(solid, below[later]) < 0.5
     is_out[is_out] = _visible(shell, above[is_out], normal[is_out])
     return is_out
