@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model
 
 ROBOTS = Path(__file__).parent
 
@@ -15,7 +15,7 @@ ROBOTS = Path(__file__).parent
 def main() -> None:
     """Write the twins."""
     for file in sorted(ROBOTS.glob("*/*.xml")):
-        export_usd(file, file.with_suffix(".usda"))
+        export_model(file, file.with_suffix(".usda"))
 
 
 if __name__ == "__main__":

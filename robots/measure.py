@@ -12,7 +12,8 @@ from pathlib import Path
 import igl
 import numpy as np
 
-from tgdsl.formats.robot import Model, load_model
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema import yaml
 from tgdsl.schema.placement import LayoutSpec, Placement

@@ -63,7 +63,8 @@ class FieldPart(Generic[Array]):
 
 def plan(planning: Planning, uses: Sequence[Use]) -> FieldPart[np.ndarray]:
     """Number the pairs of each use."""
-    return FieldPart(tuple(_planned(planning, use, use.request) for use in uses))
+    asked = [(use, use.request) for use in uses if isinstance(use.request, MagneticField)]
+    return FieldPart(tuple(_planned(planning, use, request) for use, request in asked))
 
 
 def _planned(planning: Planning, use: Use, request: MagneticField) -> FieldUse[np.ndarray]:

@@ -10,7 +10,7 @@ import trimesh
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model
 from tgdsl.runtime.rollout import scripted_controls
 from tgdsl.scene.scene import scene_model
 
@@ -160,7 +160,7 @@ def test_objects_for_a_robot_that_is_no_mjcf(tmp_path, format):
         (tmp_path / "arm.xml").write_text(
             '<mujoco><worldbody><body name="pad"><joint axis="0 0 1"/><geom type="box" size=".05 .05 .01"/></body></worldbody></mujoco>'
         )
-        export_usd(tmp_path / "arm.xml", tmp_path / "arm.usda")
+        export_model(tmp_path / "arm.xml", tmp_path / "arm.usda")
     doc = document(tmp_path, {"ball": {"geom": BALL, "pos": [0, 0, 0.123456789]}})
     doc["robot"]["model"] = str(tmp_path / f"arm.{format}")
     touch = tgdsl.compile(doc, dtype=torch.float64)

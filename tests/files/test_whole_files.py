@@ -18,14 +18,14 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from hand_logs import random_readings, write_log
 from joint_scenes import ALL, joint_module
-from tgdsl.compiler.usd_export import export_usd
+from tgdsl.formats.robot import export_model
 from tgdsl.runtime.rollout import Recorder
 out = Path(sys.argv[1])
 touch = joint_module(out, {"policy": ALL})
 tgdsl.save(touch, out / "a.safetensors")
 Recorder(touch, 1, 1).write(out / "a.npz", np.zeros((1, 4)))
 write_log(out / "log.npz", random_readings(np.arange(3.0)))
-export_usd(out / "scene.xml", out / "a.usda")
+export_model(out / "scene.xml", out / "a.usda")
 (out / "plain").touch()
 """
 WRITTEN = ("a.safetensors", "a.npz", "log.npz", "a.usda")

@@ -12,8 +12,7 @@ import torch
 
 import tgdsl
 from tgdsl.compiler.resolve import resolve
-from tgdsl.formats.robot import load_model
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model, load_model
 from tgdsl.schema.load import load
 from tgdsl.sensors import KINDS
 
@@ -120,7 +119,7 @@ def test_layouts_are_the_same(hand, resolution):
 @pytest.mark.parametrize("hand", HANDS)
 def test_a_squeeze_reads_the_same(hand, tmp_path):
     file, qpos, hold, squeeze = scene(hand, tmp_path)
-    export_usd(file, tmp_path / "scene.usda")
+    export_model(file, tmp_path / "scene.usda")
     first, second = (run(model, hand, qpos, hold, squeeze) for model in (file, tmp_path / "scene.usda"))
     assert (first["depth"][-1] > 0).any(axis=-1).all()  # the cube is felt to the end, in both environments
     for name, values in first.items():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tgdsl.surfaces.rays import View, first_hits
+from tgdsl.surfaces.rays import OrthographicView, first_hits
 from tgdsl.surfaces.surface import Surface
 
 
@@ -13,7 +13,7 @@ def test_rays_agree_with_brute_force_on_a_triangle_soup():
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     axes[2] *= np.linalg.det(axes)
     uv = rng.uniform(-1.5, 1.5, (2000, 2))
-    view = View.of(surface, axes)
+    view = OrthographicView.of(surface, axes)
     hits = first_hits(view, uv)
     origin = uv @ axes[:2] - 10 * axes[2]
     matrix = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], np.tile(-axes[2], (300, 1))], -1)

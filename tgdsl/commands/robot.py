@@ -65,7 +65,8 @@ class Import:
     def run(self) -> None:
         """Write it."""
         from tgdsl.files.files import with_folder, writable
-        from tgdsl.formats.usd.reader import usd_to_mjcf, write_mjcf
+        from tgdsl.formats.mjcf import write_mjcf
+        from tgdsl.formats.usd.reader import usd_to_mjcf
 
         out = writable(self.out or Path(self.stage.with_suffix(".xml").name))
         text = usd_to_mjcf(self.stage)
@@ -85,10 +86,10 @@ class ExportUsd:
     def run(self) -> None:
         """Write it."""
         from tgdsl.files.files import with_folder, writable
-        from tgdsl.formats.usd.export.writer import export_usd
+        from tgdsl.formats.robot import export_model
         from tgdsl.placement.links import robot_path
 
         file = robot_path(self.robot)
         out = writable(self.out or Path(file.with_suffix(".usda").name))
-        export_usd(file, with_folder(out))
+        export_model(file, with_folder(out))
         print(out)

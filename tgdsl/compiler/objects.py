@@ -8,7 +8,7 @@ from dataclasses import replace
 from tgdsl.compiler.sensed import sensed_object
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.errors import did_you_mean
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.plan.scene import SceneObject
 from tgdsl.schema.load import Loaded
 from tgdsl.schema.yaml import Path

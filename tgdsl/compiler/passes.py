@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tgdsl.compiler.lowered import LoweredSensor
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Quantity, Request, Use
 from tgdsl.quantities.pairs import Pair, PairedObject, PairTable
@@ -49,7 +49,7 @@ def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], scene: Model) ->
         for target in dict.fromkeys(name for request in sensor.requests for name in request.objects):
             own = [request for request in sensor.requests if target in request.objects]
             pairs, felt = {Pair(body, target) for body in sensor.layout.bodies}, sensed[target]
-            meeting = {p for p in pairs if scene.can_touch(p.link, felt.touched)}
+            meeting = {p for p in pairs if scene.can_collide_with(p.link, felt.touched)}
             is_gated = any(request.is_gated for request in own)
             if is_gated or any(request.wants_contacts for request in own):
                 touching |= meeting

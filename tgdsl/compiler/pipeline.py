@@ -18,7 +18,7 @@ from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
-from tgdsl.formats.robot import xml_files
+from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Origin, Plan

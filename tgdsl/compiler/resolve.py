@@ -14,7 +14,8 @@ from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection, SpecModel
 from tgdsl.fields.regions import OnGeoms, RegionPart
 from tgdsl.files.files import is_file, robot_names
-from tgdsl.formats.robot import Model, load_model
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.load import Loaded, LoadedLayout
@@ -23,7 +24,7 @@ from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors.base import SensorSpec
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
-from tgdsl.surfaces.region import cut
+from tgdsl.surfaces.region import clip
 from tgdsl.surfaces.sensed import SensedObject
 from tgdsl.surfaces.surface import Surface
 
@@ -72,7 +73,7 @@ class Resolved:
         """
         surface = self.robot.surface(self.patches[link].geoms)
         try:
-            return cut(surface, region) if region else surface
+            return clip(surface, region) if region else surface
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 

@@ -12,7 +12,7 @@ import mujoco
 
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
 from tgdsl.plan.scene import Asset, SceneFile
 from tgdsl.scene.compare import differing

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.inputs import ContactPart
 from tgdsl.schema.objects import NUM_SIZES, ObjectSpec

@@ -12,7 +12,7 @@ import mujoco
 
 from tgdsl.errors import RobotError
 from tgdsl.files.files import is_file
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
 from tgdsl.quantities.geoms.baking import aligned
 from tgdsl.scene.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices

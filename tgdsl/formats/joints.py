@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 
 _JOINT_DRIVES = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _SITE_DRIVES = (int(mujoco.mjtTrn.mjTRN_SITE), int(mujoco.mjtTrn.mjTRN_SLIDERCRANK))
@@ -32,13 +32,13 @@ class Actuator:
 
 @dataclass(frozen=True)
 class RobotJoints:
-    """What can be said of a robot's joints.
+    """A robot's joints and actuators.
 
     Attributes:
-        joints: Names of its hinges and slides: first those that actuators act on, in the order of these, then the others.
+        joints: Names of its hinges and slides: first the actuated ones, in the order of the actuators, then the others.
         num_actuated: How many of them have an actuator.
         slides: Those that are slides.
-        others: Names of its joints that have no single position, ball and free joints.
+        others: Names of its ball and free joints.
         actuators: Its actuators, in the model's order.
     """
 

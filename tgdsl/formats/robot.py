@@ -1,219 +1,35 @@
-"""Robots and scenes in: MJCF, URDF and USD through `mujoco.MjSpec`, geoms as triangles in their body's frame."""
+"""Robots and scenes in and out: which reader or writer a file's ending stands for."""
 
 from __future__ import annotations
 
-import hashlib
-import itertools
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import mujoco
-import numpy as np
-import trimesh
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from tgdsl.errors import RobotError
-from tgdsl.formats.urdf import as_mujoco_text
-from tgdsl.formats.usd.reader import USD_SUFFIXES, usd_to_mjcf
-from tgdsl.scene.scene import muted_mujoco, readable
-from tgdsl.surfaces.geom import Geom
-from tgdsl.surfaces.surface import Surface
+from tgdsl.errors import RobotError, listed
+from tgdsl.formats.mjcf import read_mjcf
+from tgdsl.formats.model import Model
+from tgdsl.formats.urdf import read_urdf
+from tgdsl.formats.usd.export.write import write_usd
+from tgdsl.formats.usd.reader import read_usd
+from tgdsl.scene.scene import muted_mujoco
 
-SHAPE_NAMES: dict[int, str] = {
-    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
-    mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
-    mujoco.mjtGeom.mjGEOM_SDF: "sdf",
+Reader = Callable[[Path], Model]
+"""Reads and compiles a file; `load_model` names the file in what it raises that is MuJoCo's or the system's."""
+Writer = Callable[[Model, Path], None]
+"""Writes a compiled model to a file."""
+
+READERS: Mapping[str, Reader] = {
+    ".urdf": read_urdf,
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """A robot or scene file, compiled.
-
-    Attributes:
-        file: The file it came from.
-        spec: MuJoCo's editable model.
-        compiled: MuJoCo's compiled model.
-        is_urdf: Whether it is URDF.
-        mjcf: The MJCF that it was turned into, if it is URDF or USD; else empty.
-        rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
-    """
-
-    file: Path
-    spec: mujoco.MjSpec
-    compiled: mujoco.MjModel
-    is_urdf: bool
-    mjcf: str = ""
-    rewritten: Mapping[str, Path] = field(default_factory=dict)
-
-    @cached_property
-    def bodies(self) -> tuple[str, ...]:
-        """Names of all named bodies, in MuJoCo's (depth-first) order; the first is `world`."""
-        names = (self.compiled.body(i).name for i in range(self.compiled.nbody))
-        return tuple(name for name in names if name)
-
-    @cached_property
-    def geoms(self) -> tuple[Geom, ...]:
-        """All geoms of named bodies."""
-        found = (self._geom(i) for i in range(self.compiled.ngeom))
-        return tuple(geom for geom in found if geom.body)
-
-    def _geom(self, i: int) -> Geom:
-        model = self.compiled
-        shape = SHAPE_NAMES.get(int(model.geom_type[i]), "unknown")
-        return Geom(
-            id=i,
-            name=model.geom(i).name,
-            mesh=model.mesh(model.geom_dataid[i]).name if shape in ("mesh", "sdf") else "",
-            body=model.body(model.geom_bodyid[i]).name,
-            shape=shape,
-            size=model.geom_size[i].copy(),
-            pos=model.geom_pos[i].copy(),
-            rotation=_matrix(model.geom_quat[i]),
-            is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i] or i in self._paired),
-        )
-
-    @cached_property
-    def _paired(self) -> frozenset[int]:
-        """Geoms of explicit contact pairs."""
-        return frozenset((*self.compiled.pair_geom1.tolist(), *self.compiled.pair_geom2.tolist()))
-
-    def touchable(self, body: str) -> tuple[Geom, ...]:
-        """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
-        own = tuple(geom for geom in self.geoms if geom.body == body)
-        return tuple(geom for geom in own if geom.is_colliding) or own
-
-    def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
-        """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
-
-        What is fixed to the world is no part of it.
-
-        Args:
-            body: Name of the body.
-            others: Names of bodies that are none of its parts.
-        """
-        model = self.compiled
-        found = [int(model.body(body).id)]
-        for i in range(found[0] + 1, model.nbody if found[0] else 0):
-            if model.body_parentid[i] in found and not model.body_jntnum[i] and model.body(i).name not in others:
-                found.append(i)
-        return tuple(found)
-
-    def rigid_geoms(self, bodies: Sequence[int]) -> tuple[Geom, ...]:
-        """Return the geoms of bodies that are one rigid body, see `rigid_bodies`, in the first one's frame."""
-        model = self.compiled
-        placed = {bodies[0]: (np.zeros(3), np.eye(3))}
-        for i in bodies[1:]:
-            pos, rotation = placed[int(model.body_parentid[i])]
-            placed[i] = pos + rotation @ model.body_pos[i], rotation @ _matrix(model.body_quat[i])
-        found = []
-        for i in np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist():
-            geom, body = self._geom(i), int(model.geom_bodyid[i])
-            if body != bodies[0]:
-                pos, rotation = placed[body]
-                geom = replace(geom, pos=pos + rotation @ geom.pos, rotation=rotation @ geom.rotation)
-            found.append(geom)
-        return tuple(found)
-
-    def can_meet(self, first: str, second: str) -> bool:
-        """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
-        return self.can_touch(first, [geom.id for geom in self.touchable(second)])
-
-    def can_touch(self, body: str, geoms: Iterable[int]) -> bool:
-        """Return whether MuJoCo can ever report a contact between a body's geoms and some others, by their indices."""
-        model = self.compiled
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
-            return False
-        pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-        for a, b in itertools.product([geom.id for geom in self.touchable(body)], geoms):
-            if frozenset((a, b)) in pairs:
-                return True
-            one, two = sorted(int(model.geom_bodyid[i]) for i in (a, b))
-            masks = model.geom_contype[a] & model.geom_conaffinity[b]
-            masks |= model.geom_contype[b] & model.geom_conaffinity[a]
-            if masks and (one << 16) + two not in model.exclude_signature and not self._welded(one, two):
-                return True
-        return False
-
-    def _welded(self, one: int, two: int) -> bool:
-        """MuJoCo collides no two geoms of one rigid cluster, nor of what cannot move, nor (by default) of parent and child."""
-        model = self.compiled
-        one, two = model.body_weldid[one], model.body_weldid[two]
-        if one == two or not (model.body_dofnum[one] or model.body_dofnum[two]):
-            return True
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT or not one or not two:
-            return False
-        parent_one, parent_two = (model.body_weldid[model.body_parentid[i]] for i in (one, two))
-        return bool(one == parent_two or two == parent_one)
-
-    def surface(self, geoms: tuple[Geom, ...]) -> Surface:
-        """Return the triangles of some geoms of one body, in that body's frame.
-
-        Raises:
-            RobotError: If a geom has no bounded surface.
-        """
-        return Surface.joined([self._triangles(geom) for geom in geoms])
-
-    def mesh(self, geom: Geom) -> Surface:
-        """Return the triangles of a mesh geom, in the geom's own frame."""
-        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
-        first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
-        vertices = model.mesh_vert[first : first + count].astype(np.float64)
-        first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
-        faces = model.mesh_face[first : first + count].astype(np.int64)
-        return Surface(vertices, faces, np.zeros(count, dtype=np.int64), (geom.names,))
-
-    def hull(self, geom: Geom) -> Surface:
-        """Return the convex hull that MuJoCo collides of a mesh geom, in the geom's own frame; the mesh if it has none."""
-        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
-        first = int(model.mesh_graphadr[mesh])
-        surface = self.mesh(geom)
-        if first < 0:
-            return surface
-        count = int(model.mesh_graph[first])  # a graph starts with its number of vertices, of faces, then two tables of these
-        ids = model.mesh_graph[first + 2 + count : first + 2 + 2 * count]
-        hull = trimesh.convex.convex_hull(surface.vertices[ids])
-        faces = np.asarray(hull.faces, dtype=np.int64)
-        return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
-
-    def _triangles(self, geom: Geom) -> Surface:
-        if geom.shape == "mesh":
-            own = self.mesh(geom)
-            vertices, faces = own.vertices, own.faces
-        else:
-            vertices, faces = self._tessellated(geom)
-        vertices = vertices @ geom.rotation.T + geom.pos
-        return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
-
-    def _tessellated(self, geom: Geom) -> tuple[np.ndarray, np.ndarray]:
-        if geom.shape == "box":
-            mesh = trimesh.creation.box(2 * geom.size)
-        elif geom.shape == "sphere":
-            mesh = trimesh.creation.icosphere(subdivisions=4, radius=geom.size[0])
-        elif geom.shape == "ellipsoid":
-            mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(geom.size)
-        elif geom.shape == "cylinder":
-            mesh = trimesh.creation.cylinder(geom.size[0], 2 * geom.size[1], sections=96)
-        elif geom.shape == "capsule":
-            mesh = trimesh.creation.capsule(2 * geom.size[1], geom.size[0], count=[64, 64])
-            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
-        else:
-            raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
-        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-
-
-def _matrix(quat: Float[np.ndarray, 4]) -> Float[np.ndarray, "3 3"]:
-    return Rotation.from_quat(quat, scalar_first=True).as_matrix()
+"""By a file's ending, in lower case; any other file is XML, whose root element tells."""
+ROOTS: Mapping[str, Reader] = {"robot": read_urdf}
+"""By the root element of XML; any other is MJCF's."""
+WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), write_usd)
+"""By a file's ending."""
 
 
 def load_model(path: Path) -> Model:
@@ -224,60 +40,35 @@ def load_model(path: Path) -> Model:
     """
     try:
         with muted_mujoco():
-            if path.suffix.lower() in USD_SUFFIXES:
-                text = usd_to_mjcf(path)
-                spec = mujoco.MjSpec.from_string(text)
-                return Model(path, spec, spec.compile(), False, text)
-            is_urdf = _is_urdf(path)
-            text, files = as_mujoco_text(path) if is_urdf else ("", {})
-            spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(path))
-            for mesh in spec.meshes if is_urdf else ():
-                mesh.file = str(files[Path(mesh.file).stem])
-            rewritten = _rewrite_meshes(spec)
-            compiled = spec.compile()
-            return Model(path, spec, compiled, is_urdf, spec.to_xml() if is_urdf else "", rewritten)
+            reader = READERS.get(path.suffix.lower()) or ROOTS.get(_root_element(path), read_mjcf)
+            return reader(path)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: {' '.join(str(error).split())}") from error
 
 
-def _rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
-    """Rewrite in memory those of a model's own mesh files that MuJoCo cannot read; return the files by their new names."""
-    files = {}
-    for mesh in spec.meshes:
-        file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
-        if file.is_file() and (content := readable(mesh.file, original := file.read_bytes())) is not original:
-            key = f"{hashlib.sha256(content).hexdigest()}.stl"  # MuJoCo knows files in memory by their names, without folders
-            spec.assets[key], files[key] = content, file
-            mesh.name, mesh.file = mesh.name or file.stem, key
-    return files
+def export_model(model_file: Path, out: Path) -> None:
+    """Write a robot or scene file in another format; the same input gives the same bytes.
+
+    Warns of each thing of the model that the format does not hold, after the file is written.
+
+    Args:
+        model_file: An MJCF or URDF file.
+        out: The file to write; its ending says in which format. A USD stage is text as `.usda`, binary as `.usdc` and `.usd`.
+
+    Raises:
+        RobotError: If the model cannot be read, the format cannot express it, or the file cannot be written.
+    """
+    if out.suffix not in WRITERS:
+        raise RobotError(f"{out}: USD files end in {listed(tuple(WRITERS))}")
+    WRITERS[out.suffix](load_model(model_file), out)
 
 
-def _is_urdf(path: Path) -> bool:
-    if path.suffix.lower() == ".urdf":
-        return True
+def _root_element(path: Path) -> str:
+    """Return the name of an XML file's root element, or nothing if it is not XML."""
     try:
         with path.open("rb") as file:  # what is left half read must not stay open
             for _, element in ET.iterparse(file, events=("start",)):
-                return element.tag == "robot"
+                return element.tag
     except (ET.ParseError, OSError):
-        return False
-    return False
-
-
-def xml_files(path: Path) -> Iterator[Path]:
-    """Yield a model file and all the files that it includes or attaches, each once."""
-    seen: list[Path] = []
-    waiting = [path.resolve()]
-    while waiting:
-        current = waiting.pop(0)
-        if current in seen or not current.is_file():
-            continue
-        seen.append(current)
-        yield current
-        try:
-            root = ET.parse(current).getroot()
-        except ET.ParseError:
-            continue
-        for element in root.iter():
-            if element.tag in ("include", "model") and element.get("file"):
-                waiting.append((current.parent / element.get("file", "")).resolve())
+        return ""
+    return ""

@@ -1,4 +1,4 @@
-"""URDF made fit for MuJoCo: paths found, fixed links kept, broken inertias mended and named in a warning."""
+"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning."""
 
 from __future__ import annotations
 
@@ -6,12 +6,31 @@ import warnings
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError, listed
+from tgdsl.formats.mjcf import rewrite_meshes
+from tgdsl.formats.model import Model
 
 LEAST_INERTIA = 1e-9
-"""Principal moment given to a link whose inertia is not one of any real body [kg·m²]."""
+"""Least principal moment of a link whose inertia was not physical [kg·m²]."""
+
+
+def read_urdf(path: Path) -> Model:
+    """Read and compile a URDF file.
+
+    Raises:
+        RobotError: If the file is not XML, or a mesh cannot be found.
+        ValueError: If MuJoCo cannot read or compile it.
+    """
+    text, files = as_mujoco_text(path)
+    spec = mujoco.MjSpec.from_string(text)
+    for mesh in spec.meshes:
+        mesh.file = str(files[Path(mesh.file).stem])
+    rewritten = rewrite_meshes(spec)
+    compiled = spec.compile()
+    return Model(path, spec, compiled, is_urdf=True, mjcf=spec.to_xml(), rewritten=rewritten)
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
@@ -38,7 +57,7 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
         mesh.set("filename", f"{stem}{file.suffix}")
     mended = [link.get("name", "") for link in robot.iter("link") if _mend(link)]
     if mended:
-        warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=4)
+        warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=5)
     settings = robot.find("mujoco")
     settings = ET.SubElement(robot, "mujoco") if settings is None else settings
     compiler = settings.find("compiler")

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from tgdsl.errors import TgdslError
 from tgdsl.plan.sensors import PlannedSensor
-from tgdsl.sensors.base import Context
+from tgdsl.sensors.base import UNTIMED, Context
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
 
@@ -145,7 +145,7 @@ class Clock(nn.Module):
             substep: Which of its substeps it is.
         """
         if not sensor.is_timed:
-            return Context()
+            return UNTIMED
         assert dt is not None
         count = max(sensor.substeps, 1)
         age, own = memory["clock/age"][:, None], dt / count

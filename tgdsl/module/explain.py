@@ -90,27 +90,27 @@ def explain(touch: Explained) -> str:
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
-    lines += [line for quantity in touch.quantities for line in _account(touch, quantity)]
+    lines += [line for asked in touch.quantities for line in _account(touch, asked)]
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     return "\n".join(lines + _costs(touch))
 
 
-def _account(touch: Explained, quantity: Quantity) -> list[str]:
+def _account(touch: Explained, asked: Quantity) -> list[str]:
     """Return what was measured of what a quantity computes beforehand."""
-    found = quantity.account(touch.plan.quantities[quantity.name], touch.plan.objects)
+    found = asked.account(touch.plan.quantities[asked.name], touch.plan.objects)
     return [line for headline, lines in found.items() for line in ["", headline, *(f"  {own}" for own in lines)]]
 
 
 def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
     """Return what a sensor asks of the scene; what is asked alike is found once."""
     lines = []
-    for quantity in (quantity for quantity in touch.quantities if quantity.name in sensor.uses):
-        use = sensor.uses[quantity.name]
-        others = [o.name for o in touch.plan.sensors if o is not sensor and o.uses.get(quantity.name) == use]
+    for asked in (own for own in touch.quantities if own.name in sensor.uses):
+        use = sensor.uses[asked.name]
+        others = [o.name for o in touch.plan.sensors if o is not sensor and o.uses.get(asked.name) == use]
         shared = f" (found once for {', '.join(others)} too)" if others else ""
-        said = quantity.explain(touch.plan.quantities[quantity.name], use, touch.plan.objects)
+        said = asked.explain(touch.plan.quantities[asked.name], use, touch.plan.objects)
         lines += [f"asks for {line}{shared}" for line in said]
     return lines
 

@@ -19,7 +19,7 @@ from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
 from tgdsl.tensors.fusion import stored
 
 WINDOW, KEPT = "history/", "kept/"
-"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>` (env, …, channel, row), the last one."""
+"""Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>`, the last one."""
 
 
 class Memory(nn.Module):

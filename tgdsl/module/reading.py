@@ -15,7 +15,7 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Constants, Context
+from tgdsl.sensors.base import UNTIMED, Constants, Context
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.tensors.fusion import stored
@@ -39,7 +39,7 @@ def joined_signal(
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
         rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
         of_taxels = dict(zip(names, stored(torch.stack(rows)).unbind(), strict=True))
-    found, _ = kind.forward(gathered, Context(), of_taxels, {})
+    found, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
     return _stacked(found, "signal", sensors[0].signal)
 
 

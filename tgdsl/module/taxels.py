@@ -46,7 +46,7 @@ def taxel_table(layout: Layout) -> TaxelTable:
 
 
 def row_tables(plan: Plan) -> dict[str, TaxelTable]:
-    """Return what the rows of each reading of a sensor are: of taxels `taxel_table`, else the columns that its kind declares."""
+    """Return what the rows of each reading of a sensor are: of taxels `taxel_table`, else what its kind declares."""
     found = {}
     for sensor in plan.sensors:
         for reading, axis in zip(sensor.readings, sensor.axes, strict=True):

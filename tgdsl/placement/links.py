@@ -10,7 +10,8 @@ import numpy as np
 
 from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
 from tgdsl.files.files import layout_file, robot_file, robot_names
-from tgdsl.formats.robot import SHAPE_NAMES, Model, load_model
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
 from tgdsl.schema.load import LoadedLayout, load_layout
 from tgdsl.schema.select import select
 
@@ -74,7 +75,7 @@ def links_table(robot: Model, layout: Path | None = None) -> list[str]:
         cells = (
             ("  " * depth[body] + name,),
             _joints(model, body) or ("-" if body else "",),
-            _geoms(model, body) or ("-",),
+            _geoms(robot, body) or ("-",),
             (_area(robot, body),),
             (f"{1e3 * model.body_mass[body]:.1f}" if body else "",),
             (", ".join(groups.get(name, ())),),
@@ -116,17 +117,12 @@ def _range(model: mujoco.MjModel, joint: int, kind: str) -> str:
     return f"up to {high:.4g} {unit}" if kind == "ball" else f"{low:.4g} to {high:.4g} {unit}"
 
 
-def _geoms(model: mujoco.MjModel, body: int) -> tuple[str, ...]:
+def _geoms(robot: Model, body: int) -> tuple[str, ...]:
     found = []
-    paired = {*model.pair_geom1.tolist(), *model.pair_geom2.tolist()}
-    first = int(model.body_geomadr[body])
-    for geom in range(first, first + int(model.body_geomnum[body])):
-        shape = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown")
-        mesh = model.mesh(model.geom_dataid[geom]).name if shape in ("mesh", "sdf") else ""
-        kind = f"{shape} {mesh}" if mesh else shape
-        name = model.geom(geom).name
-        is_colliding = model.geom_contype[geom] or model.geom_conaffinity[geom] or geom in paired
-        found.append(f"{name + ': ' if name else ''}{kind}, {'colliding' if is_colliding else 'visual'}")
+    first = int(robot.compiled.body_geomadr[body])
+    for geom in map(robot.geom, range(first, first + int(robot.compiled.body_geomnum[body]))):
+        kind = f"{geom.shape} {geom.mesh}" if geom.mesh else geom.shape
+        found.append(f"{geom.name + ': ' if geom.name else ''}{kind}, {'colliding' if geom.is_colliding else 'visual'}")
     return tuple(found)
 
 

@@ -34,7 +34,7 @@ class Inputs:
         joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
         actuators: Actuators of the field `last_action`.
         contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
-        substeps: Physics steps of a call that some sensor is advanced at, each with a state of its own: see `SceneState.substeps`.
+        substeps: Physics steps of a call at each of which some sensor is advanced: see `SceneState.substeps`.
     """
 
     fields: tuple[str, ...]

@@ -52,7 +52,7 @@ class Plan:
         layout: The taxels of all sensors.
         objects: What taxels feel.
         pairs: The (link, object) pairs that may meet, in the order of the objects.
-        quantities: What sensors ask of the scene: each quantity's own part, by its name, in the order in which they are gathered.
+        quantities: What sensors ask of the scene: each quantity's own part, by its name, in their order.
         sensors: Sensors, in the document's order.
         proprioception: Readings of joints and actuators, which are fields of the state, handed out by the same names.
         observations: Observation terms, in the document's order.

@@ -137,7 +137,7 @@ class PlannedSensor(Generic[Array]):
 
     @property
     def wants_clock(self) -> bool:
-        """Whether it wants to know when a reading is made: for chance, for what its noise remembers, for its rate or its kind."""
+        """Whether it wants to know when a reading is made: for chance, noise with memory, its rate or its kind."""
         return self.is_timed or bool(self.noise and self.noise.streams) or any("/" in name for name in self.state)
 
     @property

@@ -1,7 +1,7 @@
 """What a sensor kind is: a spec, an equation, and how it is lowered and computed.
 
 A kind is one file that holds, in this order: what it measures, its spec, `reference` (the definition, float64), `lower`
-(constants, state and requests, no physics), `forward` (batched, in component planes), and last a `Kind` that ties them together.
+(constants, state, requests; no physics), `forward` (batched, in component planes), and last a `Kind` that ties them together.
 
 Shapes: `env` environments, `taxel` taxels of one sensor, `body` bodies that carry it, `row` rows of a reading.
 """
@@ -190,7 +190,7 @@ class Lowered:
 
 
 class Context(NamedTuple):
-    """When a kind is called. Only a kind that `is_timed` is told; to others all of it is None.
+    """When a kind is called. Only a kind that `is_timed` may look: to others it is `UNTIMED`, which holds nothing.
 
     Attributes:
         dt: Time since the last call, or the last substep [s], a scalar.
@@ -200,11 +200,15 @@ class Context(NamedTuple):
         is_first: Whether it is the first call after each environment's reset, (env, 1).
     """
 
-    dt: Tensor | None = None
-    step: Tensor | None = None
-    substep: int = 0
-    time: Tensor | None = None
-    is_first: Tensor | None = None
+    dt: Tensor
+    step: Tensor
+    substep: int
+    time: Tensor
+    is_first: Tensor
+
+
+UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]
+"""What a kind gets that does not want to know the time."""
 
 
 class ReferenceContext(NamedTuple):
@@ -234,11 +238,11 @@ class Kind:
         spec: Its pydantic model; `kind` is a `Literal` with the kind's name.
         lower: `(spec, layout, surface_of) → Lowered`; the layout holds the sensor's own taxels, or no taxels and its links. May
             raise `LowerError`.
-        forward: `(gathered, context, constants, state) → (planes by channel name, new state)`: planes (env, row), at least those
-            of the channels; pure, traceable; the new state is like the old. Where all channels are one tensor (env, channel, row)
-            already it stands for them, as "signal", or of a report as "<report>/signal".
-        reference: `(spec, layout, gathered, context, state) → (reading (row, channel), new state)` for one environment, in NumPy:
-            what was asked for is what the quantities' references return; of a block it is called once per sample.
+        forward: `(gathered, context, constants, state) → (planes by channel name, new state)`: planes (env, row), at least
+            those of the channels; pure, traceable; the new state is like the old. Where all channels are one tensor
+            (env, channel, row) already it stands for them, as "signal", or of a report as "<report>/signal".
+        reference: `(spec, layout, gathered, context, state) → (reading (row, channel), new state)` for one environment, in
+            NumPy: what was asked for is what the quantities' references return; of a block it is called once per substep.
         decide: `(planes, constants, state) → (planes, new state)`, if the reading is made of the signal by a threshold: what
             `forward` returns is then the signal, which noise disturbs first.
         knobs: Names of the noise knobs that it has.

@@ -1,10 +1,10 @@
-"""A link's outer surface: its meshes cleaned, and the parts that lie inside others dropped.
+"""A link's outer surface: its meshes cleaned, and the components that lie inside others dropped.
 
-Real meshes hold screws and magnets as parts of their own, and disagree with themselves about what is outside.
+Real meshes hold screws and magnets as components of their own, and disagree with themselves about what is outside.
 
 The only file that imports pymeshlab (GPL-3), and only when a surface is cleaned: compiled modules run without it.
 
-Shapes: `f` faces, `edge` three per face, `part` connected parts of the mesh, `n` points. Everything is in the body
+Shapes: `f` faces, `edge` three per face, `component` connected components of the mesh, `n` points. Everything is in the body
 frame.
 """
 
@@ -24,40 +24,40 @@ from tgdsl.surfaces.region import LENGTH_TOLERANCE
 from tgdsl.surfaces.surface import Surface
 
 MAX_HOLE = 0.05
-"""A part is solid, so that points can be inside it, if the squared length of its border is at most this share of its
+"""A component is solid, so that points can be inside it, if the squared length of its border is at most this share of its
 area: a sphere with a hole of an eighth of its radius is, a bowl is not."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """A clean surface whose enclosed parts are gone.
+    """A clean surface whose enclosed components are gone.
 
     Attributes:
-        surface: Its triangles; solid parts are counter-clockwise seen from outside.
-        part: Connected part of each face.
-        is_solid: Which parts enclose a volume.
+        surface: Its triangles; solid components are counter-clockwise seen from outside.
+        component: Connected component of each face.
+        is_solid: Which components enclose a volume.
     """
 
     surface: Surface
-    part: Int[np.ndarray, " f"]
-    is_solid: Bool[np.ndarray, " part"]
+    component: Int[np.ndarray, " f"]
+    is_solid: Bool[np.ndarray, " component"]
 
     @cached_property
     def offset(self) -> float:
         """Distance to either side of a face at which points are tested for being inside [m]."""
         return max(1e-6 * float(np.ptp(self.surface.corners.reshape(-1, 3), axis=0).max()), LENGTH_TOLERANCE)
 
-    def solid(self, part: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-        """Return vertices and faces of one part."""
-        used, faces = np.unique(self.surface.faces[self.part == part], return_inverse=True)
+    def solid(self, component: int) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+        """Return vertices and faces of one component."""
+        used, faces = np.unique(self.surface.faces[self.component == component], return_inverse=True)
         return self.surface.vertices[used], faces.reshape(-1, 3).astype(np.int64)
 
-    def winding(self, part: int, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Return how often a part winds around points: 1 inside, 0 outside, 1/2 on a flat piece of it."""
+    def winding(self, component: int, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return how often a component winds around points: 1 inside, 0 outside, 1/2 on a flat piece of it."""
         import igl
 
         winding = np.zeros(len(pos))
-        vertices, faces = self.solid(part)
+        vertices, faces = self.solid(component)
         near = ((pos >= vertices.min(axis=0) - self.offset) & (pos <= vertices.max(axis=0) + self.offset)).all(axis=1)
         if near.any():
             winding[near] = np.atleast_1d(igl.winding_number(vertices, faces, pos[near]))
@@ -65,9 +65,9 @@ class Shell:
 
 
 def outer_shell(surface: Surface) -> Shell:
-    """Return the cleaned surface without the parts that lie wholly inside another.
+    """Return the cleaned surface without the components that lie wholly inside another.
 
-    Closed parts that are inside out are turned, so that all face outward.
+    Closed components that are inside out are turned, so that all face outward.
 
     Args:
         surface: The link's triangles, in the body frame.
@@ -76,15 +76,15 @@ def outer_shell(surface: Surface) -> Shell:
         ImportError: If pymeshlab is not installed.
     """
     clean = _clean(surface)
-    part = _parts(clean)
-    is_solid = _solid(clean, part)
-    volume = np.bincount(part, _signed_volumes(clean, part), minlength=len(is_solid))
-    is_turned = (is_solid & (volume < 0))[part]
+    component = _components(clean)
+    is_solid = _solid(clean, component)
+    volume = np.bincount(component, _signed_volumes(clean, component), minlength=len(is_solid))
+    is_turned = (is_solid & (volume < 0))[component]
     faces = np.where(is_turned[:, None], clean.faces[:, ::-1], clean.faces)
-    shell = Shell(Surface(clean.vertices, faces, clean.face_geom, clean.geoms), part, is_solid)
-    is_kept = ~_enclosed(shell)[part]
-    kept, part = np.unique(part[is_kept], return_inverse=True)
-    return Shell(shell.surface.keep(is_kept), part, is_solid[kept])
+    shell = Shell(Surface(clean.vertices, faces, clean.face_geom, clean.geoms), component, is_solid)
+    is_kept = ~_enclosed(shell)[component]
+    kept, component = np.unique(component[is_kept], return_inverse=True)
+    return Shell(shell.surface.keep(is_kept), component, is_solid[kept])
 
 
 def _clean(surface: Surface) -> Surface:
@@ -129,46 +129,46 @@ def _disagrees(faces: Int[np.ndarray, "f 3"]) -> bool:
     return bool(((num_faces == 2) & (sense != 0)).any())
 
 
-def _parts(surface: Surface) -> Int[np.ndarray, " f"]:
-    """Return the connected part of each face, numbered in the order of the faces."""
+def _components(surface: Surface) -> Int[np.ndarray, " f"]:
+    """Return the connected component of each face, numbered in the order of the faces."""
     start, end = _edges(surface.faces).T
     size = len(surface.vertices)
     _, label = connected_components(coo_array((np.ones(len(start), bool), (start, end)), (size, size)), directed=False)
     label = label[surface.faces[:, 0]]
-    _, first, part = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[part]
+    _, first, component = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[component]
 
 
-def _solid(surface: Surface, part: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " part"]:
-    """Return which parts are closed but for small holes."""
+def _solid(surface: Surface, component: Int[np.ndarray, " f"]) -> Bool[np.ndarray, " component"]:
+    """Return which components are closed but for small holes."""
     edges = np.sort(_edges(surface.faces), axis=1)
     _, first, num_faces = np.unique(edges, axis=0, return_index=True, return_counts=True)
     border = first[num_faces == 1]
     length = np.linalg.norm(np.diff(surface.vertices[edges[border]], axis=1)[:, 0], axis=1)
-    num = part.max(initial=-1) + 1
-    perimeter = np.bincount(part[border // 3], length, minlength=num)
-    return perimeter**2 <= MAX_HOLE * np.bincount(part, surface.face_areas, minlength=num)
+    num = component.max(initial=-1) + 1
+    perimeter = np.bincount(component[border // 3], length, minlength=num)
+    return perimeter**2 <= MAX_HOLE * np.bincount(component, surface.face_areas, minlength=num)
 
 
-def _signed_volumes(surface: Surface, part: Int[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-    """Return the volume between each face and its part's first corner; negative if the face looks toward it [m³]."""
-    _, first = np.unique(part, return_index=True)
-    corners = surface.corners - surface.corners[first, :1][part]
+def _signed_volumes(surface: Surface, component: Int[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """Return the volume between each face and its component's first corner; negative if the face looks toward it [m³]."""
+    _, first = np.unique(component, return_index=True)
+    corners = surface.corners - surface.corners[first, :1][component]
     return np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
 
 
-def _enclosed(shell: Shell) -> Bool[np.ndarray, " part"]:
-    """Return which parts lie wholly inside some solid part."""
+def _enclosed(shell: Shell) -> Bool[np.ndarray, " component"]:
+    """Return which components lie wholly inside some solid component."""
     num = len(shell.is_solid)
     owner = np.full(len(shell.surface.vertices), -1)
-    owner[shell.surface.faces] = shell.part[:, None]
+    owner[shell.surface.faces] = shell.component[:, None]
     vertices, owner = shell.surface.vertices[owner >= 0], owner[owner >= 0]
     is_enclosed = np.zeros(num, dtype=bool)
-    for part in np.flatnonzero(shell.is_solid).tolist():
-        other = owner != part
+    for component in np.flatnonzero(shell.is_solid).tolist():
+        other = owner != component
         # Not 1/2: a vertex on the other's surface, even in a notch of it, shall not count.
-        is_out = shell.winding(part, vertices[other]) < 0.9
+        is_out = shell.winding(component, vertices[other]) < 0.9
         is_inside = np.bincount(owner[other][is_out], minlength=num) == 0
-        is_inside[part] = False
+        is_inside[component] = False
         is_enclosed |= is_inside
     return is_enclosed

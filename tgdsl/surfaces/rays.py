@@ -1,9 +1,12 @@
-"""Parallel rays onto a surface: what they hit first, and the rectangle in which they can hit a region at all.
+"""Orthographic ray casting: first hits of parallel rays on a surface, and the rectangle in which they can hit a region.
 
 Rays travel along one direction and start outside, so the first hit is on the outer surface by construction: inner
 shells and overlapping geoms need no cleaning. All rays being parallel, casting is drawing triangles: everything is
 expressed as (u, v, t) with u along the columns, v along the rows and t along the rays, a right-handed frame, and a ray
 is a point in the (u, v) plane.
+
+Not libigl's or trimesh's: of 2,015,232 rays along the axes onto the links of two hands `igl.AABB.intersect_ray_first` misses
+124,159 and goes through the nearest face of others, Embree is float32 and asked ray by ray, and trimesh needs rtree.
 
 Shapes: `f` faces that are not seen edge-on, `ray` rays, `pair` (face, ray) pairs whose bounding boxes meet.
 """
@@ -31,8 +34,8 @@ _PAIRS = 1_000_000  # (face, ray) pairs tested at a time, to bound memory
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """A surface seen along a direction.
+class OrthographicView:
+    """A surface in orthographic projection along a direction.
 
     Attributes:
         axes: Rows are the unit vectors of u, v and t in the body frame, right-handed; rays travel along +t.
@@ -51,7 +54,7 @@ class View:
     rounding: float
 
     @staticmethod
-    def of(surface: Surface, axes: Float[np.ndarray, "3 3"]) -> View:
+    def of(surface: Surface, axes: Float[np.ndarray, "3 3"]) -> OrthographicView:
         """Return the view of a surface along `axes[2]`, without faces that are edge-on or have no area."""
         cosine = surface.face_normals @ axes[2]
         face_id = np.flatnonzero(np.abs(cosine) > EDGE_ON)
@@ -61,7 +64,7 @@ class View:
         corners = np.where(is_front[:, None, None], corners[:, ::-1], corners)
         normals = np.where(is_front[:, None], 1.0, -1.0) * surface.face_normals[face_id] + 0.0  # no −0
         extent = float(np.abs(corners).max(initial=0.0))
-        return View(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
+        return OrthographicView(axes, face_id, corners, normals, surface.face_geom[face_id], ROUNDING * extent)
 
 
 def reference_axes(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -96,7 +99,7 @@ class Hits:
     depth: Float[np.ndarray, " ray"]
 
 
-def first_hits(view: View, uv: Float[np.ndarray, "ray 2"]) -> Hits:
+def first_hits(view: OrthographicView, uv: Float[np.ndarray, "ray 2"]) -> Hits:
     """Return what each ray hits first.
 
     Where several faces are hit at the same depth (a shared edge), the one that faces the ray most squarely counts, then
@@ -122,7 +125,7 @@ def first_hits(view: View, uv: Float[np.ndarray, "ray 2"]) -> Hits:
 
 
 def _hits(
-    view: View, uv: Float[np.ndarray, "ray 2"], face: Int[np.ndarray, " pair"], ray: Int[np.ndarray, " pair"]
+    view: OrthographicView, uv: Float[np.ndarray, "ray 2"], face: Int[np.ndarray, " pair"], ray: Int[np.ndarray, " pair"]
 ) -> tuple[Int[np.ndarray, " hit"], Int[np.ndarray, " hit"], Float[np.ndarray, " hit"]]:
     """Return face, ray and depth of the pairs that meet."""
     u, v = uv[ray].T
@@ -141,7 +144,9 @@ def _hits(
     return face, ray, np.clip(t, corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1))
 
 
-def _pairs(view: View, uv: Float[np.ndarray, "ray 2"]) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
+def _pairs(
+    view: OrthographicView, uv: Float[np.ndarray, "ray 2"]
+) -> Iterator[tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]]:
     """Yield (face, ray) pairs whose bounding boxes meet, in chunks; rays are sorted into coarse squares."""
     if not len(uv):
         return
@@ -185,7 +190,7 @@ def _runs(sorted_ids: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " run"], I
     return np.concatenate([[0], cuts]), np.concatenate([cuts, [len(sorted_ids)]])
 
 
-def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
+def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
     """Return the bounding rectangle, in (u, v), of all first hits in the region; None if there is no such hit.
 
     Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
@@ -216,7 +221,7 @@ def seen_rectangle(view: View, region: Region) -> tuple[Float[np.ndarray, " 2"],
 
 
 def _raster_hits(
-    view: View, region: Region, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
+    view: OrthographicView, region: Region, low: Float[np.ndarray, " 2"], high: Float[np.ndarray, " 2"]
 ) -> Float[np.ndarray, "hit 2"]:
     """Return the rays of a fine raster over a rectangle whose first hit is in the region."""
     size = np.maximum(high - low, view.rounding)

@@ -173,8 +173,8 @@ def _disc(
     return np.where(is_on[..., None], points, np.nan)
 
 
-def cut(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
-    """Return the part of a surface that is in a region: whole faces, and what boxes leave of others.
+def clip(surface: Surface, parts: Sequence[RegionPart]) -> Surface:
+    """Return a surface clipped to a region: whole faces, and what boxes leave of others.
 
     Raises:
         SampleError: If the region holds nothing of the surface, or is a sphere: a box has straight edges to cut along.

@@ -1,4 +1,7 @@
-"""Triangle surfaces as solids: signed distance to the outer surface, lids for what is open, sharp edges.
+"""Triangle surfaces as solids: signed distance to the outer surface, closed boundary loops, sharp edges.
+
+Distances and winding numbers are libigl's. `igl.signed_distance` takes as long (2.8 s for 860,000 points, signs the same), but
+builds its trees anew at each call, ignores holes, and measures to faces inside other components too.
 
 Shapes: `n` points, `v` vertices, `f` and `g` faces, `x`, `y`, `z` nodes along the axes.
 """
@@ -19,15 +22,15 @@ from tgdsl.surfaces.surface import Surface
 
 SHARP = np.deg2rad(30.0)
 """Angle between the normals of two faces from which their edge is sharp [rad]."""
-PARTS = 64
-"""Parts that do not hang together, up to which those inside others are looked for."""
+MAX_COMPONENTS = 64
+"""Largest number of connected components of which those inside others are looked for."""
 CHUNK = 1 << 18
 """Points that are asked for at once."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Places of the nodes: the solid's box, the margin, and one cell more for the stencil."""
+    """A regular grid of nodes around a solid: its bounding box, a margin, and one cell more for the stencil."""
 
     origin: Float[np.ndarray, " 3"]
     cell: float
@@ -52,7 +55,7 @@ class Lattice:
         return 4 * self.num_nodes
 
     def pos(self, nodes: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        """Return the places of nodes, given as flat indices [m]."""
+        """Return the positions of nodes, given as flat indices [m]."""
         return self.origin + self.cell * np.stack(np.unravel_index(nodes, self.shape), axis=1)
 
     def nodes_around(self, pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " m"]:
@@ -74,14 +77,14 @@ class Solid:
         vertices, same = np.unique(np.asarray(surface.vertices, float) + 0.0, axis=0, return_inverse=True)
         faces = same.reshape(-1)[np.asarray(surface.faces, np.int64)]
         faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        vertices, lids = _lids(vertices, faces)
-        self.is_watertight = not len(lids)
-        faces, lids = (part[_has_area(vertices[part])] for part in (faces, lids))
+        vertices, caps = _hole_caps(vertices, faces)
+        self.is_watertight = not len(caps)
+        faces, caps = (part[_has_area(vertices[part])] for part in (faces, caps))
         if not len(faces):
             raise BakeError("a surface to bake needs a face with an area")
-        self._closed = vertices, np.ascontiguousarray(np.concatenate([faces, lids]))
-        before, behind = self._sides(vertices[lids])
-        faces = np.concatenate([faces, lids[self.is_inside(before) != self.is_inside(behind)]])
+        self._closed = vertices, np.ascontiguousarray(np.concatenate([faces, caps]))
+        before, behind = self._sides(vertices[caps])
+        faces = np.concatenate([faces, caps[self.is_inside(before) != self.is_inside(behind)]])
         self._creases = _creases(vertices, faces)
         self.leaf = max(leaf, 1e-3 * float(np.linalg.norm(np.ptp(vertices, axis=0))))
         self.corners = self._outer(vertices, faces, self.leaf)
@@ -105,16 +108,16 @@ class Solid:
         return corners.mean(axis=1) + step, corners.mean(axis=1) - step
 
     def _outer(self, vertices: np.ndarray, faces: np.ndarray, leaf: float) -> np.ndarray:
-        """Return the corners of the faces less what lies inside; faces that meet another part are split down to `leaf` [m]."""
-        links = coo_array((np.ones(2 * len(faces)), (faces[:, :2].ravel(), faces[:, 1:].ravel())), (len(vertices),) * 2)
-        part_of_face = connected_components(links, directed=False)[1][faces[:, 0]]
-        parts = np.unique(part_of_face)
-        if not 1 < len(parts) <= PARTS:
+        """Return the corners of the outer faces; those that meet another component are bisected down to `leaf` [m]."""
+        edges = coo_array((np.ones(2 * len(faces)), (faces[:, :2].ravel(), faces[:, 1:].ravel())), (len(vertices),) * 2)
+        component_of_face = connected_components(edges, directed=False)[1][faces[:, 0]]
+        components = np.unique(component_of_face)
+        if not 1 < len(components) <= MAX_COMPONENTS:
             return vertices[faces]
         outer = []
-        for part in parts:
-            others = np.ascontiguousarray(faces[part_of_face != part])
-            tree, whole = _tree(vertices, others), vertices[faces[part_of_face == part]]
+        for component in components:
+            others = np.ascontiguousarray(faces[component_of_face != component])
+            tree, whole = _tree(vertices, others), vertices[faces[component_of_face == component]]
             corners, owner, pieces, owners = whole, np.arange(len(whole)), [], []
             is_cut = np.zeros(len(whole), bool)
             while len(corners):
@@ -185,7 +188,7 @@ def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
 
 
 def halved(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
-    """Return the two halves of each triangle, cut from the middle of its longest side; needles become stout."""
+    """Return the two halves of each triangle by longest-edge bisection."""
     length = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(corners, turn[:, :, None], axis=1).swapaxes(0, 1)
@@ -193,8 +196,8 @@ def halved(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
-def _lids(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices, and a middle for each loop of open edges, and the faces that close the loops.
+def _hole_caps(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices with a centre for each boundary loop, and the triangle fans that close the loops.
 
     An edge is open where its faces do not run along it as often one way as the other. What is open is a boundary and has
     none itself, so every walk along open edges comes back, whatever the mesh.
@@ -206,7 +209,7 @@ def _lids(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
     for (low, high), times in zip(pairs[net != 0].tolist(), net[net != 0].tolist(), strict=True):
         start, end = (high, low) if times > 0 else (low, high)
         onward.setdefault(start, []).extend([end] * abs(times))
-    middles, lids = [], []
+    middles, caps = [], []
     for first in onward:
         path = [first]
         while onward[first] or len(path) > 1:
@@ -217,12 +220,12 @@ def _lids(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> 
                 path = path[: at + 1]
                 middle = len(vertices) + len(middles)
                 middles.append(vertices[loop].mean(axis=0))
-                lids.extend((start, end, middle) for start, end in zip(loop, loop[1:] + loop[:1], strict=True))
-    return np.concatenate([vertices, np.reshape(middles, (-1, 3))]), np.array(lids, np.int64).reshape(-1, 3)
+                caps.extend((start, end, middle) for start, end in zip(loop, loop[1:] + loop[:1], strict=True))
+    return np.concatenate([vertices, np.reshape(middles, (-1, 3))]), np.array(caps, np.int64).reshape(-1, 3)
 
 
 def _creases(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sharp edges: vertices and pairs of their indices."""
+    """Return the sharp edges: vertices and pairs of their indices; `igl.sharp_edges` leaves out open and non-manifold ones."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -18,8 +18,9 @@ from stages import (
     path_of,
 )
 
+from tgdsl.formats.mjcf import write_mjcf
 from tgdsl.formats.robot import load_model
-from tgdsl.formats.usd.reader import usd_to_mjcf, write_mjcf
+from tgdsl.formats.usd.reader import usd_to_mjcf
 
 
 @pytest.mark.parametrize("suffix", ["usd", "usda", "usdc", "usdz"])

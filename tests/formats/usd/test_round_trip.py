@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model
 from tgdsl.formats.usd.reader import usd_to_mjcf
 
 XHAND1 = Path(__file__).parents[3] / "robots" / "xhand1" / "xhand1_right.xml"
@@ -60,7 +60,7 @@ def pair(request, tmp_path_factory) -> tuple[mujoco.MjModel, mujoco.MjModel]:
     if request.param == "shapes":
         file = folder / "shapes.xml"
         file.write_text(SHAPES)
-    export_usd(file, folder / "out.usda")
+    export_model(file, folder / "out.usda")
     back = mujoco.MjModel.from_xml_string(usd_to_mjcf(folder / "out.usda"))
     return mujoco.MjModel.from_xml_path(str(file)), back
 

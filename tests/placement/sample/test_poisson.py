@@ -8,7 +8,7 @@ import trimesh
 from scipy.spatial import KDTree
 from surfaces import DOWN, HERE, ball, box, error_of, placement, surface_of
 
-from tgdsl.placement.sample import spread
+from tgdsl.placement.sample import poisson
 from tgdsl.placement.sample.sample import sample
 from tgdsl.surfaces import meshlab
 from tgdsl.surfaces.region import Region
@@ -55,7 +55,7 @@ def test_spacing_is_kept_and_leaves_no_gap(spacing):
     found = sample(surface, placement("poisson", spacing=spacing), HERE)
     if len(found.pos) > 1:
         assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() >= spacing
-    pool = spread.pool(meshlab.outer_shell(surface), Region(None, (), (), ()), 0, None, spacing)
+    pool = poisson.pool(meshlab.outer_shell(surface), Region(None, (), (), ()), 0, None, spacing)
     assert KDTree(found.pos).query(pool.pos)[0].max() <= spacing
     np.testing.assert_allclose(found.area.sum(), 2 * (0.0004 + 0.0002 + 0.0002), rtol=1e-9)
 

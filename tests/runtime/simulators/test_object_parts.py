@@ -8,7 +8,7 @@ from warp_cases import warp
 
 import tgdsl
 from tgdsl.errors import RobotError, SimulationError, SpecError
-from tgdsl.formats.usd.export.writer import export_usd
+from tgdsl.formats.robot import export_model
 from tgdsl.plan.inputs import ContactPart
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
@@ -45,7 +45,7 @@ def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", as
     )
     model = folder / ("scene.usda" if as_usd else "scene.xml")
     if as_usd:
-        export_usd(folder / "scene.xml", model)
+        export_model(folder / "scene.xml", model)
     line = np.linspace(-0.025, 0.025, 6)
     points = [{"pos": [float(x), float(y), 0.01], "normal": [0, 0, 1], "radius": 0.004} for x in line for y in line]
     layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}

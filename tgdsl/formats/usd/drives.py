@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tgdsl.formats.usd.notes import read_note
+from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.stage import Prim, Stage
 
-ENDLESS = 1e30
-"""From this magnitude on a limit is none: the largest float32 is often written for infinity."""
-ROUNDED = 1e-6
-"""A damping that is less than this part of the joint's own, which was taken off it, is rounding of float32."""
+INFINITE = 1e30
+"""Limits of this magnitude and more are infinite: the largest float32 is often written for infinity."""
+ROUNDING = 1e-6
+"""A drive's damping below this share of the joint's own, which was subtracted from it, is rounding of float32."""
 Range = tuple[float, float]
 
 
@@ -63,27 +63,32 @@ def read_drive(stage: Stage, prim: Prim, instance: str, kind: str, own: float) -
     if stage.value(prim, f"drive:{instance}:physics:type") == "acceleration":
         stage.drop("drives were dropped whose gains are per mass (type acceleration), which MuJoCo does not have", prim)
         return None, own
-    is_angular = kind == "hinge"
-    gain = stage.kilograms * (stage.metres**2 * math.degrees(1) if is_angular else 1.0)
-    force = stage.kilograms * (stage.metres**2 if is_angular else stage.metres)
-    unit = math.radians(1) if is_angular else stage.metres
-    most = math.inf if most >= ENDLESS else most * force
+    gain, force, unit = _si_units(stage, is_angular=kind == "hinge")
+    most = math.inf if most >= INFINITE else most * force
     own = min(own, damping * gain)
     rest = damping * gain - own
-    rest = 0.0 if rest < ROUNDED * own else rest
+    rest = 0.0 if rest < ROUNDING * own else rest
     if not stiffness and not rest:
         return None, own
-    control = read_note(stage, prim, "ctrlrange")
-    order = read_note(stage, prim, "order")
+    control = read_custom(stage, prim, "ctrlrange")
+    order = read_custom(stage, prim, "order")
     drive = Drive(
         stiffness * gain,
         rest,
         most,
         target * unit,
         velocity * unit,
-        str(read_note(stage, prim, "actuator") or ""),
+        str(read_custom(stage, prim, "actuator") or ""),
         None if control is None else (float(control[0]), float(control[1])),
-        float(read_note(stage, prim, "gear") or 1.0),
+        float(read_custom(stage, prim, "gear") or 1.0),
         math.inf if order is None else float(order),
     )
     return drive, own
+
+
+def _si_units(stage: Stage, is_angular: bool) -> tuple[float, float, float]:
+    """Return the stage's units of a drive's gains, of its force and of its target, in SI and radians."""
+    if is_angular:
+        torque = stage.kilograms_per_unit * stage.metres_per_unit**2
+        return stage.kilograms_per_unit * (stage.metres_per_unit**2 * math.degrees(1)), torque, math.radians(1)
+    return stage.kilograms_per_unit, stage.kilograms_per_unit * stage.metres_per_unit, stage.metres_per_unit

@@ -1,11 +1,11 @@
-"""Which bodies of a USD stage must not collide: joints, filtered pairs and collision groups, as pairs of bodies."""
+"""Collision filtering of a USD stage (joints, FilteredPairsAPI, CollisionGroup) as pairs of bodies that must not collide."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from itertools import combinations
 
-from tgdsl.formats.usd.geoms import Geom
+from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.stage import Prim, Stage
 
@@ -13,7 +13,7 @@ Pair = frozenset[str | None]
 """Paths of two bodies; None is the world."""
 
 
-def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Geom]) -> list[Pair]:
+def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]) -> list[Pair]:
     """Return the pairs of bodies that must not collide, sorted.
 
     MuJoCo tells bodies apart, not their colliders: what only holds for some colliders of a body is dropped, with a warning.

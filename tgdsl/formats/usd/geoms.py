@@ -1,4 +1,4 @@
-"""Colliders and visuals of a USD stage: what each is, which body it moves with, what it is made of."""
+"""Gprims of a USD stage, colliders and visuals: shape, body and physics material."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.formats.usd.notes import GEOM, MESH, SITE, read_note, read_notes
-from tgdsl.formats.usd.shapes import SCHEMAS, Shape, approximated, shape_of
+from tgdsl.formats.usd.custom_attributes import GEOM, MESH, SITE, read_custom, read_mjcf_attributes
+from tgdsl.formats.usd.shapes import SCHEMAS, Shape, collision_shape, shape_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 FRICTIONS = ("dynamicFriction", "staticFriction")
@@ -17,8 +17,8 @@ FRICTIONS = ("dynamicFriction", "staticFriction")
 
 
 @dataclass(frozen=True, eq=False)
-class Geom:
-    """A geometry prim, as it collides or as it is seen.
+class Gprim:
+    """A UsdGeom.Gprim as a collider or a visual.
 
     Attributes:
         path: Path of its prim.
@@ -31,7 +31,7 @@ class Geom:
         friction: Coefficient of sliding friction, or None if its material has none.
         density: Density of its material [kg/m³], or 0.
         color: Red, green, blue, alpha, or None.
-        notes: More attributes of the MJCF geom, if it collides.
+        mjcf_attributes: More attributes of the MJCF geom, if it collides.
         mesh: Attributes of its MJCF mesh, its name among them.
     """
 
@@ -45,7 +45,7 @@ class Geom:
     friction: float | None
     density: float
     color: Float[np.ndarray, 4] | None
-    notes: dict[str, str] = field(default_factory=dict)
+    mjcf_attributes: dict[str, str] = field(default_factory=dict)
     mesh: dict[str, str] = field(default_factory=dict)
 
 
@@ -57,17 +57,17 @@ class Site:
         prim: Its prim.
         body: Path of its body; None is the world.
         pose: Its frame in the body's frame [m].
-        notes: More attributes of the MJCF site.
+        mjcf_attributes: More attributes of the MJCF site.
     """
 
     prim: Prim
     body: str | None
     pose: Matrix
-    notes: dict[str, str]
+    mjcf_attributes: dict[str, str]
 
 
 def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Site]:
-    """Read all prims that are noted to be sites.
+    """Read all prims with the custom attribute `site`.
 
     Args:
         stage: The stage.
@@ -76,15 +76,15 @@ def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[s
     """
     sites = []
     for prim in stage.prims:
-        if read_note(stage, prim, "site"):
+        if read_custom(stage, prim, "site"):
             body = owners[str(prim.GetPath())]
             pose = stage.frame(prim)[0]
             place = pose if body is None else np.linalg.inv(frames[body]) @ pose
-            sites.append(Site(prim, body, place, read_notes(stage, prim, SITE)))
+            sites.append(Site(prim, body, place, read_mjcf_attributes(stage, prim, SITE)))
     return sites
 
 
-def read_geoms(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Geom]:
+def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Gprim]:
     """Read all colliders and all that is visible.
 
     A mesh that collides as a box or ball and is visible gives two geoms.
@@ -97,7 +97,7 @@ def read_geoms(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[s
     Raises:
         RobotError: If a mesh is broken.
     """
-    geoms: list[Geom] = []
+    geoms: list[Gprim] = []
     instancer = "//"  # what is below a point instancer is only there as its instances
     for prim in stage.prims:
         if str(prim.GetPath()).startswith(instancer):
@@ -119,7 +119,7 @@ def read_geoms(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[s
 
 def _geoms(
     stage: Stage, prim: Prim, body: str | None, frames: Mapping[str, Matrix], is_collider: bool, is_visible: bool
-) -> list[Geom]:
+) -> list[Gprim]:
     pose = stage.pose(prim)
     if abs(np.linalg.det(pose[:3, :3])) == 0:
         raise stage.error(prim, "its transform is flat: a scale is zero")
@@ -127,21 +127,23 @@ def _geoms(
     shape = shape_of(stage, prim, place)
     friction, density = _material(stage, prim) if is_collider else (None, 0.0)
     color = _color(stage, prim)
-    notes, mesh = read_notes(stage, prim, GEOM) if is_collider else {}, read_notes(stage, prim, MESH)
-    mesh |= {"name": name} if (name := read_note(stage, prim, "mesh")) else {}
+    attributes, mesh = read_mjcf_attributes(stage, prim, GEOM) if is_collider else {}, read_mjcf_attributes(stage, prim, MESH)
+    mesh |= {"name": name} if (name := read_custom(stage, prim, "mesh")) else {}
     path = str(prim.GetPath())
     if not is_collider:
         if shape.vertices is not None and len(shape.vertices) < 4:
             stage.drop("visual meshes with less than four points were dropped", prim)
             return []
-        return [Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh)]
+        return [Gprim(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh)]
     collided, is_hull = (
-        approximated(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
+        collision_shape(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
     )
     is_same = collided is shape
-    found = [Geom(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color, notes, mesh)]
+    found = [
+        Gprim(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color, attributes, mesh)
+    ]
     if is_visible and not is_same:
-        found.append(Geom(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh))
+        found.append(Gprim(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh))
     return found
 
 
@@ -163,7 +165,7 @@ def _material(stage: Stage, prim: Prim) -> tuple[float | None, float]:
         stage.drop("restitution of materials was dropped: MuJoCo has none", material)
     authored = [stage.authored(material, f"physics:{name}") for name in FRICTIONS]
     friction = next((float(value) for value in authored if value is not None), None)
-    return friction, stage.number(material, "physics:density") * stage.kilograms / stage.metres**3
+    return friction, stage.number(material, "physics:density") * stage.kilograms_per_unit / stage.metres_per_unit**3
 
 
 def _color(stage: Stage, prim: Prim) -> Float[np.ndarray, 4] | None:

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.drives import ENDLESS, Drive, Range, read_drive
-from tgdsl.formats.usd.notes import JOINT, read_note, read_notes
+from tgdsl.formats.usd.custom_attributes import JOINT, read_custom, read_mjcf_attributes
+from tgdsl.formats.usd.drives import INFINITE, Drive, Range, read_drive
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
-OPEN_SIDE = 1e10
-"""Written for a missing limit beside one that exists, which MuJoCo has no word for [rad or m]."""
-MEETING = 1e-4
-"""How far the two frames of a joint may be apart in the authored pose [m and rad]."""
+FAR_LIMIT = 1e10
+"""Stands for an infinite limit opposite a finite one: MuJoCo limits both sides or none [rad or m]."""
+FRAME_TOLERANCE = 1e-4
+"""Largest gap between the two frames of a joint in the authored poses [m and rad]."""
 DOFS = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 """Degrees of freedom of a generic joint, as its limits and drives are called."""
 AXES = {"X": np.array([1.0, 0.0, 0.0]), "Y": np.array([0.0, 1.0, 0.0]), "Z": np.array([0.0, 0.0, 1.0])}
@@ -44,7 +44,7 @@ class Joint:
         friction: Friction torque or force [N·m or N].
         is_excluded: Whether it is kept out of the articulation.
         is_filtering: Whether the bodies must not collide.
-        notes: More attributes of the MJCF joint.
+        mjcf_attributes: More attributes of the MJCF joint.
     """
 
     path: str
@@ -61,7 +61,7 @@ class Joint:
     friction: float
     is_excluded: bool
     is_filtering: bool
-    notes: dict[str, str]
+    mjcf_attributes: dict[str, str]
 
     def pose(self, is_swapped: bool) -> Matrix:
         """Return the pose of the child in its parent at position zero; body 0 is the child if swapped."""
@@ -135,10 +135,10 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
     if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
         kind, frame0, limits = "fixed", frame0 @ _moved(kind, axis, limits[0]), None
     _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
-    drive, damping = None, float(read_note(stage, prim, "damping") or 0.0)
+    drive, damping = None, float(read_custom(stage, prim, "damping") or 0.0)
     if kind in ("hinge", "slide"):
         drive, damping = read_drive(stage, prim, instance, kind, damping)
-    mass = stage.kilograms * (1.0 if kind == "slide" else stage.metres**2)
+    mass = stage.kilograms_per_unit * (1.0 if kind == "slide" else stage.metres_per_unit**2)
     return Joint(
         path=str(prim.GetPath()),
         prim=prim,
@@ -151,10 +151,10 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
         drive=drive,
         damping=damping,
         armature=stage.number(prim, "physxJoint:armature") * mass,
-        friction=stage.number(prim, "physxJoint:jointFriction") * mass * (stage.metres if kind == "slide" else 1.0),
+        friction=stage.number(prim, "physxJoint:jointFriction") * mass * (stage.metres_per_unit if kind == "slide" else 1.0),
         is_excluded=bool(stage.value(prim, "physics:excludeFromArticulation")),
         is_filtering=not stage.value(prim, "physics:collisionEnabled"),
-        notes=read_notes(stage, prim, JOINT),
+        mjcf_attributes=read_mjcf_attributes(stage, prim, JOINT),
     )
 
 
@@ -184,7 +184,7 @@ def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | 
             stage.drop("cone limits of spherical joints were dropped: MuJoCo limits a ball joint's whole angle", prim)
         return kind, axis, None, ""
     low, high = (stage.number(prim, f"physics:{end}Limit") for end in ("lower", "upper"))
-    unit = math.radians(1) if kind == "hinge" else stage.metres
+    unit = math.radians(1) if kind == "hinge" else stage.metres_per_unit
     return kind, axis, _range(low, high, unit), "angular" if kind == "hinge" else "linear"
 
 
@@ -197,7 +197,7 @@ def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range
             continue
         low, high = (stage.number(prim, f"limit:{dof}:physics:{end}") for end in ("low", "high"))
         if low < high or low == high != 0.0:
-            free[dof] = _range(low, high, math.radians(1) if dof.startswith("rot") else stage.metres)
+            free[dof] = _range(low, high, math.radians(1) if dof.startswith("rot") else stage.metres_per_unit)
     is_unlimited = not any(free.values()) and not prim.HasAPI(stage.pxr.UsdPhysics.LimitAPI, "distance")
     if not free:
         return "fixed", AXES["X"], None, ""
@@ -215,8 +215,8 @@ def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range
 
 def _range(low: float, high: float, unit: float) -> Range | None:
     """Return a range in SI; a side without limit gets a far one if the other has one."""
-    ends = tuple(math.copysign(OPEN_SIDE, end) if abs(end) >= ENDLESS else end * unit for end in (low, high))
-    return None if max(abs(low), abs(high)) >= ENDLESS and min(abs(low), abs(high)) >= ENDLESS else (ends[0], ends[1])
+    ends = tuple(math.copysign(FAR_LIMIT, end) if abs(end) >= INFINITE else end * unit for end in (low, high))
+    return None if max(abs(low), abs(high)) >= INFINITE and min(abs(low), abs(high)) >= INFINITE else (ends[0], ends[1])
 
 
 def _side(
@@ -263,7 +263,7 @@ def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
                 "drives were dropped that are not along the one degree of freedom of a revolute or prismatic joint", prim
             )
     for name in ("physics:breakForce", "physics:breakTorque"):
-        if stage.number(prim, name, math.inf) < ENDLESS:
+        if stage.number(prim, name, math.inf) < INFINITE:
             stage.drop("joints do not break: their breakForce and breakTorque were dropped", prim)
     # Schemas that usd-core does not know are not among `GetAppliedSchemas`.
     if any("Mimic" in name for name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()):

@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.geoms import Geom
+from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 DENSITY = 1000.0
 """What a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]."""
-BALL = 0.1
-"""Radius of the ball that stands in for a body which has a mass but neither inertia nor geometry [m]."""
+FALLBACK_RADIUS = 0.1
+"""Radius of the ball whose inertia a body with a mass, but neither inertia nor geometry, gets [m]."""
 LEAST_INERTIA = 1e-9
 """Least principal moment of a body whose inertia is that of no real body [kg·m²]."""
 Vector = Float[np.ndarray, "3"]
@@ -25,7 +25,7 @@ Tensor = Float[np.ndarray, "3 3"]
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """How a body resists motion, in its frame.
+    """Mass, centre of mass and inertia of a body, in its frame.
 
     Attributes:
         mass: [kg].
@@ -59,7 +59,7 @@ class _Authored:
     tensor: Tensor | None = None
 
 
-def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Geom], frame: Matrix) -> Inertial | None:
+def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix) -> Inertial | None:
     """Return the mass and inertia of a body, or None if it has neither mass nor colliders.
 
     A body's mass overrules its colliders', a collider's density overrules its body's, and that its material's. A centre of
@@ -80,10 +80,10 @@ def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Geom], frame: Matrix) 
     if own.mass and whole is not None:
         whole = Inertial(own.mass, whole.centre, whole.tensor * (own.mass / whole.mass))
     elif own.mass and own.tensor is None:
-        whole = _stand_in(stage, body, own.mass, geoms)
+        whole = _fallback_inertial(stage, body, own.mass, geoms)
     elif own.mass:
         whole = Inertial(own.mass, np.zeros(3), np.zeros((3, 3)))
-    return None if whole is None else _mended(stage, body, _overruled(whole, own))
+    return None if whole is None else _repaired(stage, body, _overruled(whole, own))
 
 
 def _authored(stage: Stage, prim: Prim) -> _Authored:
@@ -100,10 +100,10 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
         quat = stage.value(prim, "physics:principalAxes")
         is_turned = quat.GetReal() or any(quat.GetImaginary())
         axes = rotation_of(stage, prim, "physics:principalAxes").as_matrix() if is_turned else np.eye(3)
-        tensor = axes @ np.diag(moments) @ axes.T * stage.kilograms * stage.metres**2
+        tensor = axes @ np.diag(moments) @ axes.T * stage.kilograms_per_unit * stage.metres_per_unit**2
     return _Authored(
-        mass * stage.kilograms,
-        density * stage.kilograms / stage.metres**3,
+        mass * stage.kilograms_per_unit,
+        density * stage.kilograms_per_unit / stage.metres_per_unit**3,
         stage.frame(prim)[1] * centre if np.isfinite(centre).all() else None,
         tensor,
     )
@@ -115,10 +115,10 @@ def _overruled(computed: Inertial, own: _Authored) -> Inertial:
     return Inertial(computed.mass, centre, computed.about(centre) if own.tensor is None else own.tensor)
 
 
-def _collider(stage: Stage, geom: Geom, body_density: float, frame: Matrix) -> Inertial:
+def _collider(stage: Stage, geom: Gprim, body_density: float, frame: Matrix) -> Inertial:
     """Return what a collider contributes, in the body's frame."""
     own = _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
-    volume, centre, tensor = geom.shape.solid(geom.is_hull)
+    volume, centre, tensor = geom.shape.mass_properties(geom.is_hull)
     mass = own.mass or volume * (own.density or body_density or geom.density or DENSITY)
     computed = Inertial(mass, centre, tensor * (mass / volume if volume else 0.0))
     if own.centre is None and own.tensor is None:
@@ -142,19 +142,19 @@ def _sum(parts: list[Inertial]) -> Inertial | None:
     return Inertial(mass, centre, np.sum([part.about(centre) for part in parts], axis=0))
 
 
-def _stand_in(stage: Stage, body: Prim, mass: float, geoms: list[Geom]) -> Inertial:
-    """Return a body of which only the mass is known: its visuals filled evenly, or a ball."""
-    solids = [geom.shape.solid(False) for geom in geoms if geom.shape.kind != "plane"]
+def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: list[Gprim]) -> Inertial:
+    """Return the inertia of a body of which only the mass is known: that of its visuals as solids, or of a ball."""
+    solids = [geom.shape.mass_properties(False) for geom in geoms if geom.shape.kind != "plane"]
     whole = _sum([Inertial(*solid) for solid in solids if solid[0] > 0])
     if whole is not None:
         stage.drop("bodies have a mass but neither inertia nor colliders; their visuals were taken as solid", body)
         return Inertial(mass, whole.centre, whole.tensor * (mass / whole.mass))
-    stage.drop(f"bodies have a mass but neither inertia nor geometry; a ball of {BALL} m radius was taken", body)
-    return Inertial(mass, np.zeros(3), 0.4 * mass * BALL**2 * np.eye(3))
+    stage.drop(f"bodies have a mass but neither inertia nor geometry; a ball of {FALLBACK_RADIUS} m radius was taken", body)
+    return Inertial(mass, np.zeros(3), 0.4 * mass * FALLBACK_RADIUS**2 * np.eye(3))
 
 
-def _mended(stage: Stage, body: Prim, found: Inertial) -> Inertial:
-    """Replace an inertia that no rigid body can have by a ball's of about the same size; rounding is only rounded away."""
+def _repaired(stage: Stage, body: Prim, found: Inertial) -> Inertial:
+    """Replace an inertia that breaks the triangle inequality by a ball's of about the same size; rounding is only corrected."""
     moments, axes = found.principal()
     low, middle, high = moments
     if low > 0 and low + middle >= high:

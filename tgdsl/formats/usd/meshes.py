@@ -1,4 +1,4 @@
-"""Triangles of USD geometry: polygon meshes checked and cut up, and shapes that MuJoCo has no primitive for."""
+"""Triangles of USD geometry: polygon meshes validated and triangulated, and shapes that MuJoCo has no primitive for."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def _triangles(vertices: Vertices, sizes: Int[np.ndarray, " polygon"], corners: 
     order = [np.flatnonzero(sizes == 3)]
     for polygon in np.flatnonzero(sizes > 3):
         ring = corners[starts[polygon] : starts[polygon] + sizes[polygon]]
-        found.append(ring[_ears(vertices[ring])])
+        found.append(ring[_ear_clipping(vertices[ring])])
         order.append(np.full(len(ring) - 2, polygon))
     return np.concatenate(found)[np.argsort(np.concatenate(order), kind="stable")]
 
 
-def _ears(ring: Vertices) -> Faces:
-    """Cut a polygon, convex or not, into triangles: corner after corner that sticks out and has no other corner inside."""
+def _ear_clipping(ring: Vertices) -> Faces:
+    """Triangulate a simple polygon by ear clipping."""
     following = np.roll(ring, -1, axis=0)
     normal = np.cross(ring - ring[0], following - ring[0]).sum(axis=0)
     axis = int(np.abs(normal).argmax())
@@ -86,12 +86,12 @@ def _cross(a: Float[np.ndarray, " 2"], b: Float[np.ndarray, "*n 2"]) -> Float[np
     return np.asarray(a[0] * b[..., 1] - a[1] * b[..., 0])
 
 
-def lathed(profile: list[tuple[float, float]], axis: str) -> tuple[Vertices, Faces]:
-    """Return a convex solid of revolution as triangles.
+def surface_of_revolution(profile: list[tuple[float, float]], axis: str) -> tuple[Vertices, Faces]:
+    """Return the surface of a convex solid of revolution as triangles.
 
     Args:
         profile: Radius and height of its rings, from the lowest to the highest; a ring of radius zero is a tip.
-        axis: The axis that it is turned around, X, Y or Z.
+        axis: Its axis of revolution, X, Y or Z.
     """
     angles = 2 * np.pi * np.arange(SECTIONS) / SECTIONS
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -106,16 +106,16 @@ def lathed(profile: list[tuple[float, float]], axis: str) -> tuple[Vertices, Fac
         faces += [np.stack([a, b, b + SECTIONS], axis=1), np.stack([a, b + SECTIONS, a + SECTIONS], axis=1)]
     top = (len(profile) - 1) * SECTIONS
     faces.append(np.stack([np.full(SECTIONS, high), here + top, after + top], axis=1))
-    return compact(vertices @ turned(axis).T, np.concatenate(faces))
+    return merge_vertices(vertices @ rotation_from_z(axis).T, np.concatenate(faces))
 
 
-def turned(axis: str) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation that takes z to an axis."""
+def rotation_from_z(axis: str) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that takes z to an axis: a cyclic permutation."""
     return np.eye(3)[:, {"X": [1, 2, 0], "Y": [2, 0, 1], "Z": [0, 1, 2]}[axis]]
 
 
-def compact(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "merged 3"], Int[np.ndarray, "kept 3"]]:
-    """Merge vertices at the same place, and drop faces that have lost a corner by it and vertices that no face has."""
+def merge_vertices(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "merged 3"], Int[np.ndarray, "kept 3"]]:
+    """Merge coincident vertices; drop degenerate faces and unreferenced vertices."""
     merged, index = np.unique(vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[faces]
     a, b, c = faces.T
@@ -124,8 +124,8 @@ def compact(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "merged
     return merged[used], index.reshape(-1, 3)
 
 
-def ball_profile(radius: float, low: float, high: float, low_radius: float | None = None) -> list[tuple[float, float]]:
-    """Return the profile of the hull of two balls, for `lathed`.
+def capsule_profile(radius: float, low: float, high: float, low_radius: float | None = None) -> list[tuple[float, float]]:
+    """Return the profile of the hull of two balls, for `surface_of_revolution`.
 
     Args:
         radius: Radius of the upper ball, and of the lower one too unless that is given.

@@ -13,35 +13,40 @@ The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
 - A joint that closes a loop becomes an equality constraint between sites.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2. Materials' looks, subdivision,
   holes of meshes and what is not drawn by default are left out; whatever else is dropped is warned of.
-- What `usd_export` notes in attributes `tgdsl:` is read back, in SI units and radians whatever those of the stage.
+- Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever those of the stage.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError
-from tgdsl.files.files import naming
+from tgdsl.formats.model import Model
+from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, spanning_tree
+from tgdsl.formats.usd.custom_attributes import OPTION, read_custom, read_mjcf_attributes, read_option_flags
+from tgdsl.formats.usd.elements import (
+    MeshAssets,
+    add_actuators_and_key,
+    add_geom,
+    add_joint_element,
+    add_loop_constraint,
+    add_site,
+    floats_text,
+    with_pose,
+)
 from tgdsl.formats.usd.filters import exclusions
-from tgdsl.formats.usd.geoms import Geom, Site, read_geoms, read_sites
-from tgdsl.formats.usd.joints import MEETING, Joint, read_joints
+from tgdsl.formats.usd.geoms import Gprim, Site, read_gprims, read_sites
+from tgdsl.formats.usd.joints import FRAME_TOLERANCE, Joint, read_joints
 from tgdsl.formats.usd.mass import Inertial, inertial_of
-from tgdsl.formats.usd.notes import OPTION, read_flags, read_note, read_notes
-from tgdsl.formats.usd.stage import Matrix, Prim, Stage, opened, unique_names
-from tgdsl.formats.usd.tree import Link, Tree, spanning_tree
-from tgdsl.formats.usd.xml import MeshAssets, add_geom, add_key, add_loop, add_motion, add_site, numbers, posed
+from tgdsl.formats.usd.stage import Matrix, Prim, Stage, open_stage, unique_names
 
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-"""Endings of USD files."""
 GRAVITY = 9.81
 """What a stage's scene means by earth gravity [m/s²]."""
 
@@ -57,7 +62,7 @@ class _Robot:
         geoms: All geoms.
         sites: All sites.
         inertials: Mass and inertia of each body that has one.
-        tree: Which body hangs on which.
+        tree: Parent and joint of each body.
         kinematic: Whether each body is kinematic.
         names: Name of each body, then of each geom, of each joint and of each site, by path.
         free: Name of each floating body's joint, or empty, by the body's path.
@@ -66,13 +71,25 @@ class _Robot:
     bodies: dict[str, Prim]
     frames: dict[str, Matrix]
     joints: list[Joint]
-    geoms: list[Geom]
+    geoms: list[Gprim]
     sites: list[Site]
     inertials: dict[str, Inertial | None]
-    tree: Tree
+    tree: SpanningTree
     kinematic: dict[str, bool]
     names: tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]
     free: dict[str, str]
+
+
+def read_usd(path: Path) -> Model:
+    """Read and compile a UsdPhysics stage.
+
+    Raises:
+        RobotError: As `usd_to_mjcf`.
+        ValueError: If MuJoCo cannot compile it.
+    """
+    text = usd_to_mjcf(path)
+    spec = mujoco.MjSpec.from_string(text)
+    return Model(path, spec, spec.compile(), is_urdf=False, mjcf=text)
 
 
 def usd_to_mjcf(path: Path) -> str:
@@ -82,10 +99,10 @@ def usd_to_mjcf(path: Path) -> str:
         RobotError: If usd-core is missing, the file is not USD, something that it refers to is missing, or it holds
             something that MuJoCo cannot express.
     """
-    with opened(path) as stage:
+    with open_stage(path) as stage:
         robot = _read(stage)
         _check(stage, robot)
-        return ET.tostring(_written(stage, robot), encoding="unicode")
+        return ET.tostring(_mjcf_root(stage, robot), encoding="unicode")
 
 
 def _read(stage: Stage) -> _Robot:
@@ -102,7 +119,7 @@ def _read(stage: Stage) -> _Robot:
         path = str(prim.GetPath())
         owners[path] = path if path in bodies else owners[path.rpartition("/")[0] or "/"]
     frames = {path: stage.frame(prim)[0] for path, prim in bodies.items()}
-    joints, geoms = read_joints(stage, owners, frames), read_geoms(stage, owners, frames)
+    joints, geoms = read_joints(stage, owners, frames), read_gprims(stage, owners, frames)
     sites = read_sites(stage, owners, frames)
     inertials = {
         path: inertial_of(stage, prim, [geom for geom in geoms if geom.body == path], frames[path])
@@ -117,22 +134,22 @@ def _read(stage: Stage) -> _Robot:
         unique_names(stage, [site.prim for site in sites]),
     )
     tree = spanning_tree(kinematic, joints, roots)
-    free = {path: str(read_note(stage, prim, "freejoint") or "") for path, prim in bodies.items()}
+    free = {path: str(read_custom(stage, prim, "freejoint") or "") for path, prim in bodies.items()}
     return _Robot(bodies, frames, joints, geoms, sites, inertials, tree, kinematic, names, free)
 
 
 def _check(stage: Stage, robot: _Robot) -> None:
     """Refuse what MuJoCo would refuse without naming the prim, and take note of what it cannot start with."""
-    for path, link in robot.tree.links.items():
+    for path, node in robot.tree.nodes.items():
         prim = robot.bodies[path]
-        is_moving = not robot.kinematic[path] and (link.joint is None or link.joint.kind != "fixed")
+        is_moving = not robot.kinematic[path] and (node.joint is None or node.joint.kind != "fixed")
         if is_moving and not _has_mass(robot, path):
             raise stage.error(prim, "the body can move, but has neither mass nor colliders")
         for name in ("velocity", "angularVelocity"):
             if any(stage.value(prim, f"physics:{name}")):
                 stage.drop("initial velocities were dropped", prim)
-        if link.joint is not None and _authored(robot, link.joint)[2] > MEETING:
-            stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", link.joint.prim)
+        if node.joint is not None and _authored(robot, node.joint)[2] > FRAME_TOLERANCE:
+            stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", node.joint.prim)
     for geom in robot.geoms:
         if geom.shape.kind == "plane" and geom.body is not None and not robot.kinematic[geom.body]:
             raise stage.error(geom.prim, "a plane can only belong to the world or to a kinematic body")
@@ -140,8 +157,8 @@ def _check(stage: Stage, robot: _Robot) -> None:
 
 def _has_mass(robot: _Robot, path: str) -> bool:
     """Return whether a body, or one that is welded below it, has mass."""
-    welded = (link for link in robot.tree.children(path) if link.joint is not None and link.joint.kind == "fixed")
-    return robot.inertials[path] is not None or any(_has_mass(robot, link.body) for link in welded)
+    welded = (node for node in robot.tree.children(path) if node.joint is not None and node.joint.kind == "fixed")
+    return robot.inertials[path] is not None or any(_has_mass(robot, node.body) for node in welded)
 
 
 def _authored(robot: _Robot, joint: Joint) -> tuple[Matrix, float, float]:
@@ -149,7 +166,7 @@ def _authored(robot: _Robot, joint: Joint) -> tuple[Matrix, float, float]:
     return joint.authored((world[0], world[1]))
 
 
-def _written(stage: Stage, robot: _Robot) -> ET.Element:
+def _mjcf_root(stage: Stage, robot: _Robot) -> ET.Element:
     root = ET.Element("mujoco", model=stage.file.stem)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     option = ET.SubElement(root, "option")
@@ -158,30 +175,30 @@ def _written(stage: Stage, robot: _Robot) -> ET.Element:
     world = ET.SubElement(root, "worldbody")
     elements: dict[str | None, ET.Element] = {None: world}
     _add_geoms(robot, None, world, meshes)
-    for link in robot.tree.children(None):
-        _add_body(robot, link, world, meshes, elements)
+    for node in robot.tree.children(None):
+        _add_body(robot, node, world, meshes, elements)
     contact = ET.SubElement(root, "contact")
     for pair in exclusions(stage, robot.joints, robot.geoms):
         first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
         ET.SubElement(contact, "exclude", body1=first, body2=second)
-    if any(link.joint and link.parent and not link.joint.is_filtering for link in robot.tree.links.values()):
+    if any(node.joint and node.parent and not node.joint.is_filtering for node in robot.tree.nodes.values()):
         # MuJoCo never collides a parent with its child; here it should, and who should not is listed above.
         flags["filterparent"] = "disable"
     if flags:
         ET.SubElement(option, "flag", flags)
     equality, actuator = ET.SubElement(root, "equality"), ET.SubElement(root, "actuator")
     for joint in robot.tree.loops:
-        _add_loop(stage, robot, joint, elements, equality)
-    motions = [(link, _authored(robot, link.joint) if link.joint else None) for link in _depth_first(robot.tree)]
-    add_key(ET.SubElement(root, "keyframe"), actuator, motions, robot.frames, robot.kinematic, robot.names[2])
+        _add_loop_constraint(stage, robot, joint, elements, equality)
+    motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in _depth_first(robot.tree)]
+    add_actuators_and_key(ET.SubElement(root, "keyframe"), actuator, motions, robot.frames, robot.kinematic, robot.names[2])
     for empty in [element for element in root if len(element) == 0 and not element.attrib]:
         root.remove(empty)
     return root
 
 
-def _depth_first(tree: Tree, parent: str | None = None) -> list[Link]:
-    """Return all links in MuJoCo's order."""
-    return [link for child in tree.children(parent) for link in (child, *_depth_first(tree, child.body))]
+def _depth_first(tree: SpanningTree, parent: str | None = None) -> list[TreeNode]:
+    """Return all nodes in MuJoCo's order."""
+    return [node for child in tree.children(parent) for node in (child, *_depth_first(tree, child.body))]
 
 
 def _option(stage: Stage, option: ET.Element) -> dict[str, str]:
@@ -191,44 +208,44 @@ def _option(stage: Stage, option: ET.Element) -> dict[str, str]:
         stage.drop("physics scenes after the first one were dropped", scene)
     if not scenes:
         return {}
-    option.attrib |= {"gravity": _gravity(stage, scenes[0]), **read_notes(stage, scenes[0], OPTION)}
-    return read_flags(stage, scenes[0])
+    option.attrib |= {"gravity": _gravity(stage, scenes[0]), **read_mjcf_attributes(stage, scenes[0], OPTION)}
+    return read_option_flags(stage, scenes[0])
 
 
 def _gravity(stage: Stage, scene: Prim) -> str:
     """Return gravity [m/s²]."""
     direction = np.array(stage.value(scene, "physics:gravityDirection"), dtype=np.float64)
     size = stage.number(scene, "physics:gravityMagnitude", -math.inf)
-    size = GRAVITY if size < 0 else size * stage.metres
+    size = GRAVITY if size < 0 else size * stage.metres_per_unit
     if not np.isfinite(direction).all() or not math.isfinite(size):
         raise stage.error(scene, "gravity is not finite")
     if not direction.any():
-        return numbers([0.0, 0.0, -size])
-    return numbers(stage.world[:3, :3] @ direction / stage.metres / np.linalg.norm(direction) * size)
+        return floats_text([0.0, 0.0, -size])
+    return floats_text(stage.world_from_stage[:3, :3] @ direction / stage.metres_per_unit / np.linalg.norm(direction) * size)
 
 
 def _add_body(
-    robot: _Robot, link: Link, parent: ET.Element, meshes: MeshAssets, elements: dict[str | None, ET.Element]
+    robot: _Robot, node: TreeNode, parent: ET.Element, meshes: MeshAssets, elements: dict[str | None, ET.Element]
 ) -> None:
-    pose = robot.frames[link.body] if link.joint is None else link.joint.pose(link.is_swapped)
-    element = posed(ET.SubElement(parent, "body", name=robot.names[0][link.body]), pose)
-    elements[link.body] = element
-    if robot.kinematic[link.body]:
+    pose = robot.frames[node.body] if node.joint is None else node.joint.pose(node.is_swapped)
+    element = with_pose(ET.SubElement(parent, "body", name=robot.names[0][node.body]), pose)
+    elements[node.body] = element
+    if robot.kinematic[node.body]:
         element.set("mocap", "true")
     else:
-        add_motion(element, link, robot.names[2], robot.free[link.body])
-    if (inertial := robot.inertials[link.body]) is not None:
+        add_joint_element(element, node, robot.names[2], robot.free[node.body])
+    if (inertial := robot.inertials[node.body]) is not None:
         moments, axes = inertial.principal()
         ET.SubElement(
             element,
             "inertial",
-            pos=numbers(inertial.centre),
-            quat=numbers(axes.as_quat(canonical=True, scalar_first=True)),
-            mass=numbers([inertial.mass]),
-            diaginertia=numbers(moments),
+            pos=floats_text(inertial.centre),
+            quat=floats_text(axes.as_quat(canonical=True, scalar_first=True)),
+            mass=floats_text([inertial.mass]),
+            diaginertia=floats_text(moments),
         )
-    _add_geoms(robot, link.body, element, meshes)
-    for child in robot.tree.children(link.body):
+    _add_geoms(robot, node.body, element, meshes)
+    for child in robot.tree.children(node.body):
         _add_body(robot, child, element, meshes, elements)
 
 
@@ -248,7 +265,7 @@ def _add_geoms(robot: _Robot, body: str | None, element: ET.Element, meshes: Mes
             add_site(element, robot.names[3][str(site.prim.GetPath())], site)
 
 
-def _add_loop(
+def _add_loop_constraint(
     stage: Stage, robot: _Robot, joint: Joint, elements: Mapping[str | None, ET.Element], equality: ET.Element
 ) -> None:
     if all(body is None or robot.kinematic[body] for body in joint.bodies):
@@ -260,55 +277,4 @@ def _add_loop(
         stage.drop("limits, drives, armature and friction of joints that close a loop were dropped", joint.prim)
     taken = {site.get("name", "") for element in elements.values() for site in element.iter("site")}
     ends = (elements[joint.bodies[0]], elements[joint.bodies[1]])
-    add_loop(equality, ends, joint, robot.names[2][joint.path], taken)
-
-
-def write_mjcf(text: str, out: Path) -> None:
-    """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
-
-    All is written under temporary names first, then renamed, so that nothing half-written is left behind.
-
-    Args:
-        text: What `usd_to_mjcf` returns.
-        out: The MJCF file. It is replaced if it is there, and so are meshes of the same names; other files are left alone.
-
-    Raises:
-        FileError: If it cannot be written.
-    """
-    root, out = ET.fromstring(text), Path(out)
-    folder = out.with_name(f"{out.stem}_assets")
-    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
-        files: list[str] = []
-        for mesh in root.iterfind("asset/mesh[@vertex]"):
-            file = _file_name(mesh.get("name", ""), files)
-            (Path(temporary) / file).write_text(
-                _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")), encoding="utf-8"
-            )
-            mesh.set("file", file)
-        if files:
-            root.findall("compiler")[0].set("meshdir", folder.name)
-        ET.indent(root)
-        draft = Path(temporary) / "model.xml"
-        draft.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-        for file in files:
-            folder.mkdir(exist_ok=True)
-            os.replace(Path(temporary) / file, folder / file)
-        os.replace(draft, out)
-
-
-def _file_name(name: str, taken: list[str]) -> str:
-    """Return a file name for a mesh, and take it; names that only differ in case are one on some file systems."""
-    stem = re.sub(r"[^\w.-]", "_", name) or "mesh"
-    file, number = f"{stem}.obj", 1
-    while file.lower() in map(str.lower, taken):
-        number += 1
-        file = f"{stem}_{number}.obj"
-    taken.append(file)
-    return file
-
-
-def _wavefront(vertices: str, faces: str) -> str:
-    points, corners = vertices.split(), [int(index) + 1 for index in faces.split()]
-    lines = [f"v {' '.join(points[i : i + 3])}" for i in range(0, len(points), 3)]
-    lines += [f"f {' '.join(map(str, corners[i : i + 3]))}" for i in range(0, len(corners), 3)]
-    return "\n".join([*lines, ""])
+    add_loop_constraint(equality, ends, joint, robot.names[2][joint.path], taken)

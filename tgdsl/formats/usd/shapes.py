@@ -10,15 +10,23 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.meshes import Faces, Vertices, ball_profile, compact, lathed, read_mesh, turned
+from tgdsl.formats.usd.meshes import (
+    Faces,
+    Vertices,
+    capsule_profile,
+    merge_vertices,
+    read_mesh,
+    rotation_from_z,
+    surface_of_revolution,
+)
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage, rotation_and_scale
 
-ROUND = 1e-5
-"""Relative difference of two scales from which on a circle is none any more: scales are often authored in float32."""
+CIRCULAR = 1e-5
+"""Relative difference of two scales up to which a circle stays one: scales are often authored in float32."""
 CONVEX = 1e-3
-"""A closed mesh that fills its hull but for this part counts as convex."""
+"""A closed mesh whose volume is less than its hull's by at most this share counts as convex."""
 FLAT = 1e-6
-"""A mesh that is thinner than this part of its length has no hull."""
+"""A mesh whose thickness is at most this share of its length has no hull."""
 SCHEMAS = ("Mesh", "Cube", "Sphere", "Capsule", "Capsule_1", "Cylinder", "Cylinder_1", "Cone", "Plane")
 """Geometry that can be read."""
 
@@ -59,27 +67,27 @@ class Shape:
     @cached_property
     def _closed(self) -> trimesh.Trimesh | None:
         assert self.vertices is not None and self.faces is not None
-        own = trimesh.Trimesh(*compact(self.vertices, self.faces), process=False)
+        own = trimesh.Trimesh(*merge_vertices(self.vertices, self.faces), process=False)
         return own if own.is_volume else None
 
-    def solid(self, is_hull: bool) -> tuple[float, Float[np.ndarray, 3], Float[np.ndarray, "3 3"]]:
+    def mass_properties(self, is_hull: bool) -> tuple[float, Float[np.ndarray, 3], Float[np.ndarray, "3 3"]]:
         """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
 
         Args:
             is_hull: Whether the hull of a mesh counts, rather than the mesh; that of an open mesh always does.
         """
-        volume, centre, inertia = self._mesh_solid(is_hull) if self.kind == "mesh" else self._primitive_solid()
+        volume, centre, inertia = self._mesh_properties(is_hull) if self.kind == "mesh" else self._primitive_properties()
         rotation = self.pose[:3, :3]
         return volume, rotation @ centre + self.pose[:3, 3], rotation @ inertia @ rotation.T
 
-    def _mesh_solid(self, is_hull: bool) -> tuple[float, np.ndarray, np.ndarray]:
+    def _mesh_properties(self, is_hull: bool) -> tuple[float, np.ndarray, np.ndarray]:
         solid = None if is_hull else self._closed
         solid = self.hull if solid is None else solid
         if solid is None:
             return 0.0, np.zeros(3), np.zeros((3, 3))
         return float(solid.volume), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
 
-    def _primitive_solid(self) -> tuple[float, np.ndarray, np.ndarray]:
+    def _primitive_properties(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Closed forms (any handbook): second moments ∫x², ∫y², ∫z² of each, from which the moments of inertia follow."""
         if self.kind == "box":
             x, y, z = self.size
@@ -113,15 +121,15 @@ def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:
     """
     schema = str(prim.GetTypeName())
     if schema == "Mesh":
-        return meshed(*read_mesh(stage, prim), place)
+        return mesh_shape(*read_mesh(stage, prim), place)
     if schema == "Plane":
-        return _plane(stage, prim, place)
+        return _plane_shape(stage, prim, place)
     split = rotation_and_scale(place[:3, :3])
     if schema == "Sphere":
-        return _ball(_sizes(stage, prim, "radius")[0], np.zeros(3), place)
+        return _sphere_shape(_sizes(stage, prim, "radius")[0], np.zeros(3), place)
     if schema == "Cube":
         half = _sizes(stage, prim, "size")[0] / 2
-        return boxed(np.full(3, -half), np.full(3, half), place)
+        return box_shape(np.full(3, -half), np.full(3, half), place)
     axis = str(stage.value(prim, "axis"))
     half = _sizes(stage, prim, "height", is_least_zero=schema.startswith("Capsule"))[0] / 2
     if schema.endswith("_1"):
@@ -130,16 +138,16 @@ def shape_of(stage: Stage, prim: Prim, place: Matrix) -> Shape:
         low, high = (_sizes(stage, prim, "radius")[0],) * 2
     across, along = _scales(split[1] if split else None, axis)
     pose = place.copy()
-    pose[:3, :3] = (split[0] if split else np.eye(3)) @ turned(axis)
+    pose[:3, :3] = (split[0] if split else np.eye(3)) @ rotation_from_z(axis)
     if schema.startswith("Cylinder"):
         if low == high and across:
             return Shape("cylinder", (low * across, half * along), pose)
-        return meshed(*lathed([(low, -half), (high, half)], axis), place)
+        return mesh_shape(*surface_of_revolution([(low, -half), (high, half)], axis), place)
     if schema.startswith("Capsule"):
-        if low == high and across and abs(across - along) <= ROUND * along:
+        if low == high and across and abs(across - along) <= CIRCULAR * along:
             return Shape("capsule", (low * across, half * along), pose) if half else Shape("sphere", (low * across,), pose)
-        return meshed(*lathed(ball_profile(high, -half, half, low), axis), place)
-    return meshed(*lathed([(low, -half), (0.0, half)], axis), place)
+        return mesh_shape(*surface_of_revolution(capsule_profile(high, -half, half, low), axis), place)
+    return mesh_shape(*surface_of_revolution([(low, -half), (0.0, half)], axis), place)
 
 
 def _sizes(stage: Stage, prim: Prim, *names: str, is_least_zero: bool = False) -> list[float]:
@@ -156,10 +164,10 @@ def _scales(scale: Float[np.ndarray, 3] | None, axis: str) -> tuple[float, float
         return 0.0, 0.0
     along = "XYZ".index(axis)
     first, second = np.abs(np.delete(scale, along))
-    return (float(first) if abs(first - second) <= ROUND * first else 0.0), float(abs(scale[along]))
+    return (float(first) if abs(first - second) <= CIRCULAR * first else 0.0), float(abs(scale[along]))
 
 
-def meshed(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
+def mesh_shape(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
     """Return a mesh: its scale goes into its vertices, and what is left of the transform into its pose."""
     linear, pose = place[:3, :3], place.copy()
     if np.linalg.det(linear) < 0:
@@ -172,13 +180,13 @@ def meshed(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
     return Shape("mesh", (), pose, vertices * scale, faces)
 
 
-def boxed(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matrix) -> Shape:
+def box_shape(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matrix) -> Shape:
     """Return the box between two corners of a prim's space, as a mesh where shear makes it none."""
     split = rotation_and_scale(place[:3, :3])
     if split is None:
         corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
         faces = np.asarray(trimesh.creation.box().faces, dtype=np.int64)  # its corners come in the same order
-        return meshed(corners, faces, place)
+        return mesh_shape(corners, faces, place)
     pose = place.copy()
     pose[:3, :3], scale = split
     pose[:3, 3] += place[:3, :3] @ ((low + high) / 2)
@@ -186,7 +194,7 @@ def boxed(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matrix) 
     return Shape("box", (x, y, z), pose)
 
 
-def _ball(radius: float, centre: Float[np.ndarray, 3], place: Matrix) -> Shape:
+def _sphere_shape(radius: float, centre: Float[np.ndarray, 3], place: Matrix) -> Shape:
     """Return a ball under any linear map: an ellipsoid along its singular vectors."""
     linear, pose = place[:3, :3] * radius, place.copy()
     pose[:3, 3] += place[:3, :3] @ centre
@@ -197,25 +205,25 @@ def _ball(radius: float, centre: Float[np.ndarray, 3], place: Matrix) -> Shape:
     else:
         pose[:3, :3], half = split[0], np.abs(split[1])
     x, y, z = half.tolist()
-    return Shape("sphere", (x,), pose) if half.max() - half.min() <= ROUND * x else Shape("ellipsoid", (x, y, z), pose)
+    return Shape("sphere", (x,), pose) if half.max() - half.min() <= CIRCULAR * x else Shape("ellipsoid", (x, y, z), pose)
 
 
-def _plane(stage: Stage, prim: Prim, place: Matrix) -> Shape:
+def _plane_shape(stage: Stage, prim: Prim, place: Matrix) -> Shape:
     """Return a plane with its normal along its axis; width and length only say how much of it is drawn."""
     split = rotation_and_scale(place[:3, :3])
     if split is None:
         raise stage.error(prim, "a plane cannot be sheared")
     axis = str(stage.value(prim, "axis"))
     pose = place.copy()
-    pose[:3, :3] = split[0] @ turned(axis)
+    pose[:3, :3] = split[0] @ rotation_from_z(axis)
     width, length = _sizes(stage, prim, "width", "length")
     # Width and length lie along x and y of a plane whose normal is z; along z and y for x; along x and z for y.
     extents = {"X": (0, length, width), "Y": (width, 0, length), "Z": (width, length, 0)}[axis]
-    half = np.abs(turned(axis).T @ (np.abs(split[1]) * extents)) / 2
+    half = np.abs(rotation_from_z(axis).T @ (np.abs(split[1]) * extents)) / 2
     return Shape("plane", (float(half[0]), float(half[1]), float(max(half)) / 100), pose)
 
 
-def approximated(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple[Shape, bool]:
+def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple[Shape, bool]:
     """Return what a mesh collides as, and whether that is the mesh's hull because of its `physics:approximation`.
 
     Args:
@@ -235,7 +243,7 @@ def approximated(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tuple
         points = read_mesh(stage, prim)[0]
         low, high = points.min(axis=0), points.max(axis=0)
         if wanted == "boundingCube":
-            return boxed(low, high, place), False
+            return box_shape(low, high, place), False
         centre = place[:3, :3] @ ((low + high) / 2) + place[:3, 3]
         placed = points @ place[:3, :3].T + place[:3, 3]
         pose = np.eye(4)

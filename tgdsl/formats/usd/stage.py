@@ -1,4 +1,4 @@
-"""An opened USD stage: what failed to resolve, its units and up-axis, poses in metres with Z up, names, and what is dropped."""
+"""An opened USD stage: composition errors, units and up-axis, transforms in metres with Z up, names, and what is dropped."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ Matrix = Float[np.ndarray, "4 4"]
 SHEAR = 1e-5
 """Cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32."""
 NAMESPACE = "tgdsl:"
-"""What the names of our own custom attributes begin with."""
+"""Namespace of the custom attributes that hold MJCF's values."""
 NAME_ATTRIBUTE = f"{NAMESPACE}name"
 """A custom string attribute of a prim: the name that it has in MJCF."""
 
 
-def pxr() -> Any:
-    """Return the modules of usd-core that this package uses.
+def usd_modules() -> Any:
+    """Return usd-core's modules by their names; only this function imports them.
 
     Raises:
-        RobotError: If it is not installed.
+        RobotError: If usd-core is not installed.
     """
     try:
-        from pxr import Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils, Vt
     except ImportError as error:
-        raise RobotError("reading USD needs usd-core: pip install usd-core") from error
+        raise RobotError("USD files need usd-core, which is not installed: pip install usd-core") from error
     return SimpleNamespace(
-        Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, UsdUtils=UsdUtils
+        Gf=Gf, Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, UsdUtils=UsdUtils, Vt=Vt
     )
 
 
@@ -52,7 +52,7 @@ class Stage:
         file: The file that it came from.
         usd: The `pxr.Usd.Stage`.
         pxr: The modules of usd-core.
-        dropped: Prim paths by what was not kept of them, in the order met.
+        dropped: Prim paths by what was dropped of them, in the order found.
     """
 
     file: Path
@@ -61,12 +61,12 @@ class Stage:
     dropped: dict[str, list[str]] = field(default_factory=dict)
 
     @cached_property
-    def metres(self) -> float:
+    def metres_per_unit(self) -> float:
         """Length of the stage's unit [m]."""
         return float(self.pxr.UsdGeom.GetStageMetersPerUnit(self.usd))
 
     @cached_property
-    def kilograms(self) -> float:
+    def kilograms_per_unit(self) -> float:
         """Mass of the stage's unit [kg]."""
         return float(self.pxr.UsdPhysics.GetStageKilogramsPerUnit(self.usd))
 
@@ -77,12 +77,12 @@ class Stage:
         return tuple(usd.PrimRange(self.usd.GetPseudoRoot(), usd.TraverseInstanceProxies()))[1:]
 
     @cached_property
-    def world(self) -> Matrix:
+    def world_from_stage(self) -> Matrix:
         """From the stage's own space and unit to metres with Z up."""
         matrix = np.eye(4)
         if self.pxr.UsdGeom.GetStageUpAxis(self.usd) == self.pxr.UsdGeom.Tokens.y:
             matrix[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-        matrix[:3, :3] *= self.metres
+        matrix[:3, :3] *= self.metres_per_unit
         return matrix
 
     @cached_property
@@ -125,7 +125,7 @@ class Stage:
         own = np.eye(4) if prim.IsPseudoRoot() else np.array(self._poses.GetLocalToWorldTransform(prim), dtype=np.float64).T
         if not np.isfinite(own).all():
             raise self.error(prim, "its transform is not finite")
-        return self.world @ own
+        return self.world_from_stage @ own
 
     def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, 3]]:
         """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes.
@@ -146,7 +146,7 @@ class Stage:
         return RobotError(f"{self.file}: {prim.GetPath()}: {what}")
 
     def drop(self, what: str, prim: Prim) -> None:
-        """Take note of something that is not kept."""
+        """Record what MuJoCo cannot hold, for a warning when the stage is closed."""
         paths = self.dropped.setdefault(what, [])
         if (path := str(prim.GetPath())) not in paths:
             paths.append(path)
@@ -163,7 +163,7 @@ def _is_rounded(exact: Any, value: Any) -> bool:
 
 
 def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, 3]] | None:
-    """Split a linear map into a rotation after a scale along the axes (negative where it mirrors), or None if it shears."""
+    """Decompose a linear map into a rotation and a scale along the axes (negative for a reflection); None if it shears."""
     lengths = np.linalg.norm(linear, axis=0)
     if not (lengths > 0).all():
         return None
@@ -176,15 +176,15 @@ def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarr
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Stage]:
+def open_stage(path: Path) -> Iterator[Stage]:
     """Open a stage, with all that it refers to; at the end warn once of each kind of thing that was dropped.
 
-    USD's own printing is turned into warnings.
+    USD's diagnostics become warnings.
 
     Raises:
         RobotError: If it is not USD, or something that it refers to does not resolve.
     """
-    modules = pxr()
+    modules = usd_modules()
     printed = modules.UsdUtils.CoalescingDiagnosticDelegate()
     try:
         if not path.is_file():
@@ -192,7 +192,7 @@ def opened(path: Path) -> Iterator[Stage]:
         try:
             usd = modules.Usd.Stage.Open(str(path))
         except modules.Tf.ErrorException as error:
-            raise RobotError(f"{path}: not a USD file: {_told(error)}") from error
+            raise RobotError(f"{path}: not a USD file: {_message(error)}") from error
         stage = Stage(path, usd, modules)
         _check_composition(stage)
         yield stage
@@ -205,8 +205,8 @@ def opened(path: Path) -> Iterator[Stage]:
         del printed
 
 
-def _told(error: Exception) -> str:
-    """Return USD's own account of an error, without the places in its sources."""
+def _message(error: Exception) -> str:
+    """Return the text of a USD error without file names and lines of its sources."""
     lines = [line.partition(" : ")[2].strip("' ") for line in str(error).splitlines() if " : " in line]
     return " ".join("; ".join(dict.fromkeys(lines)).split())
 

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tgdsl.errors import RobotError, SampleError, TgdslError
-from tgdsl.formats.robot import Model
-from tgdsl.placement.propose.anatomy import Hand, hands, robot_tree, scenery
-from tgdsl.placement.propose.closing import Closing
-from tgdsl.placement.sample import spread
+from tgdsl.formats.model import Model
+from tgdsl.placement.propose.flexion import Flexion
+from tgdsl.placement.propose.hands import Hand, free_standing, hands, kinematic_tree
+from tgdsl.placement.sample import poisson
 from tgdsl.surfaces import meshlab
 from tgdsl.surfaces.region import Region
 
@@ -37,8 +37,8 @@ _ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
 
 
 @dataclass(frozen=True, eq=False)
-class Skin:
-    """Points spread over what can be touched of a body, in its frame.
+class LinkSurface:
+    """Samples of the outer surface of a body, in its frame.
 
     Attributes:
         area: Its whole surface [m²].
@@ -116,29 +116,29 @@ def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
     Raises:
         TgdslError: If no link can be sampled, or if the density asks for more taxels than a link can have.
     """
-    skins, left_out = _skins(robot)
-    tree = robot_tree(robot, {n: s.area for n, s in skins.items()}, {n: s.centroid for n, s in skins.items()})
-    names = {int(robot.compiled.body(name).id): name for name in skins}
-    for body in scenery(tree):
-        del skins[names[body]]
+    surfaces, left_out = _link_surfaces(robot)
+    tree = kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+    names = {int(robot.compiled.body(name).id): name for name in surfaces}
+    for body in free_standing(tree):
+        del surfaces[names[body]]
         left_out.append((names[body], "stands or floats by itself: taken for scenery or an object"))
-    if not skins:
+    if not surfaces:
         what = "; ".join(f'"{name}": {why}' for name, why in left_out)
         raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({what})" if what else ""))
     found = hands(tree)
     facing: dict[str, tuple[float, ...] | None] = {}
     for hand in found:
-        closing = Closing(tree, hand)
+        flexion = Flexion(tree, hand)
         wanted = [*hand.fingers, *([hand.palm] if hand.palm is not None else [])]
-        facing |= {names[body]: closing.direction(body) for body in wanted}
-    links = tuple(_link(name, skins[name], facing.get(name), density) for name in robot.bodies if name in skins)
-    groups = _groups(found, names, tuple(skins)) if with_groups else {}
-    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(skins)))
+        facing |= {names[body]: flexion.direction(body) for body in wanted}
+    links = tuple(_link(name, surfaces[name], facing.get(name), density) for name in robot.bodies if name in surfaces)
+    groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
+    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)))
 
 
-def _skins(robot: Model) -> tuple[dict[str, Skin], list[tuple[str, str]]]:
+def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str, str]]]:
     """Return what can be touched of each named body with geoms, and why some cannot be sampled."""
-    skins: dict[str, Skin] = {}
+    surfaces: dict[str, LinkSurface] = {}
     left_out = [("world", "no link")] if robot.touchable("world") else []
     for body in robot.bodies[1:]:
         geoms = robot.touchable(body)
@@ -146,40 +146,40 @@ def _skins(robot: Model) -> tuple[dict[str, Skin], list[tuple[str, str]]]:
             left_out.append((body, "no geoms"))
             continue
         try:
-            skin = _skin(robot, body)
+            surface = _link_surface(robot, body)
         except (RobotError, SampleError) as error:
             left_out.append((body, str(error).removeprefix(f"{robot.file}: ")))
             continue
-        if skin is None or skin.area < MIN_AREA:
-            left_out.append((body, "a surface without area" if skin else "nothing that can be touched from outside"))
+        if surface is None or surface.area < MIN_AREA:
+            left_out.append((body, "a surface without area" if surface else "nothing that can be touched from outside"))
         else:
-            skins[body] = skin
+            surfaces[body] = surface
     model = robot.compiled
     unnamed = sum(not model.body(i).name and model.body_geomnum[i] > 0 for i in range(model.nbody))
     if unnamed:
         left_out.append((f"{unnamed} more", "bodies with geoms but no name"))
-    return skins, left_out
+    return surfaces, left_out
 
 
-def _skin(robot: Model, body: str) -> Skin | None:
+def _link_surface(robot: Model, body: str) -> LinkSurface | None:
     surface = robot.surface(robot.touchable(body))
     if not surface.face_areas.sum() > MIN_AREA:
-        return Skin(0.0, np.zeros(3), np.zeros((0, 3)))
+        return LinkSurface(0.0, np.zeros(3), np.zeros((0, 3)))
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
         raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
-    pool = spread.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
-    return None if pool is None else Skin(pool.area, pool.pos.mean(axis=0), pool.normal)
+    pool = poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
+    return None if pool is None else LinkSurface(pool.area, pool.pos.mean(axis=0), pool.normal)
 
 
-def _link(name: str, skin: Skin, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
+def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
     share = 1.0
     if facing is not None:
-        share = float(_faces(skin.normals, facing).mean())
+        share = float(_faces(surface.normals, facing).mean())
         if share < MIN_SHARE:
             share, facing = 1.0, None
-    area = share * skin.area
+    area = share * surface.area
     counts = {resolution: max(1, round(area * density * factor)) for resolution, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(

@@ -13,7 +13,7 @@ from typing import Any
 from tgdsl.errors import TgdslError, listed
 from tgdsl.fields import units
 from tgdsl.files.files import with_folder, writable, write_whole
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, escaped, propose
 
 WIDTH = 120

@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import SampleError
-from tgdsl.placement.sample import spread
+from tgdsl.placement.sample import poisson
 from tgdsl.placement.sample.points import point_table
 from tgdsl.schema.placement import Grid, Placement, Points, Poisson
 from tgdsl.surfaces import meshlab
-from tgdsl.surfaces.rays import View, first_hits, frame, reference_axes, seen_rectangle
+from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, reference_axes, visible_rectangle
 from tgdsl.surfaces.region import Region, unit
 from tgdsl.surfaces.surface import Surface
 
 MIN_COSINE = 0.1
 """A grid cell on a steep face counts at most 1/0.1 times its projected area."""
-MAX_DENSITY = spread.MAX_POOL / spread.PER_SAMPLE
+MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
 
 
@@ -73,9 +73,9 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
     normal is the hit face's, turned against the ray should the mesh be inside out. With `rows_reversed` rows run up: the
     frame is left-handed, as the mirror image of a grid is.
     """
-    view = View.of(surface, _grid_axes(placement))
+    view = OrthographicView.of(surface, _grid_axes(placement))
     region = Region.of(surface, placement.region)
-    rectangle = seen_rectangle(view, region)
+    rectangle = visible_rectangle(view, region)
     if rectangle is None:
         what = "the link's surface" if region.is_everything else "the region"
         raise SampleError(f"no part of {what} is seen along {_shown(placement.direction)}", "turn `direction`")
@@ -136,13 +136,13 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
 
 
 def _poisson(surface: Surface, placement: Poisson) -> Samples:
-    """Spread samples evenly: an exact count by sample elimination, or as many as fit at a spacing."""
+    """Poisson-disk samples: an exact count by sample elimination, or as many as fit at a spacing by dart throwing."""
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
         raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
     region = Region.of(surface, placement.region)
-    pool = spread.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    pool = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
     if pool is None:
         raise SampleError("no part of the link's outer surface is in the region", "widen `region`")
     if placement.count is not None and len(pool.pos) < placement.count:
@@ -152,14 +152,14 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
         least = np.sqrt(pool.area / MAX_DENSITY)
         what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
         raise SampleError(what, f"expected at least {least:.2g} m")
-    chosen = spread.spread(pool, placement.count, placement.spacing, placement.seed)
+    chosen = poisson.choose(pool, placement.count, placement.spacing, placement.seed)
     normal = pool.normal[chosen]
     return Samples(
         pos=pool.pos[chosen],
         normal=normal,
         tangent=_tangent(normal, reference_axes(normal)),
         radius=np.full(len(chosen), placement.radius),
-        area=spread.shares(pool, chosen),
+        area=poisson.voronoi_areas(pool, chosen),
         cell=np.full((len(chosen), 2), -1),
     )
 

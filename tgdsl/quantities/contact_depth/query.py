@@ -1,7 +1,7 @@
 """The question most contact sensors ask: how deep is a probe in which object, which way is out, how does it move.
 
 Two steps: `measure` finds the distance of every probe to every object, once, and `penetration` makes of it what one sensor
-feels, of which there may be several with different gates, objects and wants. `search.search` does both where a GPU's kernel can.
+feels, of which there may be several with different gates and objects. `search.search` does both where a GPU's kernel can.
 
 Shapes: `env` environments, `pair` (link, object) pairs, `taxel` probes, `geom` geoms of an object.
 """

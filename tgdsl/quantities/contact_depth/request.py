@@ -56,7 +56,7 @@ class ContactDepth(Request[Penetration]):
     """Asks how deep probes are in objects: the deepest object wins, the first among equals.
 
     Attributes:
-        radius: How far from each taxel objects are felt [m], (taxel,); None: the probes' own radii. Inactive probes feel nothing.
+        radius: How far from each taxel objects are felt [m], (taxel,); None: the probes' own. Inactive probes feel nothing.
         range: Distance from an object's surface up to which it is needed [m], if more than the radius.
         normal: Whether the normal is asked for.
         motion: Whether the velocities are.

@@ -6,8 +6,8 @@ at a time holds an anchor: the deepest when it was taken, the first among equals
 
     s_i = R_oᵀ (e_i − c_o) − x_i,        t_i = Π_ni(s_i)                                      [m]
 
-R_o, c_o how the object sees the link (`geoms.distance.Frame`), x_i the taxel's place. With a friction cap, |t_i| ≤ `slip` h_i: beyond it
-the skin slides, t_i is scaled back, and the anchor is dragged along by as much.
+R_o, c_o how the object sees the link (`geoms.distance.Frame`), x_i the taxel's place. With a friction cap, |t_i| ≤ `slip` h_i:
+beyond it the skin slides, t_i is scaled back, and the anchor is dragged along by as much.
 
 Shapes: planes (env, taxel); in `reference`, (taxel,) and (taxel, 3).
 """

@@ -10,53 +10,54 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.robot import SHAPE_NAMES
-from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
-from tgdsl.formats.usd.notes import GEOM, MESH, SITE, Notes, notable, plain
+from tgdsl.formats.model import SHAPE_NAMES
+from tgdsl.formats.usd.custom_attributes import GEOM, MESH, SITE, AttributeTable, default_model, non_default
+from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
+from tgdsl.formats.usd.stage import usd_modules
 
 MESH_GEOM = int(mujoco.mjtGeom.mjGEOM_MESH)
 MASKS = ("contype", "conaffinity")
-"""What is noted of visuals too."""
+"""Custom attributes of visuals too."""
 AS_SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-"""How the importer takes meshes, unless it is noted otherwise."""
+"""How the importer takes meshes without the custom attribute `inertia`."""
 PLAIN_RGBA = (0.5, 0.5, 0.5, 1.0)
 """MuJoCo's default colour of a geom: if a material is there too, the material's shows."""
 
 
-def add_geoms(draft: Draft, body: int, materials: str) -> None:
+def add_geoms(writer: StageWriter, body: int, materials: str) -> None:
     """Write the geoms of a body below its prim.
 
     Args:
-        draft: The stage.
+        writer: Where to write it.
         body: MuJoCo's index.
         materials: Path of the scope that holds the physics materials.
 
     Raises:
         RobotError: If USD has no such shape.
     """
-    model = draft.model
+    model = writer.model
     first = int(model.body_geomadr[body])
     for geom in range(first, first + int(model.body_geomnum[body])):
-        shape, scale = _define(draft, geom)
+        shape, scale = _define(writer, geom)
         prim = shape.GetPrim()
-        place(prim, *_pose(draft, geom), scale)
-        note(prim, "name", model.geom(geom).name)
-        _colour(draft, geom, shape)
+        set_pose(prim, *_pose(writer, geom), scale)
+        set_custom(prim, "name", model.geom(geom).name)
+        _colour(writer, geom, shape)
         is_colliding = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
-        for key, value in _notes(draft, GEOM, geom).items():
+        for key, value in _custom_attributes(writer, GEOM, geom).items():
             if is_colliding or key in MASKS:
-                note(prim, key, value)
+                set_custom(prim, key, value)
         if is_colliding:
-            _collide(draft, geom, prim, materials)
+            _add_collider(writer, geom, prim, materials)
 
 
-def _notes(draft: Draft, table: Notes, index: int) -> dict[str, Any]:
-    return notable(table, lambda name: getattr(draft.model, name)[index], lambda name: getattr(plain(), name)[0])
+def _custom_attributes(writer: StageWriter, table: AttributeTable, index: int) -> dict[str, Any]:
+    return non_default(table, lambda name: getattr(writer.model, name)[index], lambda name: getattr(default_model(), name)[0])
 
 
-def _pose(draft: Draft, geom: int) -> tuple[np.ndarray, np.ndarray]:
+def _pose(writer: StageWriter, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a geom's pose in its body's frame; of a mesh, that of the frame which its file is in."""
-    model, mesh = draft.model, int(draft.model.geom_dataid[geom])
+    model, mesh = writer.model, int(writer.model.geom_dataid[geom])
     pos, quat = model.geom_pos[geom], model.geom_quat[geom]
     if model.geom_type[geom] != MESH_GEOM:
         return pos, quat
@@ -65,9 +66,9 @@ def _pose(draft: Draft, geom: int) -> tuple[np.ndarray, np.ndarray]:
     return pos - turn.apply(model.mesh_pos[mesh]), quat
 
 
-def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
+def _define(writer: StageWriter, geom: int) -> tuple[Any, np.ndarray | None]:
     """Define a geom's prim without its pose; return its schema, and the scale that it wants."""
-    model, shapes = draft.model, usd().UsdGeom
+    model, shapes = writer.model, usd_modules().UsdGeom
     kind, size = SHAPE_NAMES.get(int(model.geom_type[geom]), "unknown"), model.geom_size[geom]
     name = model.geom(geom).name
     mesh = model.mesh(model.geom_dataid[geom]).name if kind == "mesh" else ""
@@ -76,15 +77,15 @@ def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
     body = int(model.geom_bodyid[geom])
     if schema is None:
         shown = f'geom "{name}"' if name else f"unnamed {kind} geom {geom}"
-        raise RobotError(f"{draft.file}: {shown} of body {draft.body_name(body)} is of type {kind}, which USD does not have")
-    shape = getattr(shapes, schema).Define(draft.stage, draft.path(draft.bodies[body], name or mesh or kind))
+        raise RobotError(f"{writer.file}: {shown} of body {writer.body_name(body)} is of type {kind}, which USD does not have")
+    shape = getattr(shapes, schema).Define(writer.stage, writer.path(writer.bodies[body], name or mesh or kind))
     scale = size if kind in ("box", "ellipsoid") else None
     if kind == "box":
         shape.CreateSizeAttr(2.0)
     elif kind == "ellipsoid":
         shape.CreateRadiusAttr(1.0)
     elif kind == "mesh":
-        _fill(draft, geom, shape)
+        _add_triangles(writer, geom, shape)
     elif kind == "plane":
         shape.CreateAxisAttr("Z")
         for create, half in ((shape.CreateWidthAttr, size[0]), (shape.CreateLengthAttr, size[1])):
@@ -95,22 +96,22 @@ def _define(draft: Draft, geom: int) -> tuple[Any, np.ndarray | None]:
     if kind in ("capsule", "cylinder"):
         shape.CreateAxisAttr("Z")
         shape.CreateHeightAttr(2.0 * float(size[1]))
-    shape.CreateExtentAttr(shapes.Boundable.ComputeExtentFromPlugins(shape, usd().Usd.TimeCode.Default()))
+    shape.CreateExtentAttr(shapes.Boundable.ComputeExtentFromPlugins(shape, usd_modules().Usd.TimeCode.Default()))
     return shape, scale
 
 
-def _fill(draft: Draft, geom: int, shape: Any) -> None:
+def _add_triangles(writer: StageWriter, geom: int, shape: Any) -> None:
     """Write a mesh's triangles as its file has them, and what MuJoCo makes of them."""
-    model, mesh, u = draft.model, int(draft.model.geom_dataid[geom]), usd()
+    model, mesh, u = writer.model, int(writer.model.geom_dataid[geom]), usd_modules()
     shape.CreatePointsAttr(u.Vt.Vec3fArray.FromNumpy(_file_vertices(model, mesh)))
     first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
     shape.CreateFaceVertexIndicesAttr(u.Vt.IntArray.FromNumpy(model.mesh_face[first : first + count].astype(np.int32).ravel()))
     shape.CreateFaceVertexCountsAttr(u.Vt.IntArray.FromNumpy(np.full(count, 3, dtype=np.int32)))
     shape.CreateSubdivisionSchemeAttr("none")
-    note(shape.GetPrim(), "mesh", model.mesh(mesh).name)
-    own, usual = draft.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
-    for key, value in notable(MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name)).items():
-        note(shape.GetPrim(), key, value)
+    set_custom(shape.GetPrim(), "mesh", model.mesh(mesh).name)
+    own, usual = writer.spec.mesh(model.mesh(mesh).name), mujoco.MjSpec().add_mesh(inertia=AS_SHELL)
+    for key, value in non_default(MESH, lambda name: getattr(own, name), lambda name: getattr(usual, name)).items():
+        set_custom(shape.GetPrim(), key, value)
 
 
 def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "vertex 3"]:
@@ -130,46 +131,46 @@ def _file_vertices(model: mujoco.MjModel, mesh: int) -> Float[np.ndarray, "verte
     return np.ascontiguousarray(found + 0.0, dtype=np.float32)
 
 
-def _colour(draft: Draft, geom: int, shape: Any) -> None:
-    model = draft.model
+def _colour(writer: StageWriter, geom: int, shape: Any) -> None:
+    model = writer.model
     rgba, material = model.geom_rgba[geom], int(model.geom_matid[geom])
     if material >= 0 and np.array_equal(rgba, np.array(PLAIN_RGBA, dtype=rgba.dtype)):
         rgba = model.mat_rgba[material]
     *colour, opacity = rgba.tolist()
-    shape.CreateDisplayColorAttr([usd().Gf.Vec3f(*colour)])
+    shape.CreateDisplayColorAttr([usd_modules().Gf.Vec3f(*colour)])
     if opacity != 1.0:
         shape.CreateDisplayOpacityAttr([opacity])
 
 
-def _collide(draft: Draft, geom: int, prim: Any, materials: str) -> None:
-    u = usd()
+def _add_collider(writer: StageWriter, geom: int, prim: Any, materials: str) -> None:
+    u = usd_modules()
     u.UsdPhysics.CollisionAPI.Apply(prim)
     if prim.IsA(u.UsdGeom.Mesh):
         u.UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")  # as MuJoCo collides it
-    friction = float(draft.model.geom_friction[geom, 0])
-    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(draft, friction, materials), materialPurpose="physics")
+    friction = float(writer.model.geom_friction[geom, 0])
+    u.UsdShade.MaterialBindingAPI.Apply(prim).Bind(_material(writer, friction, materials), materialPurpose="physics")
 
 
-def _material(draft: Draft, friction: float, scope: str) -> Any:
+def _material(writer: StageWriter, friction: float, scope: str) -> Any:
     """Return the physics material of a sliding friction; geoms of the same friction share it."""
-    u = usd()
-    if friction not in draft.frictions:
-        material = u.UsdShade.Material.Define(draft.stage, draft.path(scope, f"friction_{friction!r}"))
+    u = usd_modules()
+    if friction not in writer.frictions:
+        material = u.UsdShade.Material.Define(writer.stage, writer.path(scope, f"friction_{friction!r}"))
         surface = u.UsdPhysics.MaterialAPI.Apply(material.GetPrim())
-        put(surface.CreateStaticFrictionAttr(), friction)
-        put(surface.CreateDynamicFrictionAttr(), friction)
-        draft.frictions[friction] = material
-    return draft.frictions[friction]
+        set_number(surface.CreateStaticFrictionAttr(), friction)
+        set_number(surface.CreateDynamicFrictionAttr(), friction)
+        writer.frictions[friction] = material
+    return writer.frictions[friction]
 
 
-def add_sites(draft: Draft, body: int) -> None:
+def add_sites(writer: StageWriter, body: int) -> None:
     """Write the sites of a body below its prim, as frames."""
-    model = draft.model
+    model = writer.model
     for site in np.flatnonzero(model.site_bodyid == body).tolist():
         name = model.site(site).name
-        prim = usd().UsdGeom.Xform.Define(draft.stage, draft.path(draft.bodies[body], name or "site")).GetPrim()
-        place(prim, model.site_pos[site], model.site_quat[site])
-        note(prim, "site", True)
-        note(prim, "name", name)
-        for key, value in _notes(draft, SITE, site).items():
-            note(prim, key, value)
+        prim = usd_modules().UsdGeom.Xform.Define(writer.stage, writer.path(writer.bodies[body], name or "site")).GetPrim()
+        set_pose(prim, model.site_pos[site], model.site_quat[site])
+        set_custom(prim, "site", True)
+        set_custom(prim, "name", name)
+        for key, value in _custom_attributes(writer, SITE, site).items():
+            set_custom(prim, key, value)

@@ -19,8 +19,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
-from tgdsl.formats.usd.export.draft import Draft, note, put, tidy, usd
-from tgdsl.formats.usd.notes import JOINT, notable, plain
+from tgdsl.formats.usd.custom_attributes import JOINT, default_model, non_default
+from tgdsl.formats.usd.export.stage_writer import StageWriter, rounded, set_custom, set_number
+from tgdsl.formats.usd.stage import usd_modules
 
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
 JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -29,26 +30,26 @@ NO_BIAS, AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIA
 SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoint"}
 
 
-def joint_of(draft: Draft, body: int) -> int:
+def joint_of(writer: StageWriter, body: int) -> int:
     """Return the index of a body's joint, or -1 if it is fixed to its parent.
 
     Raises:
         RobotError: If it has several joints.
     """
-    count = int(draft.model.body_jntnum[body])
+    count = int(writer.model.body_jntnum[body])
     if count > 1:
         raise RobotError(
-            f'{draft.file}: body "{draft.body_name(body)}" has {count} joints, and a body in USD has one to its parent; '
+            f'{writer.file}: body "{writer.body_name(body)}" has {count} joints, and a body in USD has one to its parent; '
             "give each joint a body of its own"
         )
-    return int(draft.model.body_jntadr[body]) if count else -1
+    return int(writer.model.body_jntadr[body]) if count else -1
 
 
-def add_joint(draft: Draft, body: int, scope: str, collides: bool) -> Any | None:
+def add_joint(writer: StageWriter, body: int, scope: str, collides: bool) -> Any | None:
     """Write the joint of a body to its parent; none if it floats freely or is placed by the user (mocap).
 
     Args:
-        draft: The stage, with all bodies.
+        writer: Where to write it; all bodies are there.
         body: MuJoCo's index of the child.
         scope: Path of the scope that holds the joints.
         collides: Whether the two bodies can collide with each other.
@@ -56,22 +57,22 @@ def add_joint(draft: Draft, body: int, scope: str, collides: bool) -> Any | None
     Returns:
         The joint's schema, if USD has a joint there that can move.
     """
-    model, joint = draft.model, joint_of(draft, body)
+    model, joint = writer.model, joint_of(writer, body)
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if kind == FREE or model.body_mocapid[body] >= 0:
         return None
     name = model.joint(joint).name if joint >= 0 else ""
-    physics = usd().UsdPhysics
-    path = draft.path(scope, name or f"{draft.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
-    made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(draft.stage, path)
-    note(made.GetPrim(), "name", name)
+    physics = usd_modules().UsdPhysics
+    path = writer.path(scope, name or f"{writer.body_name(body)}_{'fixed' if joint < 0 else 'joint'}")
+    made = getattr(physics, SCHEMAS.get(kind, "FixedJoint")).Define(writer.stage, path)
+    set_custom(made.GetPrim(), "name", name)
     parent = int(model.body_parentid[body])
     if parent:  # a joint without its first body holds the second in the world
-        made.CreateBody0Rel().SetTargets([draft.bodies[parent]])
-    made.CreateBody1Rel().SetTargets([draft.bodies[body]])
+        made.CreateBody0Rel().SetTargets([writer.bodies[parent]])
+    made.CreateBody1Rel().SetTargets([writer.bodies[body]])
     if collides:
         made.CreateCollisionEnabledAttr(True)
-    _frames(draft, body, joint, made)
+    _frames(writer, body, joint, made)
     if joint < 0:
         return None
     if kind in (SLIDE, HINGE):
@@ -81,8 +82,8 @@ def add_joint(draft: Draft, body: int, scope: str, collides: bool) -> Any | None
     return made
 
 
-def _frames(draft: Draft, body: int, joint: int, made: Any) -> None:
-    model = draft.model
+def _frames(writer: StageWriter, body: int, joint: int, made: Any) -> None:
+    model = writer.model
     pos, turn = np.zeros(3), Rotation.identity()
     kind = int(model.jnt_type[joint]) if joint >= 0 else -1
     if joint >= 0:
@@ -98,8 +99,8 @@ def _frames(draft: Draft, body: int, joint: int, made: Any) -> None:
         parent_turn = parent_turn * Rotation.from_rotvec([-rest, 0.0, 0.0])
     for number, (place, rotation) in enumerate(((parent_pos, parent_turn), (pos, turn))):
         quat = rotation.as_quat(canonical=True, scalar_first=True)
-        put(getattr(made, f"CreateLocalPos{number}Attr")(), tidy(place))
-        put(getattr(made, f"CreateLocalRot{number}Attr")(), tidy(quat))
+        set_number(getattr(made, f"CreateLocalPos{number}Attr")(), rounded(place))
+        set_number(getattr(made, f"CreateLocalRot{number}Attr")(), rounded(quat))
 
 
 def _x_to(axis: np.ndarray) -> Rotation:
@@ -114,26 +115,28 @@ def _limit(model: mujoco.MjModel, joint: int, made: Any) -> None:
     low, high = model.jnt_range[joint].tolist() if model.jnt_limited[joint] else (-math.inf, math.inf)
     if model.jnt_type[joint] == HINGE:
         low, high = math.degrees(low), math.degrees(high)
-    put(made.CreateLowerLimitAttr(), low)
-    put(made.CreateUpperLimitAttr(), high)
+    set_number(made.CreateLowerLimitAttr(), low)
+    set_number(made.CreateUpperLimitAttr(), high)
 
 
 def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     """Write a joint's armature, dry friction and damping, in SI units; of the first two PhysX has attributes, USD has none."""
     first = int(model.jnt_dofadr[joint])
     index = {"jnt": joint, "dof": first}
-    notes = notable(JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(plain(), name)[0])
+    notes = non_default(
+        JOINT, lambda name: getattr(model, name)[index[name[:3]]], lambda name: getattr(default_model(), name)[0]
+    )
     for key, value in notes.items():
-        note(prim, key, value)
+        set_custom(prim, key, value)
     known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
     if any(known.values()):
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
     for key, value in known.items():
         if value:
-            put(prim.CreateAttribute(f"physxJoint:{key}", usd().Sdf.ValueTypeNames.Float, custom=True), value)
+            set_number(prim.CreateAttribute(f"physxJoint:{key}", usd_modules().Sdf.ValueTypeNames.Float, custom=True), value)
     damping = float(model.dof_damping[first])
     if damping:
-        note(prim, "damping", damping)
+        set_custom(prim, "damping", damping)
     if damping and model.jnt_type[joint] in (SLIDE, HINGE):
         _drive(model, joint, Servo(0.0, 0.0, math.inf, None), prim)
 
@@ -157,34 +160,36 @@ class Servo:
     gear: float = 1.0
 
 
-def add_drives(draft: Draft, joints: dict[int, Any]) -> None:
+def add_drives(writer: StageWriter, joints: dict[int, Any]) -> None:
     """Write the actuators that USD has drives for; say which are left out.
 
     Args:
-        draft: The stage.
+        writer: Where to write them.
         joints: The schema of each joint that can move, by MuJoCo's index.
     """
-    model, driven = draft.model, list[int]()
+    model, driven = writer.model, list[int]()
     for actuator in range(model.nu):
         name = model.actuator(actuator).name
-        shown = f'{draft.file}: actuator "{name}"' if name else f"{draft.file}: unnamed actuator {actuator}"
+        shown = f'{writer.file}: actuator "{name}"' if name else f"{writer.file}: unnamed actuator {actuator}"
         servo, joint = _servo(model, actuator), int(model.actuator_trnid[actuator, 0])
         if servo is None:
             is_motor = model.actuator_biastype[actuator] == NO_BIAS and model.actuator_gaintype[actuator] == FIXED_GAIN
             what = "is a motor" if is_motor else "is no position or velocity servo of a hinge or slide joint"
-            draft.left_out.append(f"{shown} {what}, which USD has no drive for: left out")
+            writer.unsupported.append(f"{shown} {what}, which USD has no drive for: left out")
             continue
         if joint in driven:
-            draft.left_out.append(f"{shown} is not the first of its joint, and USD has one drive for each: left out")
+            writer.unsupported.append(f"{shown} is not the first of its joint, and USD has one drive for each: left out")
             continue
         driven.append(joint)
         low, high = model.actuator_forcerange[actuator].tolist()
         if model.actuator_forcelimited[actuator] and low != -high:
-            draft.left_out.append(f"{shown} has the force range {low:g} {high:g}, and USD's are symmetric: the larger is used")
+            writer.unsupported.append(
+                f"{shown} has the force range {low:g} {high:g}, and USD's are symmetric: the larger is used"
+            )
         _drive(model, joint, servo, joints[joint].GetPrim())
-        note(joints[joint].GetPrim(), "actuator", name)
+        set_custom(joints[joint].GetPrim(), "actuator", name)
     for order, joint in enumerate(driven if driven != sorted(driven) else ()):
-        note(joints[joint].GetPrim(), "order", order)
+        set_custom(joints[joint].GetPrim(), "order", order)
 
 
 def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
@@ -216,12 +221,12 @@ def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:
     """Write a servo as a joint's drive, or write it over the drive that is there."""
     is_hinge = model.jnt_type[joint] == HINGE
     unit = math.radians(1.0) if is_hinge else 1.0  # an angular drive counts in degrees
-    drive = usd().UsdPhysics.DriveAPI.Apply(prim, "angular" if is_hinge else "linear")
+    drive = usd_modules().UsdPhysics.DriveAPI.Apply(prim, "angular" if is_hinge else "linear")
     drive.CreateTypeAttr("force")
-    put(drive.CreateStiffnessAttr(), servo.stiffness * unit)
-    put(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
-    put(drive.CreateMaxForceAttr(), servo.limit)
+    set_number(drive.CreateStiffnessAttr(), servo.stiffness * unit)
+    set_number(drive.CreateDampingAttr(), (servo.damping + float(model.dof_damping[model.jnt_dofadr[joint]])) * unit)
+    set_number(drive.CreateMaxForceAttr(), servo.limit)
     if servo.control:
-        note(prim, "ctrlrange", servo.control)
+        set_custom(prim, "ctrlrange", servo.control)
     if servo.gear != 1.0:
-        note(prim, "gear", servo.gear)
+        set_custom(prim, "gear", servo.gear)

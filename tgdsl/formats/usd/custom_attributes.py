@@ -1,6 +1,6 @@
-"""What MuJoCo has and USD has no word for: attributes `tgdsl:<MJCF's name>`, that the exporter writes and the importer reads.
+"""Custom attributes `tgdsl:<MJCF's name>`: what MuJoCo has and USD has no schema for, written on export and read on import.
 
-Their values are MJCF's: SI units and radians, whatever the units of the stage. What MuJoCo has by default is not noted.
+Their values are MJCF's: SI units and radians, whatever the units of the stage. MuJoCo's defaults are not written.
 
 A value that USD keeps in float32 has a twin in double, `tgdsl:<USD's own name>`, in USD's unit. It counts as long as USD's
 value is what it rounds to: who edits the stage edits USD's.
@@ -17,9 +17,9 @@ import numpy as np
 
 from tgdsl.formats.usd.stage import NAMESPACE, Prim, Stage
 
-Notes = dict[str, str]
+AttributeTable = dict[str, str]
 """Attributes of an MJCF element, and the arrays of `MjModel` (or fields of `MjOption`, `MjsMesh`) that hold their values."""
-GEOM: Notes = {
+GEOM: AttributeTable = {
     "condim": "geom_condim",
     "priority": "geom_priority",
     "friction": "geom_friction",
@@ -31,16 +31,16 @@ GEOM: Notes = {
     "contype": "geom_contype",
     "conaffinity": "geom_conaffinity",
 }
-JOINT: Notes = {
+JOINT: AttributeTable = {
     "margin": "jnt_margin",
     "solreflimit": "jnt_solref",
     "solimplimit": "jnt_solimp",
     "solreffriction": "dof_solref",
     "solimpfriction": "dof_solimp",
 }
-SITE: Notes = {"type": "site_type", "size": "site_size", "group": "site_group", "rgba": "site_rgba"}
-MESH: Notes = {"maxhullvert": "maxhullvert", "inertia": "inertia"}
-OPTION: Notes = {
+SITE: AttributeTable = {"type": "site_type", "size": "site_size", "group": "site_group", "rgba": "site_rgba"}
+MESH: AttributeTable = {"maxhullvert": "maxhullvert", "inertia": "inertia"}
+OPTION: AttributeTable = {
     name: name
     for name in (
         *(
@@ -59,7 +59,7 @@ OPTION: Notes = {
         *("sdf_iterations", "sdf_initpoints", "wind", "magnetic", "o_margin", "o_solref", "o_solimp", "o_friction"),
     )
 }
-WORDS = {
+KEYWORDS = {
     "type": ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box"),
     "inertia": ("convex", "exact", "legacy", "shell"),
     "integrator": ("Euler", "RK4", "implicit", "implicitfast", "discrete"),
@@ -67,38 +67,38 @@ WORDS = {
     "jacobian": ("dense", "sparse", "auto"),
     "solver": ("PGS", "CG", "Newton"),
 }
-"""MJCF's words where it has no numbers, in the order of MuJoCo's."""
+"""MJCF's keywords, in the order of MuJoCo's enumerations."""
 FLAGS = {"disable": (mujoco.mjtDisableBit, "mjDSBL_"), "enable": (mujoco.mjtEnableBit, "mjENBL_")}
-"""MuJoCo's flags that are noted if set, as lists of MJCF's names, and the bits that they are."""
+"""MuJoCo's flags that are written if set, as lists of MJCF's names, and their bits."""
 KNOWN_FLAGS = ("gravity", "filterparent")
-"""Flags that USD has words for."""
+"""Flags that USD has attributes for."""
 
 
 @cache
-def plain() -> mujoco.MjModel:
-    """Return a model in which all that is noted is as MuJoCo has it by default."""
+def default_model() -> mujoco.MjModel:
+    """Return a model with MuJoCo's default value of every attribute in the tables."""
     inside = '<body><joint/><geom type="sphere" size="1"/><site/></body>'
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
 
 
-def notable(table: Notes, own: Any, usual: Any) -> dict[str, Any]:
-    """Return the values of a table that are not as usual, by MJCF's names, as `note` wants them.
+def non_default(table: AttributeTable, own: Any, usual: Any) -> dict[str, Any]:
+    """Return the values of a table that are not MuJoCo's defaults, by MJCF's names, as `set_custom` takes them.
 
     Args:
-        table: What could be noted.
+        table: The attributes.
         own: By the array's name, an element's value: any callable.
-        usual: The same of an element that MuJoCo's defaults hold for.
+        usual: The same of an element with MuJoCo's defaults.
     """
     found = {}
     for attribute, array in table.items():
         value = np.asarray(own(array))
         if not np.array_equal(value, usual(array)):
-            found[attribute] = WORDS[attribute][int(value)] if attribute in WORDS else value.tolist()
+            found[attribute] = KEYWORDS[attribute][int(value)] if attribute in KEYWORDS else value.tolist()
     return found
 
 
-def flags(model: mujoco.MjModel) -> dict[str, list[str]]:
-    """Return the flags of a model that are to be noted, by `disable` and `enable`."""
+def non_default_flags(model: mujoco.MjModel) -> dict[str, list[str]]:
+    """Return the flags of a model that are set and that USD has no attribute for, by `disable` and `enable`."""
     found = {}
     for key, (bits, prefix) in FLAGS.items():
         names = {
@@ -109,20 +109,20 @@ def flags(model: mujoco.MjModel) -> dict[str, list[str]]:
     return {key: names for key, names in found.items() if names}
 
 
-def read_note(stage: Stage, prim: Prim, key: str) -> Any:
-    """Return the value of a note, or None."""
+def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
+    """Return the value of a custom attribute, or None."""
     return stage.authored(prim, f"{NAMESPACE}{key}")
 
 
-def read_notes(stage: Stage, prim: Prim, attributes: Iterable[str]) -> dict[str, str]:
-    """Return what is noted of a prim, as attributes of an MJCF element."""
-    found = {attribute: read_note(stage, prim, attribute) for attribute in attributes}
+def read_mjcf_attributes(stage: Stage, prim: Prim, attributes: Iterable[str]) -> dict[str, str]:
+    """Return a prim's custom attributes as attributes of an MJCF element."""
+    found = {attribute: read_custom(stage, prim, attribute) for attribute in attributes}
     return {attribute: _text(value) for attribute, value in found.items() if value is not None}
 
 
-def read_flags(stage: Stage, scene: Prim) -> dict[str, str]:
-    """Return the flags that are noted of a physics scene, as attributes of an MJCF element."""
-    return {str(name): key for key in FLAGS for name in read_note(stage, scene, key) or ()}
+def read_option_flags(stage: Stage, scene: Prim) -> dict[str, str]:
+    """Return a physics scene's solver flags as attributes of an MJCF element."""
+    return {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
 
 
 def _text(value: Any) -> str:

@@ -1,7 +1,7 @@
-"""Which side of a link is its inner side: guessed from how the hand closes, and left open where that is not clear.
+"""The palmar side of each link, guessed from how the joints flex; None where that is not clear.
 
 A joint that moves one way only closes toward the end of its range at which the fingertips are nearer to one another and to
-the palm. A link's inner side faces where its own joint then carries it; the palm's faces the fingertips as they close.
+the palm. A link's palmar side faces where its own joint then carries it; the palm's faces the fingertips as they close.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.placement.propose.anatomy import Hand, Tree
+from tgdsl.placement.propose.hands import Hand, KinematicTree
 
 ONE_SIDED = 3.0
 """A joint bends one way if its range from the start is this many times longer on one side than on the other."""
@@ -26,14 +26,14 @@ LINK_SNAP, PALM_SNAP = np.radians(30.0), np.radians(40.0)
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-class Closing:
-    """How a hand closes."""
+class Flexion:
+    """Which way each joint of a hand flexes."""
 
-    def __init__(self, tree: Tree, hand: Hand):
+    def __init__(self, tree: KinematicTree, hand: Hand):
         """Look at each joint of the fingers by itself, the others half closed and then closed."""
         self.tree, self.hand = tree, hand
         self.data = mujoco.MjData(tree.model)
-        inner = {s for body in hand.fingers for s in tree.path(tree.segment[body])} - set(tree.path(hand.stem))
+        inner = {s for body in hand.fingers for s in tree.path(tree.segment[body])} - set(tree.path(hand.base))
         self.bending = {s: joint for s in sorted(inner - hand.looped) if (joint := _bending(tree, s)) is not None}
         self.others = tree.model.qpos0.copy()
         for joint in self.bending.values():
@@ -45,7 +45,7 @@ class Closing:
         self.closed = {joint: _end(tree, joint, sum(pair)) for joint, pair in gains.items() if _is_clear(*pair)}
 
     def direction(self, body: int) -> tuple[float, ...] | None:
-        """Return where the inner side of a body faces, in its frame; None if that cannot be told."""
+        """Return where the palmar side of a body faces, in its frame; None if that is not clear."""
         if body == self.hand.palm:
             return self._palm_direction()
         joint = self.bending.get(self.tree.segment[body])
@@ -59,7 +59,7 @@ class Closing:
                 return None
         low, high = model.jnt_range[joint]
         along = along * (1.0 if self.closed[joint] > 0.5 * (low + high) else -1.0)
-        return _snapped(data.xmat[body].reshape(3, 3).T @ along, LINK_SNAP, is_free=True)
+        return _snapped(data.xmat[body].reshape(3, 3).T @ along, LINK_SNAP, keeps_oblique=True)
 
     def _palm_direction(self) -> tuple[float, ...] | None:
         palm = self.hand.palm
@@ -67,7 +67,7 @@ class Closing:
         if palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
             return None
         half, nearly, whole = (self._toward(palm, tips, share) for share in (0.5, 0.75, 1.0))
-        direction = _snapped(nearly, PALM_SNAP, is_free=False)
+        direction = _snapped(nearly, PALM_SNAP, keeps_oblique=False)
         # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
         is_clear = direction is not None and min(half @ direction, whole @ direction) > 0.5
         return direction if is_clear else None
@@ -113,7 +113,7 @@ class Closing:
         return self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ self.tree.centroid[body]
 
 
-def _end(tree: Tree, joint: int, gain: float) -> float:
+def _end(tree: KinematicTree, joint: int, gain: float) -> float:
     return float(tree.model.jnt_range[joint, 1 if gain > 0 else 0])
 
 
@@ -123,7 +123,7 @@ def _is_clear(half: float, whole: float) -> bool:
     return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
 
 
-def _bending(tree: Tree, segment: int) -> int | None:
+def _bending(tree: KinematicTree, segment: int) -> int | None:
     """Return the only joint of a segment that moves one way from the start, within limits."""
     found = []
     for joint in tree.joints(segment):
@@ -138,10 +138,10 @@ def _bending(tree: Tree, segment: int) -> int | None:
     return found[0] if len(found) == 1 else None
 
 
-def _snapped(direction: Float[np.ndarray, " 3"], angle: float, is_free: bool) -> tuple[float, ...] | None:
+def _snapped(direction: Float[np.ndarray, " 3"], angle: float, keeps_oblique: bool) -> tuple[float, ...] | None:
     """Return the axis of the frame that is near a direction; if none is, the direction itself or None."""
     direction = direction / max(float(np.linalg.norm(direction)), 1e-9)
     axis = int(np.abs(direction).argmax())
     if abs(direction[axis]) >= np.cos(angle):
         return tuple(float(np.sign(direction[axis])) if i == axis else 0.0 for i in range(3))
-    return tuple(round(float(x), 2) + 0.0 for x in direction) if is_free else None
+    return tuple(round(float(x), 2) + 0.0 for x in direction) if keeps_oblique else None

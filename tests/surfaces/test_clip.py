@@ -1,4 +1,4 @@
-"""Part of a surface as a surface of its own: area, place and orientation of what is left."""
+"""A surface clipped to a region: area, place and orientation of what is left."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from surfaces import ball, box, surface_of
 
 from tgdsl.errors import SampleError
 from tgdsl.fields.regions import Region
-from tgdsl.surfaces.region import cut
+from tgdsl.surfaces.region import clip
 
 READ = TypeAdapter(Region).validate_python
 UP = {"facing": [0, 0, 1], "within": "10 deg"}
@@ -18,7 +18,7 @@ def bounds(low, high):
 
 
 def test_a_rectangle_is_cut_out_of_a_face():
-    left = cut(surface_of(box((0.04, 0.03, 0.02))), READ([UP, bounds([-0.01, -0.005, 0], [0.015, 1, 1])]))
+    left = clip(surface_of(box((0.04, 0.03, 0.02))), READ([UP, bounds([-0.01, -0.005, 0], [0.015, 1, 1])]))
     np.testing.assert_allclose(left.face_areas.sum(), 0.025 * 0.02, rtol=1e-9)
     np.testing.assert_allclose(left.face_normals, np.broadcast_to([0, 0, 1.0], (len(left.faces), 3)), atol=1e-12)
     np.testing.assert_allclose(
@@ -28,14 +28,16 @@ def test_a_rectangle_is_cut_out_of_a_face():
 
 def test_halves_add_up_whatever_the_triangles():
     whole = surface_of(ball(0.01))
-    parts = [cut(whole, READ(bounds(low, high))) for low, high in (([-1, -1, -1], [0.003, 1, 1]), ([0.003, -1, -1], [1, 1, 1]))]
+    parts = [
+        clip(whole, READ(bounds(low, high))) for low, high in (([-1, -1, -1], [0.003, 1, 1]), ([0.003, -1, -1], [1, 1, 1]))
+    ]
     np.testing.assert_allclose(sum(part.face_areas.sum() for part in parts), whole.face_areas.sum(), rtol=1e-9)
     for part in parts:
         assert (part.face_normals @ np.array([0, 0, 1.0]) * part.corners.mean(axis=1)[:, 2] >= -1e-9).all()  # outward still
 
 
 def test_geoms_keep_their_names():
-    left = cut(surface_of(ball(0.01), ball(0.01, (0.03, 0, 0))), READ({"geoms": "g1"}))
+    left = clip(surface_of(ball(0.01), ball(0.01, (0.03, 0, 0))), READ({"geoms": "g1"}))
     assert {left.geoms[i][0] for i in left.face_geom} == {"g1"}
 
 
@@ -49,4 +51,4 @@ def test_geoms_keep_their_names():
 )
 def test_what_cannot_be_cut(region, message):
     with pytest.raises(SampleError, match=message):
-        cut(surface_of(box((0.04, 0.03, 0.02))), READ(region))
+        clip(surface_of(box((0.04, 0.03, 0.02))), READ(region))

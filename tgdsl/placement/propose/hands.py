@@ -19,13 +19,13 @@ from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tgdsl.formats.robot import Model
+from tgdsl.formats.model import Model
 
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class KinematicTree:
     """The segments of a robot, and the surface that their bodies carry.
 
     Attributes:
@@ -97,18 +97,18 @@ class Tree:
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """What a tree of the robot is taken for.
+    """Palm, fingers and tips found in a kinematic tree.
 
     Attributes:
-        stem: Segment from which the fingers branch off; 0 if they hang on the world.
+        base: Segment from which the fingers branch off; 0 if they hang on the world.
         palm: The largest body of it, or None if it has no surface.
         tips: Bodies at the ends of the fingers.
-        fingers: All bodies that move against the stem, tips included.
+        fingers: All bodies that move against the base, tips included.
         looped: Segments in chains that are closed to loops.
         others: The rest, such as a wrist.
     """
 
-    stem: int
+    base: int
     palm: int | None
     tips: list[int]
     fingers: list[int]
@@ -116,7 +116,7 @@ class Hand:
     others: list[int] = field(default_factory=list)
 
 
-def robot_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, Float[np.ndarray, " 3"]]) -> Tree:
+def kinematic_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, Float[np.ndarray, " 3"]]) -> KinematicTree:
     """Return the tree of a robot.
 
     Args:
@@ -125,60 +125,60 @@ def robot_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, F
         centroid: Centre of that surface in the body's frame, by name [m].
     """
     ids = {name: int(robot.compiled.body(name).id) for name in area}
-    return Tree(robot.compiled, {ids[n]: area[n] for n in area}, {ids[n]: centroid[n] for n in area})
+    return KinematicTree(robot.compiled, {ids[n]: area[n] for n in area}, {ids[n]: centroid[n] for n in area})
 
 
-def scenery(tree: Tree) -> list[int]:
-    """Return the bodies with surface that are no part of the robot if others are: single segments that stand or float."""
+def free_standing(tree: KinematicTree) -> list[int]:
+    """Return the bodies with surface that are scenery if others are not: single segments, fixed or floating."""
     roots = [segment for segment, parent in tree.parent.items() if not parent]
     single = {root for root in roots if root not in tree.parent.values() and not _is_driven(tree, root)}
     return [] if single >= tree.carries else [body for segment in sorted(single) for body in tree.bodies[segment]]
 
 
-def _is_driven(tree: Tree, segment: int) -> bool:
+def _is_driven(tree: KinematicTree, segment: int) -> bool:
     """Return whether a segment has one or two hinges and slides: none stands still, more let it go anywhere."""
     kinds = [int(tree.model.jnt_type[joint]) for joint in tree.joints(segment)]
     return 0 < len(kinds) < 3 and int(mujoco.mjtJoint.mjJNT_FREE) not in kinds
 
 
-def hands(tree: Tree) -> list[Hand]:
-    """Return what each tree of the robot is taken for; trees that hang on the world by a hinge or slide make up one hand."""
-    left_out = set(scenery(tree))
+def hands(tree: KinematicTree) -> list[Hand]:
+    """Return the hand found in each kinematic tree; trees that hang on the world by a hinge or slide make up one hand."""
+    left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
-    straight = [root for root in roots if _is_driven(tree, root) and len(_stems(tree, root)) == 0]
+    straight = [root for root in roots if _is_driven(tree, root) and len(_branchings(tree, root)) == 0]
     found = [_hand(tree, root, [s for s in tree.parent if root in tree.path(s)]) for root in roots if root not in straight]
     if straight:
         found.append(_hand(tree, 0, [s for s in tree.parent if _root(tree, s) in straight]))
     return found
 
 
-def _root(tree: Tree, segment: int) -> int:
+def _root(tree: KinematicTree, segment: int) -> int:
     return tree.path(segment)[-1]
 
 
-def _stems(tree: Tree, root: int) -> list[int]:
+def _branchings(tree: KinematicTree, root: int) -> list[int]:
     return [s for s in tree.parent if root in tree.path(s) and len(tree.children(s)) > 1]
 
 
-def _hand(tree: Tree, root: int, segments: list[int]) -> Hand:
-    stems = _stems(tree, root) if root else []
-    stem = min(stems, key=lambda s: (len(tree.path(s)), -_area(tree, s)), default=root)
-    beyond = [s for s in segments if s != stem and (not stem or stem in tree.path(s))]
-    own = tree.bodies[stem] if stem in stems else []
+def _hand(tree: KinematicTree, root: int, segments: list[int]) -> Hand:
+    branchings = _branchings(tree, root) if root else []
+    base = min(branchings, key=lambda s: (len(tree.path(s)), -_area(tree, s)), default=root)
+    beyond = [s for s in segments if s != base and (not base or base in tree.path(s))]
+    own = tree.bodies[base] if base in branchings else []
     palm = max(own, key=lambda body: (tree.area[body], -body), default=None)
-    ends, looped = _ends(tree, stem, palm, beyond)
+    ends, looped = _ends(tree, base, palm, beyond)
     fingers = [body for s in beyond for body in tree.bodies[s]]
     tips = [body for s in ends for body in _last(tree, s)]
     known = {palm, *fingers}
     others = [body for s in segments for body in tree.bodies[s] if body not in known]
-    return Hand(stem, palm, sorted(tips), sorted(fingers), looped, sorted(others))
+    return Hand(base, palm, sorted(tips), sorted(fingers), looped, sorted(others))
 
 
-def _area(tree: Tree, segment: int) -> float:
+def _area(tree: KinematicTree, segment: int) -> float:
     return sum(tree.area[body] for body in tree.bodies[segment])
 
 
-def _last(tree: Tree, segment: int) -> list[int]:
+def _last(tree: KinematicTree, segment: int) -> list[int]:
     """Return the bodies with surface of a segment that have no other such below them."""
     own = tree.bodies[segment]
     above = set()
@@ -188,7 +188,7 @@ def _last(tree: Tree, segment: int) -> list[int]:
     return [body for body in own if body not in above]
 
 
-def _ends(tree: Tree, stem: int, palm: int | None, beyond: list[int]) -> tuple[list[int], set[int]]:
+def _ends(tree: KinematicTree, base: int, palm: int | None, beyond: list[int]) -> tuple[list[int], set[int]]:
     """Return the last segments of all chains, and the segments of chains that are closed to loops."""
     leaves = [s for s in beyond if tree.bodies[s] and not tree.children(s)]
     bound = {s for pair in tree.loops for s in pair}
@@ -201,7 +201,7 @@ def _ends(tree: Tree, stem: int, palm: int | None, beyond: list[int]) -> tuple[l
     looped = {s for s in beyond if any(chain[place[b]] == chain[place[s]] for b in bound & place.keys())}
     data = mujoco.MjData(tree.model)
     mujoco.mj_kinematics(tree.model, data)
-    middle = _world(tree, data, palm) if palm is not None else data.xpos[stem]
+    middle = _world(tree, data, palm) if palm is not None else data.xpos[base]
     ends = []
     for number in range(chain.max(initial=-1) + 1):
         own = [s for s in leaves if chain[place[s]] == number]
@@ -211,5 +211,5 @@ def _ends(tree: Tree, stem: int, palm: int | None, beyond: list[int]) -> tuple[l
     return sorted(ends), looped
 
 
-def _world(tree: Tree, data: mujoco.MjData, body: int) -> Float[np.ndarray, " 3"]:
+def _world(tree: KinematicTree, data: mujoco.MjData, body: int) -> Float[np.ndarray, " 3"]:
     return data.xpos[body] + data.xmat[body].reshape(3, 3) @ tree.centroid[body]

@@ -1,4 +1,4 @@
-"""Which body hangs on which: a spanning tree of joints from each articulation's root, and the joints that close loops."""
+"""Articulations: a spanning tree of joints from each articulation's root, and the joints that close loops."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from tgdsl.formats.usd.joints import Joint
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
-    """A body's place in the tree.
+class TreeNode:
+    """A body and its parent in the spanning tree.
 
     Attributes:
         body: Path of the body.
         parent: Path of its parent; None is the world.
-        joint: What joins it to its parent, or None if it moves freely (or is moved by hand).
+        joint: What joins it to its parent, or None if it floats or is kinematic.
     """
 
     body: str
@@ -29,33 +29,33 @@ class Link:
 
 
 @dataclass(frozen=True, eq=False)
-class Tree:
+class SpanningTree:
     """A spanning tree of all bodies.
 
     Attributes:
-        links: By body; a parent comes before its children.
+        nodes: By body; a parent comes before its children.
         loops: Joints that are not in the tree.
     """
 
-    links: dict[str, Link]
+    nodes: dict[str, TreeNode]
     loops: tuple[Joint, ...]
 
-    def children(self, parent: str | None) -> tuple[Link, ...]:
-        """Return the links that hang on a body, or on the world."""
-        return tuple(link for link in self.links.values() if link.parent == parent)
+    def children(self, parent: str | None) -> tuple[TreeNode, ...]:
+        """Return the children of a body, or of the world."""
+        return tuple(node for node in self.nodes.values() if node.parent == parent)
 
 
-class _Planter:
-    """Grows the tree, one group of joined bodies after the other."""
+class _TreeBuilder:
+    """Builds the tree, one connected group of bodies after the other."""
 
     def __init__(self, kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]):
         self.kinematic = kinematic
         self.joints = [joint for joint in joints if joint.kind != "free"]
         self.roots = list(roots)
-        self.links: dict[str, Link] = {}
+        self.nodes: dict[str, TreeNode] = {}
         self.kept: list[Joint] = []
 
-    def grown(self) -> Tree:
+    def build(self) -> SpanningTree:
         waiting = self._groups()
         for group in list(waiting):
             held = [body for body in group if self.kinematic[body]]
@@ -63,23 +63,23 @@ class _Planter:
             if held or anchors:
                 waiting.remove(group)
                 anchor = None if held else min(anchors, key=lambda joint: self._rank(joint.path))
-                seeds = [Link(body, None, None) for body in held] or [Link(_end(anchor, None) or "", None, anchor)]
-                self._grow(seeds)
+                roots = [TreeNode(body, None, None) for body in held] or [TreeNode(_end(anchor, None) or "", None, anchor)]
+                self._extend(roots)
         while waiting:
-            group, seed = self._attached(waiting) or self._afloat(waiting)
+            group, root = self._attached(waiting) or self._floating(waiting)
             waiting.remove(group)
-            self._grow([seed])
-        used = {id(link.joint) for link in self.links.values()}
-        return Tree(self.links, tuple(joint for joint in self.joints if id(joint) not in used))
+            self._extend([root])
+        used = {id(node.joint) for node in self.nodes.values()}
+        return SpanningTree(self.nodes, tuple(joint for joint in self.joints if id(joint) not in used))
 
     def _rank(self, path: str) -> int:
-        """Order what could be a root: marked itself, below something marked, neither."""
+        """Rank a candidate root: has PhysicsArticulationRootAPI itself, is below a prim that has it, neither."""
         return 0 if path in self.roots else 1 if any(path.startswith(f"{root}/") for root in self.roots) else 2
 
     def _groups(self) -> list[list[str]]:
-        """Return bodies that joints of articulations hold together, in stage order, and keep those joints that are no loops."""
+        """Return connected components over articulated joints, in stage order, and keep the joints that close no loop."""
         group_of = {body: [body] for body in self.kinematic}
-        for joint in sorted(self.joints, key=_dispensable):
+        for joint in sorted(self.joints, key=_loop_priority):
             first, second = joint.bodies
             if first is not None and second is not None and not joint.is_excluded and group_of[first] is not group_of[second]:
                 group_of[first] += group_of[second]
@@ -89,7 +89,7 @@ class _Planter:
         return [sorted(group, key=order.index) for group in {id(group): group for group in group_of.values()}.values()]
 
     def _root(self, group: list[str]) -> tuple[str, bool]:
-        """Return the root of a group that is not joined to the world, and whether it is marked as such."""
+        """Return the root of a group that is not joined to the world, and whether it has PhysicsArticulationRootAPI."""
         marked = [body for body in group if body in self.roots]
         marked += [j.bodies[0] for j in self.joints if j.path in self.roots and j.bodies[0] in group and j.bodies[0]]
         if marked:
@@ -97,36 +97,36 @@ class _Planter:
         children = {joint.bodies[1] for joint in self.joints if not joint.is_excluded}
         return min(group, key=lambda body: (body in children, self._rank(body))), False
 
-    def _attached(self, waiting: list[list[str]]) -> tuple[list[str], Link] | None:
-        """Return a group that hangs on what is planted by a joint outside the articulations alone: that is no loop."""
+    def _attached(self, waiting: list[list[str]]) -> tuple[list[str], TreeNode] | None:
+        """Return a group that only a joint excluded from articulations joins to a body of the tree: it closes no loop."""
         for group in waiting:
             root, is_marked = self._root(group)
             for joint in self.joints:
                 for parent, body in (joint.bodies, joint.bodies[::-1]):
-                    is_planted = parent is None or parent in self.links
-                    if joint.is_excluded and is_planted and body in group and body and (body == root or not is_marked):
-                        return group, Link(body, parent, joint)
+                    is_placed = parent is None or parent in self.nodes
+                    if joint.is_excluded and is_placed and body in group and body and (body == root or not is_marked):
+                        return group, TreeNode(body, parent, joint)
         return None
 
-    def _afloat(self, waiting: list[list[str]]) -> tuple[list[str], Link]:
+    def _floating(self, waiting: list[list[str]]) -> tuple[list[str], TreeNode]:
         group = min(waiting, key=lambda group: not self._root(group)[1])
-        return group, Link(self._root(group)[0], None, None)
+        return group, TreeNode(self._root(group)[0], None, None)
 
-    def _grow(self, seeds: list[Link]) -> None:
-        """Add roots, and breadth first all that hangs on them."""
-        self.links |= {seed.body: seed for seed in seeds}
-        queue = [seed.body for seed in seeds]
+    def _extend(self, roots: list[TreeNode]) -> None:
+        """Add roots and, breadth first, their descendants."""
+        self.nodes |= {root.body: root for root in roots}
+        queue = [root.body for root in roots]
         while queue:
             parent = queue.pop(0)
             for joint in (joint for joint in self.joints if joint in self.kept):
                 body = _end(joint, parent)
-                if body is not None and body not in self.links:
-                    self.links[body] = Link(body, parent, joint)
+                if body is not None and body not in self.nodes:
+                    self.nodes[body] = TreeNode(body, parent, joint)
                     queue.append(body)
 
 
-def _dispensable(joint: Joint) -> tuple[bool, bool, bool]:
-    """Order joints by how much is lost where one closes a loop: a constraint can neither slide, nor be driven or limited."""
+def _loop_priority(joint: Joint) -> tuple[bool, bool, bool]:
+    """Rank joints by what is lost if they close a loop: an equality constraint can neither slide, nor be driven or limited."""
     return joint.kind != "slide", joint.drive is None, joint.range is None
 
 
@@ -137,7 +137,7 @@ def _end(joint: Joint | None, other: str | None) -> str | None:
     return joint.bodies[1] if joint.bodies[0] == other else joint.bodies[0]
 
 
-def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]) -> Tree:
+def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]) -> SpanningTree:
     """Choose the parent of every body.
 
     A kinematic body is a root. Else a group of joined bodies hangs on the world by one of its joints to it (by the marked
@@ -151,4 +151,4 @@ def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots:
         joints: All joints, in stage order.
         roots: Paths of the prims that are marked as roots of articulations.
     """
-    return _Planter(kinematic, joints, roots).grown()
+    return _TreeBuilder(kinematic, joints, roots).build()

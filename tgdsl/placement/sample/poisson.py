@@ -1,10 +1,11 @@
-"""Even samples of a link's outer surface: draw a dense pool, choose from it, share the area out.
+"""Poisson-disk samples of a link's outer surface, chosen from a dense pool of candidates, each with its Voronoi cell's area.
 
-A point is on the outer surface if it is in no solid part (by winding numbers) and can be seen from far away: pockets
+A point is on the outer surface if it is in no solid component (by winding numbers) and is visible from far away: pockets
 may be joined to the outside by a pinhole.
 
-pymeshlab's own samplers are unseeded and miss the asked count, so the pool is drawn by NumPy: seeded, area-weighted and
-stratified over the faces. An exact count is chosen from the pool by weighted sample elimination (Yuksel, "Sample
+Samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one sphere: 84 to
+92 points), trimesh's rejects points within a radius; none knows a region. So the pool is drawn by NumPy: seeded, area-weighted
+and stratified over the faces. An exact count is chosen from the pool by weighted sample elimination (Yuksel, "Sample
 Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015), a spacing by dart throwing.
 Distances are straight lines, not paths along the surface.
 
@@ -22,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from tgdsl.surfaces.meshlab import Shell
-from tgdsl.surfaces.rays import View, first_hits, frame
+from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
@@ -112,7 +113,7 @@ def _drawn(
     num: int,
     seed: int,
 ) -> Pool:
-    """Draw points evenly over pieces of faces; keep those in the region and on the outer surface."""
+    """Draw stratified points over pieces of faces; keep those in the region and on the outer surface."""
     rng = np.random.default_rng(seed)
     area = np.cumsum(_areas(corners))
     # One point in each of equal stretches of the cumulated area: never a bare patch, never a heap.
@@ -123,63 +124,63 @@ def _drawn(
     pos, face = np.einsum("nk,nkx->nx", weight, corners[piece]), face[piece]
     is_kept = region.has_points(pos)
     pos, face = pos[is_kept], face[is_kept]
-    is_kept = _outside(shell, region, pos, face)
+    is_kept = _on_outer_surface(shell, region, pos, face)
     return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], float(area[-1]) / num)
 
 
-def _outside(
+def _on_outer_surface(
     shell: Shell, region: Region, pos: Float[np.ndarray, "n 3"], face: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which points of faces are on the outside of the union of all solid parts.
+    """Return which points of faces are on the outside of the union of all solid components.
 
     Where solids touch back to back neither is outside; where their faces coincide and look the same way, only the first
-    part that belongs to the region keeps its points, lest the place count twice.
+    component that belongs to the region keeps its points, lest the place count twice.
     """
     normal = shell.surface.face_normals[face]
     above, below = pos + shell.offset * normal, pos - shell.offset * normal
-    part = shell.part[face]
+    component = shell.component[face]
     is_geom = np.ones(len(shell.surface.geoms), bool) if region.is_geom is None else region.is_geom
     is_out = np.ones(len(pos), dtype=bool)
     for solid in np.flatnonzero(shell.is_solid).tolist():
         is_out &= shell.winding(solid, above) < 0.5
-        if is_geom[shell.surface.face_geom[shell.part == solid]].any():
-            later = np.flatnonzero(is_out & (part > solid))
+        if is_geom[shell.surface.face_geom[shell.component == solid]].any():
+            later = np.flatnonzero(is_out & (component > solid))
             is_out[later] = shell.winding(solid, below[later]) < 0.5
-    is_out[is_out] = _seen(shell, above[is_out], normal[is_out])
+    is_out[is_out] = _visible(shell, above[is_out], normal[is_out])
     return is_out
 
 
-def _seen(shell: Shell, above: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return which points just above faces are seen from far away."""
-    is_seen = np.zeros(len(above), dtype=bool)
+def _visible(shell: Shell, above: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return which points just above faces are visible from far away in some direction."""
+    is_visible = np.zeros(len(above), dtype=bool)
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(DIRECTIONS)
     # A Fibonacci lattice covers the sphere evenly; walking it in steps of 37 meets every side early.
     height = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
     ring = np.sqrt(1.0 - height**2)
     lattice = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)
     for direction in lattice[37 * np.arange(DIRECTIONS) % DIRECTIONS]:
-        left = np.flatnonzero(~is_seen)
+        left = np.flatnonzero(~is_visible)
         left = left[normal[left] @ direction < -0.05]
         if not len(left):
             continue
-        view = View.of(shell.surface, frame(direction))
+        view = OrthographicView.of(shell.surface, frame(direction))
         uvt = above[left] @ view.axes.T
-        is_seen[left] = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2]
-    return is_seen
+        is_visible[left] = first_hits(view, uvt[:, :2]).depth >= uvt[:, 2]
+    return is_visible
 
 
-def spread(pool: Pool, count: int | None, spacing: float | None, seed: int) -> Int[np.ndarray, " taxel"]:
+def choose(pool: Pool, count: int | None, spacing: float | None, seed: int) -> Int[np.ndarray, " taxel"]:
     """Return the chosen points of a pool, ascending: exactly `count`, or as many as fit at `spacing` [m]."""
     order = np.random.default_rng([seed, 1]).permutation(len(pool.pos))
     if count is None:
         assert spacing is not None
-        return _thrown(pool.pos, order, spacing)
+        return _dart_throwing(pool.pos, order, spacing)
     candidates = np.sort(order[: CANDIDATES * count])
-    return candidates[_eliminated(pool.pos[candidates], count, pool.area)]
+    return candidates[_sample_elimination(pool.pos[candidates], count, pool.area)]
 
 
-def _thrown(pos: Float[np.ndarray, "pool 3"], order: Int[np.ndarray, " pool"], spacing: float) -> Int[np.ndarray, " n"]:
-    """Take points in some order, each unless it is within `spacing` of one taken before."""
+def _dart_throwing(pos: Float[np.ndarray, "pool 3"], order: Int[np.ndarray, " pool"], spacing: float) -> Int[np.ndarray, " n"]:
+    """Take points in some order; reject those within `spacing` of one taken before."""
     tree = KDTree(pos)
     is_free = np.ones(len(pos), dtype=bool)
     taken = []
@@ -190,7 +191,7 @@ def _thrown(pos: Float[np.ndarray, "pool 3"], order: Int[np.ndarray, " pool"], s
     return np.sort(np.array(taken, dtype=np.int64))
 
 
-def _eliminated(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[np.ndarray, " count"]:
+def _sample_elimination(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[np.ndarray, " count"]:
     """Remove the most crowded point until `count` are left (Yuksel 2015, with its α = 8, β = 0.65, γ = 1.5)."""
     reach = 2.0 * np.sqrt(area / (2.0 * np.sqrt(3.0) * count))
     floor = reach * (1.0 - (count / len(pos)) ** 1.5) * 0.65
@@ -215,7 +216,7 @@ def _eliminated(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[n
     return np.flatnonzero(is_left)
 
 
-def shares(pool: Pool, chosen: Int[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
-    """Return the area of the pool's points that are nearest to each chosen one [m²]."""
+def voronoi_areas(pool: Pool, chosen: Int[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
+    """Return the area of each chosen point's Voronoi cell on the surface, by counting the pool's points in it [m²]."""
     _, nearest = KDTree(pool.pos[chosen]).query(pool.pos)
     return pool.point_area * np.bincount(nearest, minlength=len(chosen))

@@ -1,12 +1,12 @@
 """Robots out: a compiled MJCF or URDF model as a UsdPhysics stage, in SI units but where USD wants degrees.
 
-Bodies are siblings below the default prim, at their world poses. What USD has no word for and tgdsl reads back is kept in
-attributes named `tgdsl:`, in SI units and radians:
+Bodies are siblings below the default prim, at their world poses. What USD has no schema for and tgdsl reads back is kept in
+custom attributes named `tgdsl:`, in SI units and radians:
 
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
   the actuator's place in the `order`, if actuators do not come in the joints' order;
-- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `usd_notes`.
+- contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
 
 Textures stay behind.
 """
@@ -23,115 +23,111 @@ import numpy as np
 
 from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.files import whole_file
-from tgdsl.formats.robot import load_model
-from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
+from tgdsl.formats.model import Model
+from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
 from tgdsl.formats.usd.export.joints import BALL, FREE, add_drives, add_joint, joint_of
-from tgdsl.formats.usd.notes import OPTION, flags, notable, plain
+from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
+from tgdsl.formats.usd.stage import usd_modules
 
 ELLIPSOID, PLANE = int(mujoco.mjtGeom.mjGEOM_ELLIPSOID), int(mujoco.mjtGeom.mjGEOM_PLANE)
-ENDINGS = (".usda", ".usdc", ".usd")
 
 
-def export_usd(model_file: Path, out: Path) -> None:
-    """Write a robot or scene file as a UsdPhysics stage; the same input gives the same bytes.
+def write_usd(model: Model, out: Path) -> None:
+    """Write a robot or scene as a UsdPhysics stage; the same input gives the same bytes.
 
     Warns of each thing of the model that USD does not hold, after the file is written.
 
     Args:
-        model_file: An MJCF or URDF file.
+        model: The robot or scene.
         out: The stage to write: `.usda` is text, `.usdc` and `.usd` are binary.
 
     Raises:
-        RobotError: If the model cannot be read, USD cannot express it, or the file cannot be written.
+        RobotError: If USD cannot express the model, or the file cannot be written.
     """
-    if out.suffix not in ENDINGS:
-        raise RobotError(f"{out}: USD files end in {listed(ENDINGS)}")
-    u = usd()
-    model = load_model(model_file)
-    draft = Draft(model_file, model.spec, model.compiled, u.Usd.Stage.CreateInMemory())
-    _add_scene(draft)
-    joints, materials = (draft.path(draft.root, name) for name in ("joints", "materials"))
-    _add_bodies(draft, materials)
-    _add_joints(draft, joints)
-    _add_filters(draft)
-    _write(draft, out)
-    for message in (*draft.left_out, *_left_out(draft)):
-        warnings.warn(message, stacklevel=2)
+    writer = StageWriter(model.file, model.spec, model.compiled, usd_modules().Usd.Stage.CreateInMemory())
+    _add_scene(writer)
+    joints, materials = (writer.path(writer.root, name) for name in ("joints", "materials"))
+    _add_bodies(writer, materials)
+    _add_joints(writer, joints)
+    _add_filters(writer)
+    _write(writer, out)
+    for message in (*writer.unsupported, *_unsupported_elements(writer)):
+        warnings.warn(message, stacklevel=3)
 
 
-def _add_scene(draft: Draft) -> None:
+def _add_scene(writer: StageWriter) -> None:
     """Write units, gravity and the default prim."""
-    u, model, stage = usd(), draft.model, draft.stage
+    u, model, stage = usd_modules(), writer.model, writer.stage
     u.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     u.UsdGeom.SetStageUpAxis(stage, u.UsdGeom.Tokens.z)
     u.UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     name = model.names[: model.names.index(b"\0")].decode()
-    draft.root = draft.path("", name)
-    root = u.UsdGeom.Xform.Define(stage, draft.root).GetPrim()
-    note(root, "name", name)
+    writer.root = writer.path("", name)
+    root = u.UsdGeom.Xform.Define(stage, writer.root).GetPrim()
+    set_custom(root, "name", name)
     stage.SetDefaultPrim(root)
     if np.any(model.jnt_type != FREE):
         u.UsdPhysics.ArticulationRootAPI.Apply(root)
     is_weightless = bool(model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     gravity = np.zeros(3) if is_weightless else model.opt.gravity
     strength = float(np.linalg.norm(gravity))
-    scene = u.UsdPhysics.Scene.Define(stage, draft.path("", "physicsScene"))
-    put(scene.CreateGravityMagnitudeAttr(), strength)
-    put(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
-    settings = notable(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(plain().opt, name))
-    for key, value in (settings | flags(model)).items():
-        note(scene.GetPrim(), key, value)
+    scene = u.UsdPhysics.Scene.Define(stage, writer.path("", "physicsScene"))
+    set_number(scene.CreateGravityMagnitudeAttr(), strength)
+    set_number(scene.CreateGravityDirectionAttr(), gravity / (strength or 1.0))
+    settings = non_default(OPTION, lambda name: getattr(model.opt, name), lambda name: getattr(default_model().opt, name))
+    for key, value in (settings | non_default_flags(model)).items():
+        set_custom(scene.GetPrim(), key, value)
 
 
-def _add_bodies(draft: Draft, materials: str) -> None:
+def _add_bodies(writer: StageWriter, materials: str) -> None:
     """Write every body at its world pose at `qpos0`, with its mass, geoms and sites."""
-    u, model = usd(), draft.model
+    u, model = usd_modules(), writer.model
     state = mujoco.MjData(model)
     mujoco.mj_kinematics(model, state)
     if np.any(model.geom_contype | model.geom_conaffinity):
-        u.UsdGeom.Scope.Define(draft.stage, materials)
+        u.UsdGeom.Scope.Define(writer.stage, materials)
     for body in range(model.nbody):
-        path = draft.path(draft.root, draft.body_name(body))
+        path = writer.path(writer.root, writer.body_name(body))
         if body == 0 and not model.body_geomnum[0] and not np.any(model.site_bodyid == 0):
             continue
-        draft.bodies[body] = path
-        prim = u.UsdGeom.Xform.Define(draft.stage, path).GetPrim()
+        writer.bodies[body] = path
+        prim = u.UsdGeom.Xform.Define(writer.stage, path).GetPrim()
         if body:
-            note(prim, "name", model.body(body).name)
-            place(prim, state.xpos[body], state.xquat[body])
-            _add_mass(draft, body, prim)
-        add_geoms(draft, body, materials)
-        add_sites(draft, body)
+            set_custom(prim, "name", model.body(body).name)
+            set_pose(prim, state.xpos[body], state.xquat[body])
+            _add_mass(writer, body, prim)
+        add_geoms(writer, body, materials)
+        add_sites(writer, body)
 
 
-def _add_mass(draft: Draft, body: int, prim: Any) -> None:
-    u, model = usd(), draft.model
+def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
+    u, model = usd_modules(), writer.model
     rigid = u.UsdPhysics.RigidBodyAPI.Apply(prim)
     if model.body_mocapid[body] >= 0:
         rigid.CreateKinematicEnabledAttr(True)
     mass = u.UsdPhysics.MassAPI.Apply(prim)
-    put(mass.CreateMassAttr(), model.body_mass[body])
-    put(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
+    set_number(mass.CreateMassAttr(), model.body_mass[body])
+    set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
         return  # of a body that has none, USD wants neither the moments nor their axes
-    put(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
-    put(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
+    set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
+    set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
 
-def _add_joints(draft: Draft, scope: str) -> None:
-    model, moving = draft.model, {}
+def _add_joints(writer: StageWriter, scope: str) -> None:
+    model, moving = writer.model, {}
     excluded = _excluded(model)
-    usd().UsdGeom.Scope.Define(draft.stage, scope)
+    usd_modules().UsdGeom.Scope.Define(writer.stage, scope)
     for body in range(1, model.nbody):
-        joint, parent = joint_of(draft, body), int(model.body_parentid[body])
-        collides = parent > 0 and (parent, body) not in excluded and not _is_one(model, parent, body)
-        made = add_joint(draft, body, scope, collides)
+        joint, parent = joint_of(writer, body), int(model.body_parentid[body])
+        collides = parent > 0 and (parent, body) not in excluded and not _never_collide(model, parent, body)
+        made = add_joint(writer, body, scope, collides)
         if made is not None:
             moving[joint] = made
         elif joint >= 0:
-            note(draft.stage.GetPrimAtPath(draft.bodies[body]), "freejoint", model.joint(joint).name)
-    add_drives(draft, moving)
+            set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
+    add_drives(writer, moving)
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
@@ -139,7 +135,7 @@ def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
     return {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature.tolist()}
 
 
-def _is_one(model: mujoco.MjModel, one: int, two: int) -> bool:
+def _never_collide(model: mujoco.MjModel, one: int, two: int) -> bool:
     """Return whether MuJoCo never collides two bodies: welded into one, or parent and child of which neither is fixed."""
     one, two = int(model.body_weldid[one]), int(model.body_weldid[two])
     if one == two or not one or not two or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
@@ -147,33 +143,33 @@ def _is_one(model: mujoco.MjModel, one: int, two: int) -> bool:
     return any(int(model.body_weldid[model.body_parentid[child]]) == parent for child, parent in ((one, two), (two, one)))
 
 
-def _add_filters(draft: Draft) -> None:
+def _add_filters(writer: StageWriter) -> None:
     """Write the pairs of bodies that do not collide and that USD would not know of.
 
     MuJoCo's own filter sees bodies that are welded together as one, USD's joints only the two that they join.
     """
-    model, u, stage = draft.model, usd(), draft.stage
+    model, u, stage = writer.model, usd_modules(), writer.stage
     pairs = _excluded(model)
     masks = model.geom_contype | model.geom_conaffinity
     colliding = sorted({int(body) for body in model.geom_bodyid[masks != 0]} - {0})
-    pairs |= {(a, b) for a, b in combinations(colliding, 2) if model.body_parentid[b] != a and _is_one(model, a, b)}
+    pairs |= {(a, b) for a, b in combinations(colliding, 2) if model.body_parentid[b] != a and _never_collide(model, a, b)}
     targets: dict[int, list[str]] = {}
     for one, two in sorted(pairs):
         if one:
-            targets.setdefault(one, []).append(draft.bodies[two])
-        elif one in draft.bodies:  # the world is no rigid body: each of its colliders is named
-            others = stage.GetPrimAtPath(draft.bodies[one]).GetChildren()
+            targets.setdefault(one, []).append(writer.bodies[two])
+        elif one in writer.bodies:  # the world is no rigid body: each of its colliders is named
+            others = stage.GetPrimAtPath(writer.bodies[one]).GetChildren()
             walls = [str(other.GetPath()) for other in others if other.HasAPI(u.UsdPhysics.CollisionAPI)]
             if walls:
                 targets.setdefault(two, []).extend(walls)
     for body, others in sorted(targets.items()):
-        filtered = u.UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(draft.bodies[body]))
+        filtered = u.UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(writer.bodies[body]))
         filtered.CreateFilteredPairsRel().SetTargets(others)
 
 
-def _left_out(draft: Draft) -> list[str]:
+def _unsupported_elements(writer: StageWriter) -> list[str]:
     """Return one message for each kind of thing that the model has and USD does not."""
-    model = draft.model
+    model = writer.model
     counts = {
         "equality constraints": model.neq,
         "tendons": model.ntendon,
@@ -188,7 +184,7 @@ def _left_out(draft: Draft) -> list[str]:
         "limits of ball joints": np.count_nonzero(model.jnt_limited[model.jnt_type == BALL]),
         "gravity compensations": np.count_nonzero(model.body_gravcomp),
     }
-    messages = [f"{draft.file}: USD holds no {kind}: {count} left out" for kind, count in counts.items() if count]
+    messages = [f"{writer.file}: USD holds no {kind}: {count} left out" for kind, count in counts.items() if count]
     colliding = (model.geom_contype | model.geom_conaffinity) != 0
     unfit = {
         "no ellipsoids, and leaves out or rounds": (model.geom_type == ELLIPSOID) & colliding,
@@ -196,19 +192,19 @@ def _left_out(draft: Draft) -> list[str]:
     }
     for what, geoms in unfit.items():
         names = [model.geom(geom).name or f"unnamed geom {geom}" for geom in np.flatnonzero(geoms).tolist()]
-        messages += [f"{draft.file}: USD's physics has {what}: {listed(names)}"] if names else []
+        messages += [f"{writer.file}: USD's physics has {what}: {listed(names)}"] if names else []
     light = [body for body in range(1, model.nbody) if not model.body_mass[body] and model.body_weldid[body]]
     if light:
-        names = listed([draft.body_name(body) for body in light])
-        messages.append(f"{draft.file}: USD takes a mass of 0 for one that is not given: {names}")
+        names = listed([writer.body_name(body) for body in light])
+        messages.append(f"{writer.file}: USD takes a mass of 0 for one that is not given: {names}")
     return messages
 
 
-def _write(draft: Draft, out: Path) -> None:
+def _write(writer: StageWriter, out: Path) -> None:
     """Write the stage to a file that is whole whenever it is there."""
     try:
         with whole_file(out) as temporary:
-            if not draft.stage.GetRootLayer().Export(str(temporary)):
+            if not writer.stage.GetRootLayer().Export(str(temporary)):
                 raise OSError(0, "USD did not say why")
     except FileError as error:
         raise RobotError(f"{out}: cannot be written: {error.reason}") from error

@@ -1,45 +1,28 @@
-"""A USD stage in the making: its names, its poses, and what it was not able to hold."""
+"""A USD stage that is being written: prim paths, transforms, attributes, and what is unsupported."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.errors import RobotError
-from tgdsl.formats.usd.stage import NAMESPACE
+from tgdsl.formats.usd.stage import NAMESPACE, usd_modules
 
 DECIMALS = 14
 """Decimals of positions and rotations: those beyond are rounding, which differs from machine to machine."""
 
 
-def tidy(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"]:
-    """Return a position [m] or rotation without the noise of its last digits."""
+def rounded(values: Float[np.ndarray, " number"]) -> Float[np.ndarray, " number"]:
+    """Return a position [m] or rotation rounded to `DECIMALS`."""
     return np.round(values, DECIMALS) + 0.0
 
 
-def usd() -> Any:
-    """Return USD's modules by their names; they are an extra, and only this function imports them.
-
-    Raises:
-        RobotError: If usd-core is not installed.
-    """
-    try:
-        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
-    except ImportError as error:
-        raise RobotError("USD files need usd-core, which is not installed: pip install usd-core") from error
-    return SimpleNamespace(
-        Gf=Gf, Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, Vt=Vt
-    )  # fmt: skip
-
-
 @dataclass(eq=False)
-class Draft:
+class StageWriter:
     """A stage that a compiled model is being written to.
 
     Attributes:
@@ -50,7 +33,7 @@ class Draft:
         root: Path of the default prim.
         bodies: Path of each body's prim by MuJoCo's index; the world's is there only if it holds something.
         frictions: The physics material of each sliding friction that is in use.
-        left_out: One message for each thing that USD does not hold.
+        unsupported: One message for each thing that USD does not hold.
     """
 
     file: Path
@@ -60,12 +43,12 @@ class Draft:
     root: str = ""
     bodies: dict[int, str] = field(default_factory=dict)
     frictions: dict[float, Any] = field(default_factory=dict)
-    left_out: list[str] = field(default_factory=list)
+    unsupported: list[str] = field(default_factory=list)
     _taken: set[str] = field(default_factory=set)
 
     def path(self, parent: str, name: str) -> str:
         """Return a path below a prim that is valid, like the name, and not yet taken; and take it."""
-        plain = f"{parent}/{usd().Tf.MakeValidIdentifier(name)}"
+        plain = f"{parent}/{usd_modules().Tf.MakeValidIdentifier(name)}"
         found, number = plain, 0
         while found in self._taken:
             number += 1
@@ -78,7 +61,7 @@ class Draft:
         return self.model.body(body).name or f"body_{body}"
 
 
-def place(
+def set_pose(
     prim: Any,
     pos: Float[np.ndarray, 3],
     quat: Float[np.ndarray, 4],
@@ -92,33 +75,33 @@ def place(
         quat: Its rotation, w x y z.
         scale: Factors along its own axes, applied first.
     """
-    u = usd()
+    u = usd_modules()
     xform, double = u.UsdGeom.Xformable(prim), u.UsdGeom.XformOp.PrecisionDouble
-    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*tidy(pos).tolist()))
-    xform.AddOrientOp(double).Set(u.Gf.Quatd(*tidy(quat).tolist()))
+    xform.AddTranslateOp(double).Set(u.Gf.Vec3d(*rounded(pos).tolist()))
+    xform.AddOrientOp(double).Set(u.Gf.Quatd(*rounded(quat).tolist()))
     if scale is not None:
         xform.AddScaleOp(double).Set(u.Gf.Vec3d(*scale.tolist()))
 
 
-def note(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
-    """Keep on a prim what USD has no word for, as the attribute `tgdsl:<key>`; an empty name is not kept."""
+def set_custom(prim: Any, key: str, value: str | bool | int | float | tuple[float, float] | list[float] | list[str]) -> None:
+    """Set a prim's custom attribute `tgdsl:<key>`; an empty string is not written."""
     if value == "":
         return
-    types = usd().Sdf.ValueTypeNames
+    types = usd_modules().Sdf.ValueTypeNames
     kinds = {str: types.String, bool: types.Bool, int: types.Int, float: types.Double, tuple: types.Double2}
     kinds[list] = types.StringArray if isinstance(value, list) and isinstance(value[0], str) else types.DoubleArray
     kind = kinds[type(value)]
     prim.CreateAttribute(f"{NAMESPACE}{key}", kind, custom=True).Set(value)
 
 
-def put(attribute: Any, value: float | Float[np.ndarray, " number"]) -> None:
-    """Set an attribute to 15 digits, and keep them in its double twin `tgdsl:<its name>` where it has float32 only.
+def set_number(attribute: Any, value: float | Float[np.ndarray, " number"]) -> None:
+    """Set an attribute to 15 digits; where it is float32, also its double-precision copy `tgdsl:<its name>`.
 
     Args:
         attribute: A number, a vector of three or a quaternion (w x y z).
         value: Its value.
     """
-    u, digits = usd(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
+    u, digits = usd_modules(), [float(f"{number:.15g}") + 0.0 for number in np.ravel(value).tolist()]
     types, kind = u.Sdf.ValueTypeNames, attribute.GetTypeName().type.typeName
     if kind == "GfQuatf":
         exact, wide = u.Gf.Quatd(*digits), types.Quatd

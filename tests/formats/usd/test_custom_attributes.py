@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from pxr import Usd
 
-from tgdsl.formats.robot import load_model
-from tgdsl.formats.usd.export.writer import export_usd
-from tgdsl.formats.usd.notes import FLAGS, KNOWN_FLAGS, OPTION
+from tgdsl.formats.robot import export_model, load_model
+from tgdsl.formats.usd.custom_attributes import FLAGS, KNOWN_FLAGS, OPTION
 
 MODEL = """
 <mujoco model="notes">
@@ -51,7 +50,7 @@ EXACT = 1e-14
 
 def exported(folder: Path, option: str = "", flags: str = "") -> Path:
     (folder / "notes.xml").write_text(MODEL.format(option=option, flags=flags))
-    export_usd(folder / "notes.xml", folder / "notes.usda")
+    export_model(folder / "notes.xml", folder / "notes.usda")
     return folder / "notes.usda"
 
 
@@ -141,7 +140,7 @@ def test_a_damped_joint_without_a_servo_has_no_actuator(tmp_path):
     (tmp_path / "door.xml").write_text(
         "<mujoco><worldbody><body><joint name='hinge' damping='.3'/><geom size='.1'/></body></worldbody></mujoco>"
     )
-    export_usd(tmp_path / "door.xml", tmp_path / "door.usda")
+    export_model(tmp_path / "door.xml", tmp_path / "door.usda")
     door = load_model(tmp_path / "door.usda").compiled
     assert door.nu == 0
     assert door.joint("hinge").damping[0] == 0.3
@@ -155,7 +154,7 @@ def test_meshes_of_one_name_are_kept_apart(tmp_path):
         f"<mujoco><asset>{meshes}</asset><worldbody><body><geom name='b' type='mesh' mesh='a'/>"
         "<geom name='c' type='mesh' mesh='b'/><geom name='d' type='mesh' mesh='c'/></body></worldbody></mujoco>"
     )
-    export_usd(tmp_path / "m.xml", tmp_path / "m.usda")
+    export_model(tmp_path / "m.xml", tmp_path / "m.usda")
     stage = Usd.Stage.Open(str(tmp_path / "m.usda"))
     stage.GetPrimAtPath("/MuJoCo_Model/body_1/c").GetAttribute("tgdsl:mesh").Set("a")
     stage.Save()
@@ -172,7 +171,7 @@ def test_a_mesh_keeps_its_vertices_its_hull_and_its_name(tmp_path):
         "<mujoco><asset><mesh name='prism' maxhullvert='12' vertex='" + " ".join(map(str, points.ravel())) + "'/></asset>"
         "<worldbody><body><geom name='rod' type='mesh' mesh='prism' pos='.1 .2 .3' quat='.5 .5 -.5 .5'/></body></worldbody></mujoco>"
     )
-    export_usd(tmp_path / "rod.xml", tmp_path / "rod.usda")
+    export_model(tmp_path / "rod.xml", tmp_path / "rod.usda")
     models = load_model(tmp_path / "rod.xml").compiled, load_model(tmp_path / "rod.usda").compiled
     assert models[1].mesh(0).name == "prism"
     for name in ("mesh_vert", "mesh_face", "mesh_graph"):

@@ -1,0 +1,134 @@
+"""URDF: meshes found and at their place, inertias mended, mistakes told."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from robot_files import MESH_TOLERANCE, nearest, trimesh_of, wedge
+from scipy.spatial.transform import Rotation
+
+from tgdsl.errors import RobotError
+from tgdsl.formats.robot import load_model
+
+BALL = "<inertial><mass value='.1'/><inertia ixx='1e-5' iyy='1e-5' izz='1e-5' ixy='0' ixz='0' iyz='0'/></inertial>"
+
+
+def urdf_of(folder: Path, links: str, name: str = "hand.urdf") -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"<robot name='hand'>{links}</robot>")
+    return path
+
+
+def link_of(name: str, geometry: str, inertial: str = BALL, origin: str = "") -> str:
+    return f"<link name='{name}'>{inertial}<collision>{origin}<geometry>{geometry}</geometry></collision></link>"
+
+
+def joint_of(name: str, parent: str, child: str, kind: str = "fixed") -> str:
+    limit = "<limit lower='-1' upper='1' effort='1' velocity='1'/><axis xyz='0 0 1'/>" if kind != "fixed" else ""
+    return f"<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>{limit}</joint>"
+
+
+@pytest.mark.parametrize(
+    "reference", ["wedge.stl", "./meshes/../wedge.stl", "package://hand_pkg/urdf/wedge.stl", "file://wedge.stl"]
+)
+def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
+    folder = tmp_path / "hand_pkg" / "urdf"
+    origin = "<origin xyz='.01 -.02 .03' rpy='.3 -.4 .5'/>"
+    mesh = f"<mesh filename='{reference}' scale='.001 .001 .001'/>"
+    path = urdf_of(
+        folder, link_of("palm", mesh, origin=origin) + link_of("tip", "<sphere radius='.01'/>") + joint_of("j", "palm", "tip")
+    )
+    (folder / "meshes").mkdir()
+    wedge().export(folder / "wedge.stl")
+    model = load_model(path)
+    assert model.is_urdf
+    rotation = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix()
+    expected = (wedge().vertices * 1e-3) @ rotation.T + [0.01, -0.02, 0.03]
+    assert nearest(trimesh_of(model, "palm").vertices, expected) < MESH_TOLERANCE
+    assert model.bodies == ("world", "palm", "tip")  # a fixed link keeps its body
+    assert [geom.mesh for geom in model.geoms] == ["wedge", ""]
+
+
+def test_urdf_primitives_and_joints(tmp_path):
+    links = link_of("base", "<box size='.02 .04 .06'/>") + link_of("a", "<cylinder radius='.01' length='.04'/>")
+    path = urdf_of(tmp_path, links + joint_of("j", "base", "a", "revolute"), "hand.xml")  # told by its root, not its name
+    model = load_model(path)
+    assert model.is_urdf
+    assert [geom.shape for geom in model.geoms] == ["box", "cylinder"]
+    np.testing.assert_allclose(trimesh_of(model, "base").extents, [0.02, 0.04, 0.06])
+    np.testing.assert_allclose(trimesh_of(model, "a").extents, [0.02, 0.02, 0.04], rtol=2e-3)
+    assert model.compiled.njnt == 1
+
+
+def test_urdf_inertias_are_mended_with_one_warning(tmp_path):
+    def inertial(*moments: float) -> str:
+        attributes = " ".join(f"i{axes}='{m}'" for axes, m in zip(("xx", "yy", "zz", "xy", "xz", "yz"), moments, strict=True))
+        return f"<inertial><mass value='.1'/><inertia {attributes}/></inertial>"
+
+    inertias = {
+        "base": inertial(1e-5, 1e-5, 1e-5, 0, 0, 0),
+        "flat": inertial(1e-5, 1e-5, 2e-5, 0, 0, 0),  # a disc: at the edge of what is possible
+        "zero": inertial(0, 0, 0, 0, 0, 0),
+        "long": inertial(1e-6, 1e-6, 1e-5, 0, 0, 0),  # breaks the triangle inequality
+        "skew": inertial(1e-5, 1e-5, 1e-5, 2e-5, 0, 0),  # not positive definite
+    }
+    links = "".join(link_of(name, "<sphere radius='.01'/>", inertia) for name, inertia in inertias.items())
+    names = list(inertias)
+    path = urdf_of(tmp_path, links + "".join(joint_of(f"j{n}", names[0], n, "revolute") for n in names[1:]))
+    with pytest.warns(UserWarning, match="mended") as caught:
+        model = load_model(path)
+    assert [str(w.message) for w in caught] == [f"{path}: inertias that no body can have were mended: zero, long, skew"]
+    moments = {name: model.compiled.body(name).inertia for name in names}
+    np.testing.assert_allclose(moments["base"], 1e-5)
+    np.testing.assert_allclose(moments["flat"], [2e-5, 1e-5, 1e-5])
+    np.testing.assert_allclose(moments["zero"], 1e-9)
+    np.testing.assert_allclose(moments["long"], 4e-6)
+    np.testing.assert_allclose(moments["skew"], 1e-5)
+
+
+def test_sound_urdf_gives_no_warning(tmp_path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_model(urdf_of(tmp_path, link_of("base", "<sphere radius='.01'/>")))
+    assert [str(w.message) for w in caught] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (link_of("a", "<mesh filename='gone.stl'/>"), 'mesh "gone.stl": there is no file {folder}/gone.stl'),
+        (
+            link_of("a", "<mesh filename='package://pkg/m/gone.stl'/>"),
+            'mesh "package://pkg/m/gone.stl": no folder above the file holds "pkg/m/gone.stl"',
+        ),
+        ("<link>", "not XML: mismatched tag: line 1, column 27"),
+    ],
+)
+def test_urdf_errors(tmp_path, text, message):
+    path = urdf_of(tmp_path, text)
+    with pytest.raises(RobotError) as caught:
+        load_model(path)
+    assert str(caught.value) == f"{path}: {message.format(folder=tmp_path.resolve())}"
+
+
+def test_a_number_that_is_none_in_a_urdf(tmp_path):
+    bad = BALL.replace("ixx='1e-5'", "ixx='abc'")
+    path = urdf_of(tmp_path, link_of("a", "<sphere radius='.01'/>", bad))
+    with pytest.raises(RobotError, match=r"hand\.urdf: .*'ixx'.*inertia.*line 1"):
+        load_model(path)
+
+
+def test_urdf_meshes_of_one_name_in_two_folders(tmp_path):
+    for folder, size in (("left", 0.02), ("right", 0.04)):
+        (tmp_path / folder).mkdir()
+        trimesh.creation.box((size, size, size)).export(tmp_path / folder / "tip.stl")
+    links = link_of("a", "<mesh filename='left/tip.stl'/>") + link_of("b", "<mesh filename='right/tip.stl'/>")
+    links += link_of("c", "<mesh filename='right/tip.stl' scale='2 2 2'/>")
+    model = load_model(urdf_of(tmp_path, links + joint_of("j", "a", "b") + joint_of("k", "a", "c")))
+    assert [geom.mesh for geom in model.geoms] == ["tip", "tip_2", "tip_21"]
+    np.testing.assert_allclose(trimesh_of(model, "c").extents, 0.08, rtol=1e-5)
+    np.testing.assert_allclose(trimesh_of(model, "a").extents, 0.02, rtol=1e-5)
+    np.testing.assert_allclose(trimesh_of(model, "b").extents, 0.04, rtol=1e-5)

@@ -1,0 +1,146 @@
+"""A proposed layout: its file, its text and its mistakes."""
+
+import pytest
+from odd_hands import CAPSULES, FOUR_BAR, VISUAL, compiled
+
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.links import open_robot
+from tgdsl.placement.propose.propose import propose
+from tgdsl.schema.load import load_layout
+from tgdsl.schema.placement import LayoutSpec
+
+
+def test_the_file_says_what_was_left_out_and_what_is_a_guess(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(VISUAL)
+    code, said, _ = here(tmp_path, "layout", "new", "hand.xml")
+    assert code == 0
+    text = (tmp_path / "layout.yaml").read_text()
+    for line in (
+        "# Left out: floor: unnamed plane geom 4 of body floor has no bounded surface to put taxels on\n",
+        '# Left out: "1 more": bodies with geoms but no name\n',
+        "# Left out: table, target: stands or floats by itself: taken for scenery or an object\n",
+        "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n",
+        '  tips: ["jaw a", "jaw b"]\n',
+    ):
+        assert line in text
+    assert "left out: floor: " in said
+    (tmp_path / "hand.xml").write_text(CAPSULES)
+    here(tmp_path, "layout", "new", "hand.xml", "--force")
+    text = (tmp_path / "layout.yaml").read_text()
+    assert '  tips: ["[t]ips", "f[[]2] end", "thumb end"]\n' in text and '  palm: ["[p]alm"]\n' in text
+
+
+URDF = """<robot name="jaws">
+  <link name="base"><collision><geometry><box size=".1 .1 .02"/></geometry></collision></link>
+  <link name="left"><collision><origin xyz="0 0 .03"/><geometry><box size=".01 .02 .06"/></geometry></collision></link>
+  <link name="right"><collision><origin xyz="0 0 .03"/><geometry><box size=".01 .02 .06"/></geometry></collision></link>
+  <joint name="l" type="prismatic"><parent link="base"/><child link="left"/><origin xyz="-.04 0 .01"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper=".03" effort="1" velocity="1"/></joint>
+  <joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz=".04 0 .01"/><axis xyz="1 0 0"/>
+    <limit lower="-.03" upper="0" effort="1" velocity="1"/></joint>
+</robot>
+"""
+
+
+def test_the_text_is_the_proposal(tmp_path, here):
+    """The file holds what the mapping does; of a URDF here, whose jaws close from opposite ends of their ranges."""
+    (tmp_path / "jaws.urdf").write_text(URDF)
+    code, said, error = here(tmp_path, "layout", "new", "jaws.urdf", "--density", "1/cm2")
+    assert code == 0, error
+    proposal = propose(load_model(tmp_path / "jaws.urdf"), 1e4)
+    assert load_layout(tmp_path / "layout.yaml").spec == LayoutSpec.model_validate(proposal.mapping())
+    found = {link.name: (link.facing, link.counts) for link in proposal.links}
+    assert found["left"] == ((1, 0, 0), {"low": 3, "med": 12, "high": 48})
+    assert found["right"] == ((-1, 0, 0), {"low": 3, "med": 12, "high": 48})
+    assert found["base"] == ((0, 0, 1), {"low": 25, "med": 100, "high": 400})
+    assert said.splitlines()[0] == "3 links: 31 taxels at low, 124 taxels at med, 496 taxels at high"
+
+
+def test_without_groups(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(FOUR_BAR)
+    assert here(tmp_path, "layout", "new", "hand.xml", "--groups", "none")[0] == 0
+    layout = load_layout(tmp_path / "layout.yaml").spec
+    assert layout.groups == {} and set(layout.resolutions) == {"low", "med", "high"}
+    assert "groups:" not in (tmp_path / "layout.yaml").read_text()
+
+
+def test_a_file_is_not_overwritten(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(FOUR_BAR)
+    (tmp_path / "layout.yaml").write_text("mine")
+    code, _, error = here(tmp_path, "layout", "new", "hand.xml")
+    assert (code, error) == (
+        2,
+        "tgdsl: layout.yaml: this file is there already; give --force to replace it, or --out for another\n",
+    )
+    assert (tmp_path / "layout.yaml").read_text() == "mine"
+    assert here(tmp_path, "layout", "new", "hand.xml", "--force")[0] == 0
+    assert (tmp_path / "layout.yaml").read_text().startswith("# A layout for hand.xml, proposed by")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.xml", "layout.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("density", "message"),
+    [
+        ("many", '--density: "many" is not a quantity, expected a number in /m2 or a string such as "4 /mm2"'),
+        ("4 cm2", '--density: "cm2" is not a unit of density, expected one of /m2, /cm2, /mm2'),
+        ("0/cm2", "--density: 0/cm2 is out of range, expected more than 0"),
+        ("-1/cm2", "--density: -1/cm2 is out of range, expected more than 0"),
+        ("1e9/cm2", 'link "base" would have'),
+    ],
+)
+def test_a_density_that_is_none(tmp_path, here, density, message):
+    (tmp_path / "hand.xml").write_text(FOUR_BAR)
+    code, _, error = here(tmp_path, "layout", "new", "hand.xml", f"--density={density}")
+    assert code == 2
+    assert error.startswith(f"tgdsl: {message}")
+    assert not (tmp_path / "layout.yaml").exists()
+
+
+def test_densities_in_other_units_are_the_same(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(FOUR_BAR)
+    texts = []
+    for density in ("25/cm2", "25e4/m2", "0.25 /mm2", "25e4"):
+        assert here(tmp_path, "layout", "new", "hand.xml", "--density", density, "--force")[0] == 0
+        texts.append((tmp_path / "layout.yaml").read_text())
+    assert len(set(texts)) == 1
+
+
+def test_a_robot_without_surface_and_one_that_is_not_there(tmp_path, here):
+    (tmp_path / "hand.xml").write_text('<mujoco><worldbody><body name="frame"/></worldbody></mujoco>')
+    code, _, error = here(tmp_path, "layout", "new", "hand.xml")
+    assert (code, error) == (2, 'tgdsl: hand.xml: no link has a surface for taxels ("frame": no geoms)\n')
+    for command in (("layout", "new"), ("links",)):
+        code, _, error = here(tmp_path, *command, "xhand2")
+        assert code == 2 and error.startswith('tgdsl: there is no file or robot "xhand2"; did you mean "xhand1')
+
+
+def test_names_that_yaml_and_selections_could_misread(tmp_path, here):
+    names = ["no", "1e3", "a: b", "#c", "[d]", "*", "e?", 'f"g\\h', "i\u2028j", "😀", "- k", "hand", "{l}", "&m", "!n", "~"]
+    parts = "".join(
+        f'<body name="{name.replace("&", "&amp;").replace(chr(34), "&quot;")}"><joint axis="{1 + i} 1 0"/><geom size=".01" pos="{i} 0 0"/></body>'
+        for i, name in enumerate(names)
+    )
+    (tmp_path / "hand.xml").write_text(f"<mujoco><worldbody>{parts}</worldbody></mujoco>", encoding="utf-8")
+    code, _, error = here(tmp_path, "layout", "new", "hand.xml", "--density", "1/cm2")
+    assert code == 0, error
+    groups = compiled(tmp_path, {"hand": "geometric"}, "low").plan.layout.groups
+    assert groups == {"tips": tuple(names), "fingers": tuple(names), "hand": tuple(names)}
+
+
+def test_a_shared_name_is_told(tmp_path, here):
+    text = FOUR_BAR.replace('name="left_rubber"', 'name="right_finger"')
+    (tmp_path / "hand.xml").write_text(text)
+    here(tmp_path, "layout", "new", "hand.xml")
+    line = "# Mind: geoms or meshes of other links are also called right_finger; a selection by that name takes both.\n"
+    assert line in (tmp_path / "layout.yaml").read_text()
+
+
+@pytest.mark.parametrize(("robot", "stem"), [("xhand1", "right_hand"), ("xhand1_left", "left_hand")])
+def test_the_xhand1_is_taken_for_what_its_own_layout_says(robot, stem):
+    proposal = propose(open_robot(robot), 1e4)
+    tips = ("thumb_rota_link2", "index_rota_link2", "mid_link2", "ring_link2", "pinky_link2")
+    assert proposal.groups["tips"] == tuple(f"{stem}_{tip}" for tip in tips)
+    assert proposal.groups["palm"] == (f"{stem}_link",)
+    facing = {link.name.removeprefix(f"{stem}_"): link.facing for link in proposal.links}
+    assert facing["thumb_rota_link2"] == (0, 0, 1)
+    assert {facing[name] for name in ("link", "index_rota_link2", "mid_link1", "mid_link2", "pinky_link2")} == {(1, 0, 0)}

@@ -1,0 +1,88 @@
+"""The table of a robot's links: areas against closed forms, columns, groups."""
+
+import numpy as np
+import pytest
+
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.links import links_table
+
+SHAPES = """
+<mujoco>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 .1"/>
+    <body name="box"><freejoint name="base"/><geom name="b" type="box" size=".01 .02 .03" mass=".1"/>
+      <geom name="shown" type="sphere" size=".05" contype="0" conaffinity="0" mass="0"/>
+      <body name="ball" pos=".1 0 0"><joint name="turn" axis="0 0 1" range="-45 90"/><joint type="slide" axis="1 0 0" range="0 .02"/>
+        <geom type="sphere" size=".02" mass=".2"/>
+        <body name="rod" pos=".1 0 0"><joint type="ball"/><geom type="cylinder" size=".01 .03" mass=".3"/></body>
+      </body>
+      <body pos="0 .1 0"><geom type="box" size=".01 .01 .01" contype="0" conaffinity="0"/></body>
+      <body name="frame"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def shapes(tmp_path):
+    (tmp_path / "shapes.xml").write_text(SHAPES)
+    return tmp_path
+
+
+def cells(line: str) -> list[str]:
+    """Return the cells of a line: columns are two blanks apart at least."""
+    return [cell for cell in line.strip().split("  ") if cell.strip()]
+
+
+def test_links_areas_have_closed_forms(shapes, here):
+    _, said, _ = here(shapes, "links", "shapes.xml")
+    lines = {line.split()[0]: line for line in said.splitlines() if not line.startswith(" " * 20)}
+    for name, area, rtol in (
+        ("box", 8 * (1 * 2 + 2 * 3 + 1 * 3), 1e-3),
+        ("ball", 4 * np.pi * 2**2, 3e-3),
+        ("rod", 2 * np.pi * 1 * (1 + 6), 2e-3),
+    ):
+        found = next(float(cell) for cell in cells(lines[name])[1:] if cell.strip().replace(".", "").isdigit())
+        assert found == pytest.approx(area, rel=rtol), name
+
+
+def test_links_table(shapes, here):
+    layout = "groups: {first: box, others: {include: [ball, rod]}, all: [first, others]}\n"
+    (shapes / "layout.yaml").write_text(layout + "resolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n")
+    code, said, error = here(shapes, "links", "shapes.xml", "--layout", "layout.yaml")
+    assert code == 0, error
+    assert said.splitlines() == links_table(load_model(shapes / "shapes.xml"), shapes / "layout.yaml")
+    assert (
+        said
+        == """\
+body                  joints                     geoms                     area [cm²]  mass [g]  groups
+world                                            ground: plane, colliding   unbounded
+  box                 base: free                 b: box, colliding              88.00     100.0  first, all
+                                                 shown: sphere, visual
+    ball              turn: hinge -45 to 90 deg  sphere, colliding              50.21     200.0  others, all
+                      slide 0 to 20 mm
+      rod             ball unlimited             cylinder, colliding            43.97     300.0  others, all
+    (unnamed body 4)  -                          box, visual                        -       8.0
+    frame             -                          -                                  -       0.0
+"""
+    )
+
+
+def test_links_of_a_robot_by_name_shows_its_own_groups(tmp_path, here):
+    code, said, error = here(tmp_path, "links", "xhand1")
+    assert code == 0, error
+    (line,) = [line for line in said.splitlines() if line.strip().startswith("right_hand_mid_link2")]
+    assert line.startswith("      right_hand_mid_link2 ") and line.endswith("tips, fingers, hand")
+    assert "hinge 0 to 110 deg" in line
+
+
+def test_links_tells_the_mistakes_of_a_layout(shapes, here):
+    (shapes / "layout.yaml").write_text(
+        "groups: {first: bux}\nresolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n"
+    )
+    code, _, error = here(shapes, "links", "shapes.xml", "--layout", "layout.yaml")
+    assert code == 2
+    assert error.splitlines()[0] == 'layout.yaml:1:17: groups.first: no link matches "bux"; did you mean "box"?'
+    code, _, error = here(shapes, "links", "shapes.xml", "--layout", "none.yaml")
+    assert (code, error) == (2, "none.yaml: cannot read this file: No such file or directory\n1 mistake\n")

@@ -1,0 +1,110 @@
+"""MJCF: read by MuJoCo itself, and written with its in-line meshes as files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+
+from tgdsl.files.files import naming
+from tgdsl.formats.model import Model
+from tgdsl.scene.scene import readable
+
+
+def read_mjcf(path: Path) -> Model:
+    """Read and compile an MJCF file.
+
+    Raises:
+        ValueError: If MuJoCo cannot read or compile it.
+    """
+    spec = mujoco.MjSpec.from_file(str(path))
+    rewritten = rewrite_meshes(spec)
+    return Model(path, spec, spec.compile(), is_urdf=False, rewritten=rewritten)
+
+
+def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
+    """Rewrite in memory those of a model's own mesh files that MuJoCo cannot read; return the files by their new names."""
+    files = {}
+    for mesh in spec.meshes:
+        file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
+        if file.is_file() and (content := readable(mesh.file, original := file.read_bytes())) is not original:
+            key = f"{hashlib.sha256(content).hexdigest()}.stl"  # MuJoCo knows files in memory by their names, without folders
+            spec.assets[key], files[key] = content, file
+            mesh.name, mesh.file = mesh.name or file.stem, key
+    return files
+
+
+def xml_files(path: Path) -> Iterator[Path]:
+    """Yield a model file and all the files that it includes or attaches, each once."""
+    seen: list[Path] = []
+    waiting = [path.resolve()]
+    while waiting:
+        current = waiting.pop(0)
+        if current in seen or not current.is_file():
+            continue
+        seen.append(current)
+        yield current
+        try:
+            root = ET.parse(current).getroot()
+        except ET.ParseError:
+            continue
+        for element in root.iter():
+            if element.tag in ("include", "model") and element.get("file"):
+                waiting.append((current.parent / element.get("file", "")).resolve())
+
+
+def write_mjcf(text: str, out: Path) -> None:
+    """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
+
+    All is written under temporary names first, then renamed, so that nothing half-written is left behind.
+
+    Args:
+        text: MJCF, its meshes in line.
+        out: The MJCF file. It is replaced if it is there, and so are meshes of the same names; other files are left alone.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    root, out = ET.fromstring(text), Path(out)
+    folder = out.with_name(f"{out.stem}_assets")
+    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
+        files: list[str] = []
+        for mesh in root.iterfind("asset/mesh[@vertex]"):
+            file = _file_name(mesh.get("name", ""), files)
+            (Path(temporary) / file).write_text(
+                _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")), encoding="utf-8"
+            )
+            mesh.set("file", file)
+        if files:
+            root.findall("compiler")[0].set("meshdir", folder.name)
+        ET.indent(root)
+        draft = Path(temporary) / "model.xml"
+        draft.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+        for file in files:
+            folder.mkdir(exist_ok=True)
+            os.replace(Path(temporary) / file, folder / file)
+        os.replace(draft, out)
+
+
+def _file_name(name: str, taken: list[str]) -> str:
+    """Return a file name for a mesh, and take it; names that only differ in case are one on some file systems."""
+    stem = re.sub(r"[^\w.-]", "_", name) or "mesh"
+    file, number = f"{stem}.obj", 1
+    while file.lower() in map(str.lower, taken):
+        number += 1
+        file = f"{stem}_{number}.obj"
+    taken.append(file)
+    return file
+
+
+def _wavefront(vertices: str, faces: str) -> str:
+    points, corners = vertices.split(), [int(index) + 1 for index in faces.split()]
+    lines = [f"v {' '.join(points[i : i + 3])}" for i in range(0, len(points), 3)]
+    lines += [f"f {' '.join(map(str, corners[i : i + 3]))}" for i in range(0, len(corners), 3)]
+    return "\n".join([*lines, ""])

@@ -1,0 +1,212 @@
+"""A robot or scene as MuJoCo compiled it, read as NumPy: its bodies, and geoms as triangles in their body's frame."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.errors import RobotError
+from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.surface import Surface
+
+SHAPE_NAMES: dict[int, str] = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+    mujoco.mjtGeom.mjGEOM_MESH: "mesh",
+    mujoco.mjtGeom.mjGEOM_SDF: "sdf",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A robot or scene file, compiled.
+
+    Attributes:
+        file: The file it came from.
+        spec: MuJoCo's editable model.
+        compiled: MuJoCo's compiled model.
+        is_urdf: Whether it is URDF.
+        mjcf: The MJCF that it was turned into, if it is URDF or USD; else empty.
+        rewritten: Files of meshes that `spec` has in memory, in another format, by their names there.
+    """
+
+    file: Path
+    spec: mujoco.MjSpec
+    compiled: mujoco.MjModel
+    is_urdf: bool
+    mjcf: str = ""
+    rewritten: Mapping[str, Path] = field(default_factory=dict)
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of all named bodies, in MuJoCo's (depth-first) order; the first is `world`."""
+        names = (self.compiled.body(i).name for i in range(self.compiled.nbody))
+        return tuple(name for name in names if name)
+
+    @cached_property
+    def geoms(self) -> tuple[Geom, ...]:
+        """All geoms of named bodies."""
+        found = (self.geom(i) for i in range(self.compiled.ngeom))
+        return tuple(geom for geom in found if geom.body)
+
+    def geom(self, i: int) -> Geom:
+        """Return a geom by its index."""
+        model = self.compiled
+        shape = SHAPE_NAMES.get(int(model.geom_type[i]), "unknown")
+        return Geom(
+            id=i,
+            name=model.geom(i).name,
+            mesh=model.mesh(model.geom_dataid[i]).name if shape in ("mesh", "sdf") else "",
+            body=model.body(model.geom_bodyid[i]).name,
+            shape=shape,
+            size=model.geom_size[i].copy(),
+            pos=model.geom_pos[i].copy(),
+            rotation=_matrix(model.geom_quat[i]),
+            is_colliding=bool(model.geom_contype[i] or model.geom_conaffinity[i] or i in self._paired),
+        )
+
+    @cached_property
+    def _paired(self) -> frozenset[int]:
+        """Geoms of explicit contact pairs."""
+        return frozenset((*self.compiled.pair_geom1.tolist(), *self.compiled.pair_geom2.tolist()))
+
+    def touchable(self, body: str) -> tuple[Geom, ...]:
+        """Return the geoms of a body that make up its touchable surface: those that collide, or else all."""
+        own = tuple(geom for geom in self.geoms if geom.body == body)
+        return tuple(geom for geom in own if geom.is_colliding) or own
+
+    def rigid_bodies(self, body: str, others: Collection[str] = ()) -> tuple[int, ...]:
+        """Return the indices of a body and of those below that are welded to it: they have no joint. Parents come first.
+
+        What is fixed to the world is no part of it.
+
+        Args:
+            body: Name of the body.
+            others: Names of bodies that are none of its parts.
+        """
+        model = self.compiled
+        found = [int(model.body(body).id)]
+        for i in range(found[0] + 1, model.nbody if found[0] else 0):
+            if model.body_parentid[i] in found and not model.body_jntnum[i] and model.body(i).name not in others:
+                found.append(i)
+        return tuple(found)
+
+    def rigid_geoms(self, bodies: Sequence[int]) -> tuple[Geom, ...]:
+        """Return the geoms of bodies that are one rigid body, see `rigid_bodies`, in the first one's frame."""
+        model = self.compiled
+        placed = {bodies[0]: (np.zeros(3), np.eye(3))}
+        for i in bodies[1:]:
+            pos, rotation = placed[int(model.body_parentid[i])]
+            placed[i] = pos + rotation @ model.body_pos[i], rotation @ _matrix(model.body_quat[i])
+        found = []
+        for i in np.flatnonzero(np.isin(model.geom_bodyid, bodies)).tolist():
+            geom, body = self.geom(i), int(model.geom_bodyid[i])
+            if body != bodies[0]:
+                pos, rotation = placed[body]
+                geom = replace(geom, pos=pos + rotation @ geom.pos, rotation=rotation @ geom.rotation)
+            found.append(geom)
+        return tuple(found)
+
+    def can_collide(self, first: str, second: str) -> bool:
+        """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
+        return self.can_collide_with(first, [geom.id for geom in self.touchable(second)])
+
+    def can_collide_with(self, body: str, geoms: Iterable[int]) -> bool:
+        """Return whether MuJoCo can ever report a contact between a body's geoms and some others, by their indices."""
+        model = self.compiled
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+            return False
+        pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
+        for a, b in itertools.product([geom.id for geom in self.touchable(body)], geoms):
+            if frozenset((a, b)) in pairs:
+                return True
+            one, two = sorted(int(model.geom_bodyid[i]) for i in (a, b))
+            masks = model.geom_contype[a] & model.geom_conaffinity[b]
+            masks |= model.geom_contype[b] & model.geom_conaffinity[a]
+            if masks and (one << 16) + two not in model.exclude_signature and not self._welded(one, two):
+                return True
+        return False
+
+    def _welded(self, one: int, two: int) -> bool:
+        """MuJoCo collides no two geoms of one rigid cluster, nor of what cannot move, nor (by default) of parent and child."""
+        model = self.compiled
+        one, two = model.body_weldid[one], model.body_weldid[two]
+        if one == two or not (model.body_dofnum[one] or model.body_dofnum[two]):
+            return True
+        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT or not one or not two:
+            return False
+        parent_one, parent_two = (model.body_weldid[model.body_parentid[i]] for i in (one, two))
+        return bool(one == parent_two or two == parent_one)
+
+    def surface(self, geoms: tuple[Geom, ...]) -> Surface:
+        """Return the triangles of some geoms of one body, in that body's frame.
+
+        Raises:
+            RobotError: If a geom has no bounded surface.
+        """
+        return Surface.joined([self._triangles(geom) for geom in geoms])
+
+    def mesh(self, geom: Geom) -> Surface:
+        """Return the triangles of a mesh geom, in the geom's own frame."""
+        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
+        first, count = int(model.mesh_vertadr[mesh]), int(model.mesh_vertnum[mesh])
+        vertices = model.mesh_vert[first : first + count].astype(np.float64)
+        first, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+        faces = model.mesh_face[first : first + count].astype(np.int64)
+        return Surface(vertices, faces, np.zeros(count, dtype=np.int64), (geom.names,))
+
+    def hull(self, geom: Geom) -> Surface:
+        """Return the convex hull that MuJoCo collides of a mesh geom, in the geom's own frame; the mesh if it has none."""
+        model, mesh = self.compiled, int(self.compiled.geom_dataid[geom.id])
+        first = int(model.mesh_graphadr[mesh])
+        surface = self.mesh(geom)
+        if first < 0:
+            return surface
+        count = int(model.mesh_graph[first])  # a graph starts with its number of vertices, of faces, then two tables of these
+        ids = model.mesh_graph[first + 2 + count : first + 2 + 2 * count]
+        hull = trimesh.convex.convex_hull(surface.vertices[ids])
+        faces = np.asarray(hull.faces, dtype=np.int64)
+        return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
+
+    def _triangles(self, geom: Geom) -> Surface:
+        if geom.shape == "mesh":
+            own = self.mesh(geom)
+            vertices, faces = own.vertices, own.faces
+        else:
+            vertices, faces = self._tessellated(geom)
+        vertices = vertices @ geom.rotation.T + geom.pos
+        return Surface(vertices, faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
+
+    def _tessellated(self, geom: Geom) -> tuple[np.ndarray, np.ndarray]:
+        if geom.shape == "box":
+            mesh = trimesh.creation.box(2 * geom.size)
+        elif geom.shape == "sphere":
+            mesh = trimesh.creation.icosphere(subdivisions=4, radius=geom.size[0])
+        elif geom.shape == "ellipsoid":
+            mesh = trimesh.creation.icosphere(subdivisions=4).apply_scale(geom.size)
+        elif geom.shape == "cylinder":
+            mesh = trimesh.creation.cylinder(geom.size[0], 2 * geom.size[1], sections=96)
+        elif geom.shape == "capsule":
+            mesh = trimesh.creation.capsule(2 * geom.size[1], geom.size[0], count=[64, 64])
+            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+        else:
+            raise RobotError(f"{self.file}: {geom.shown} of body {geom.body} has no bounded surface to put taxels on")
+        return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def _matrix(quat: Float[np.ndarray, 4]) -> Float[np.ndarray, "3 3"]:
+    return Rotation.from_quat(quat, scalar_first=True).as_matrix()
