@@ -15,8 +15,8 @@ from xhand1_models import JOINTS, document, hand_xml
 import tgdsl
 from tgdsl.errors import HandError, ObservationError, SimulationError, TgdslError
 from tgdsl.module.module import TactileModule
-from tgdsl.runtime import connect as connecting
 from tgdsl.runtime.connect import Connection
+from tgdsl.runtime.xhand1 import connect as connecting
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.driver import XHand1

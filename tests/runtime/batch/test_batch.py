@@ -12,7 +12,8 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES
-from tgdsl.runtime.batch.simulation import BatchSimulation, simulate
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulate import simulate
 
 TOLERANCE = 1e-12
 """Both sides are float64 and the same solver; what is left is the order of a few sums and products."""

@@ -6,7 +6,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, overload
+from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -25,7 +25,6 @@ from tgdsl.runtime.simulators.objects import EnvObjects, Values
 from tgdsl.runtime.simulators.room import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices
 
@@ -212,70 +211,3 @@ class BatchSimulation(Simulation):
             call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
-
-
-@overload
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: Literal["cpu"] = "cpu",
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-) -> BatchSimulation: ...
-@overload
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: str,
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-    nconmax: int | None = None,
-    njmax: int | None = None,
-) -> BatchSimulation | WarpSimulation: ...
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: str = "cpu",
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-    nconmax: int | None = None,
-    njmax: int | None = None,
-) -> BatchSimulation | WarpSimulation:
-    """Simulate the scene that a module was compiled for.
-
-    Args:
-        touch: The module.
-        num_envs: Number of environments.
-        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. The state is handed out on the
-            module's device; both on one GPU need no copies.
-        substeps: Physics steps per control step. What `state` hands out after a step is of the start of the last one: with
-            `substeps=1`, of the instant before the step. `sim.forward()` evaluates where the environments are now.
-        threads: CPU threads; 0: one per CPU.
-        keyframe: Name of the keyframe to start from.
-        on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
-            until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
-        nconmax: On a GPU, room for contacts per environment, in a pool that all share: see `WarpSimulation`.
-        njmax: On a GPU, room for rows of constraints in each environment.
-
-    Raises:
-        ArtifactError: If an asset of the scene is missing or has changed.
-        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
-            wants.
-    """
-    if device == "cpu":
-        if nconmax is not None or njmax is not None:
-            raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
-        return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, on_fault=on_fault)
-    if threads:
-        raise SimulationError(f'threads is {threads}, but only physics on "cpu" has threads, and the device is "{device}"')
-    keys: dict[str, Any] = {"nconmax": nconmax, "njmax": njmax}
-    return WarpSimulation(touch, num_envs, device=device, substeps=substeps, keyframe=keyframe, on_fault=on_fault, **keys)

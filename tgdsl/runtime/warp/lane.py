@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from tgdsl.errors import SimulationError
+from tgdsl.runtime.simulators.devices import checked_device
 
 T = TypeVar("T")
 _EAGER_CALLS = 2
@@ -49,12 +50,7 @@ class Lane:
             SimulationError: If there is no such device, or Warp is not installed.
         """
         self._warp = libraries()[0]
-        try:
-            self.device = torch.empty(0, device=device).device
-        except (RuntimeError, AssertionError) as error:
-            raise SimulationError(f'there is no device "{device}" to run physics on: {error}') from error
-        if self.device.type not in ("cpu", "cuda"):
-            raise SimulationError(f'physics on "{device}" is not supported, expected "cuda" or "cpu"')
+        self.device = checked_device(device, ("cuda", "cpu"))
         self.is_captured = graph and self.device.type == "cuda"
         with self._quiet():
             self._warp.init()

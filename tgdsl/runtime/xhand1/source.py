@@ -140,6 +140,11 @@ class XHand1Source:
         return self._control_step
 
     @property
+    def is_over(self) -> bool:
+        """Never: there is always more to read."""
+        return False
+
+    @property
     def num_late_steps(self) -> int:
         """Steps that began after they should have ended."""
         return self._pace.num_late_steps
@@ -200,6 +205,10 @@ class XHand1Source:
         self.hand.relax()
         self._pace.restart()
         self._sample = self._read(time.monotonic())
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again."""
+        self.hand.resume()
 
     def close(self) -> None:
         """Close the hand.

@@ -169,8 +169,11 @@ class ReplaySource:
         self._began_at = self._clock()
         self._take(0)
 
+    def resume(self) -> None:
+        """Nothing: what was recorded moves or not as it did."""
+
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         self._readings = iter(())
         self._now = self._end
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)
