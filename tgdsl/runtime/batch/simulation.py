@@ -5,8 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import mujoco
 import mujoco.batch
@@ -18,12 +17,13 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.batch.reading import BatchReader
+from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
 from tgdsl.runtime.simulators.joint_fields import JointPlaces, KeptJoints
-from tgdsl.runtime.simulators.lookup import keyframe_id
-from tgdsl.runtime.simulators.objects import EnvObjects, Values
-from tgdsl.runtime.simulators.room import bytes_per_env, refuse_beyond_memory
-from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.objects import EnvObjects
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices
@@ -44,6 +44,8 @@ class BatchSimulation(Simulation):
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
         substeps: Physics steps per control step.
     """
+
+    _objects: EnvObjects | None = None
 
     def __init__(
         self,
@@ -77,21 +79,18 @@ class BatchSimulation(Simulation):
                 module's state is another simulation's or of other environments.
         """
         refuse_unfit(touch, num_envs, substeps, model)
-        self._objects: EnvObjects | None = None
         if model is None:
             scenes = SceneModels(touch.plan.scene)
             model = scenes.model({})
-            self._objects = EnvObjects(scenes, touch.inputs, num_envs) if touch.inputs.objects else None
+            if touch.inputs.objects:
+                self._objects = EnvObjects(scenes, touch.inputs, num_envs)
         self.model: mujoco.MjModel = model
-        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
-        if self.model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-            what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
-            raise SimulationError(f'{what}; take <flag sleep="enable"/> out of its <option>')
+        what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+        refuse_two_instants(model, f'{what}; take <flag sleep="enable"/> out of its <option>')
         refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.substeps = substeps
         self._touch = touch
-        self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
+        self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
@@ -114,33 +113,6 @@ class BatchSimulation(Simulation):
         self._refuse_if_closed()
         self._evaluate(self._ascending(env_ids))
 
-    def set_objects(
-        self,
-        variants: Mapping[str, Values] | None = None,
-        sizes: Mapping[str, Values] | None = None,
-        env_ids: EnvIds | None = None,
-    ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew.
-
-        At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
-        the XHand1's palm, 10 ms and 3 MB.
-
-        Args:
-            variants: Which variant of an object these environments have: (env,) integers, or one for all.
-            sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
-            env_ids: Indices, or a boolean mask over environments.
-
-        Raises:
-            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
-        """
-        if self._objects is None:
-            raise SimulationError("no object of this module differs between environments")
-        ids = env_indices(env_ids, self.num_envs)
-        self._objects.choose(ids, variants or {}, sizes or {})
-        models = self._objects.models()
-        self._run(lambda: self.batch.set_models(models))
-        self.reset(ids)
-
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
         return self.batch.xpos[env], self.batch.xquat[env]
@@ -148,6 +120,11 @@ class BatchSimulation(Simulation):
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment."""
         return self.batch.get_model(env)
+
+    def _use_objects(self) -> None:
+        assert self._objects is not None
+        models = self._objects.models()
+        self._run(lambda: self.batch.set_models(models))
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
         ids = self._ascending(env_ids)
@@ -199,12 +176,10 @@ class BatchSimulation(Simulation):
         self._faults.warn_once()
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = self._reader.read() | self._kept.read()
+        values = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
-        tensors: dict[str, Any] = {name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}
-        tensors["dt"] = dt
-        return SceneState(**{name: value for name, value in tensors.items() if name in self._touch.inputs.fields})
+        return self._scene_state({name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}, dt)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

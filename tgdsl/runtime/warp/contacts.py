@@ -22,7 +22,7 @@ from torch import Tensor
 
 from tgdsl.module.state import shape_of
 from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
-from tgdsl.runtime.simulators.lookup import body_id, part_geoms
+from tgdsl.runtime.simulators.model_ids import body_id, part_geoms
 from tgdsl.runtime.warp.lane import libraries
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")

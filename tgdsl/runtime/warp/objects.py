@@ -73,7 +73,7 @@ class WorldObjects:
         self.object_size = torch.zeros(self._chosen.object_size.shape, device=device)
 
     def choose(self, ids: Int[Array, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Say what objects are like in some environments: see `BatchSimulation.set_objects`; then `tell` the environments."""
+        """Say what objects are like in some environments: see `Simulation.set_objects`; then `tell` the environments."""
         self._chosen.choose(ids, variants, sizes)
 
     def tell(self, worlds: Worlds) -> None:

@@ -16,17 +16,17 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
-from tgdsl.runtime.simulators.lookup import keyframe_id
-from tgdsl.runtime.simulators.objects import Values
-from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
 from tgdsl.runtime.warp.lane import Lane, Replay
 from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.reading import StateReader
 from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
+from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 
 class WarpSimulation(Simulation):
@@ -53,6 +53,8 @@ class WarpSimulation(Simulation):
         warp_model: MuJoCo Warp's model.
         warp_data: MuJoCo Warp's data.
     """
+
+    _objects: WorldObjects | None = None
 
     def __init__(
         self,
@@ -97,7 +99,6 @@ class WarpSimulation(Simulation):
         refuse_unfit(touch, num_envs, substeps, model)
         self._touch, self.substeps = touch, substeps
         self._lane = Lane(device, graph)
-        self._objects: WorldObjects | None = None
         if model is None:
             scenes = MeshedModels(touch.plan.scene)
             model = scenes.model({})
@@ -109,7 +110,7 @@ class WarpSimulation(Simulation):
             touch.inputs,
             num_envs,
             self._lane,
-            keyframe=-1 if keyframe is None else keyframe_id(model, keyframe),
+            keyframe=keyframe_id(model, keyframe),
             nconmax=nconmax,
             njmax=njmax,
             per_env=list(dict.fromkeys([*per_env, *(OWN_FIELDS if self._objects else ())])),
@@ -191,32 +192,6 @@ class WarpSimulation(Simulation):
         """Return the model of one environment, its objects as they are there; `parameters` are not in it."""
         return self.model if self._objects is None else self._objects.env_model(env)
 
-    def set_objects(
-        self,
-        variants: Mapping[str, Values] | None = None,
-        sizes: Mapping[str, Values] | None = None,
-        env_ids: EnvIds | None = None,
-    ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew.
-
-        At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
-        the XHand1's palm, 10 ms; none is kept.
-
-        Args:
-            variants: Which variant of an object these environments have: (env,) integers, or one for all.
-            sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
-            env_ids: Indices, or a boolean mask over environments.
-
-        Raises:
-            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
-        """
-        if self._objects is None:
-            raise SimulationError("no object of this module differs between environments")
-        ids = env_indices(env_ids, self.num_envs)
-        self._objects.choose(ids, variants or {}, sizes or {})
-        self._objects.tell(self._worlds)
-        self.reset(ids)
-
     def check(self) -> None:
         """Look for what has gone wrong in any environment since it was last reset. It waits for a GPU.
 
@@ -252,11 +227,14 @@ class WarpSimulation(Simulation):
         return self._read(dt).to(self._touch.device)
 
     def _read(self, dt: float) -> SceneState:
-        values: dict[str, Any] = dict(self._reader.read())
+        values = self._reader.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
-        values["dt"] = dt
-        return SceneState(**{name: value for name, value in values.items() if name in self._touch.inputs.fields})
+        return self._scene_state(values, dt)
+
+    def _use_objects(self) -> None:
+        assert self._objects is not None
+        self._objects.tell(self._worlds)
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
         mask = env_mask(env_ids, self.num_envs, self._lane.device)

@@ -16,17 +16,18 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.plan import Inputs
+from tgdsl.runtime.simulators.bodies import STATE_ARRAYS
+from tgdsl.runtime.simulators.claims import refuse_two_instants
 from tgdsl.runtime.simulators.faults import BAD_VALUES
 from tgdsl.runtime.simulators.joint_fields import FORCES, JointPlaces
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.lane import Lane, Replay, libraries
-from tgdsl.runtime.warp.reading import SOURCES
 
 _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
-_DERIVED = tuple(dict.fromkeys((*SOURCES, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
+_DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
 """Contacts per environment that there is room for, unless said otherwise."""
@@ -76,7 +77,7 @@ class Worlds:
             SimulationError: If MuJoCo Warp does not support something of the model, a field cannot differ, or the model lacks a
                 body.
         """
-        check_supported(model)
+        refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
         self.nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
         rows = constraint_rows(model, self.nconmax) if njmax is None else njmax
         wp, self._mjw = libraries()
@@ -256,18 +257,6 @@ class Worlds:
                 array.masked_fill_(_like(self._is_reset, array), 0.0)
         self.faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
-
-
-def check_supported(model: mujoco.MjModel) -> None:
-    """Raise what would make a state one of several instants.
-
-    Raises:
-        SimulationError: If the integrator is RK4, or sleeping is enabled.
-    """
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
-    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        raise SimulationError("bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
 
 
 def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:

@@ -184,8 +184,7 @@ class XHand1Source:
         Raises:
             StateError: Always; it lists what the hand can give.
         """
-        able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
-        raise StateError(f"a real XHand1 cannot give the poses and contacts of a SceneState; its sample() gives {able}")
+        raise no_scene_state("a real XHand1")
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Forget the speeds and the last target, make the hand passive until the next command, and read it.
@@ -226,6 +225,12 @@ class XHand1Source:
         while (reading := self.hand.read(self._read_timeout_s)).requested_at < requested_after:
             continue
         return HandSample.of(reading, self.calibration, self._velocity, self._pace.time_of(reading))
+
+
+def no_scene_state(who: str) -> StateError:
+    """Return the error of a source that does not know where objects are; it lists what a `HandSample` holds."""
+    able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
+    return StateError(f"{who} cannot give the poses and contacts of a SceneState; its sample() gives {able}")
 
 
 def is_chosen(env_ids: EnvIds) -> bool:
