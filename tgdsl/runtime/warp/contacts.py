@@ -24,6 +24,7 @@ from tgdsl.module.state import shape_of
 from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
 from tgdsl.runtime.simulators.model_ids import body_id, part_geoms
 from tgdsl.runtime.warp.lane import libraries
+from tgdsl.runtime.warp.private import constraint_contact_bit, contact_force_function
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
 """Fields of vectors, in the order of the kernel's arguments."""
@@ -128,9 +129,8 @@ def _kernel(wp: Any, mjw: Any) -> Any:
     object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
     the part along that: in the world both are turned, as the normal is.
     """
-    # Both are private, but a kernel can call a function and no kernel: the public `contact_force` is one.
-    wrench_of = mjw._src.support.contact_force_fn
-    constraint = wp.constant(int(mjw._src.types.ContactType.CONSTRAINT))
+    wrench_of = contact_force_function(mjw)
+    constraint = wp.constant(constraint_contact_bit(mjw))
 
     # fmt: off
     @wp.kernel(enable_backward=False)
