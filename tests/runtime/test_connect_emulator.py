@@ -16,7 +16,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import FORCE_MAX
 
 
@@ -99,7 +99,7 @@ def test_a_reset_does_not_hide_that_the_simulation_ended(touch, monkeypatch):
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, lockstep):
     """A mistake in what the fingertips feel ends its thread: the step that waits for a reading says so, and so does close."""
-    timing = LinkTiming(reply_timeout_s=1.0, silence_s=0.5)
+    timing = SerialTiming(reply_timeout_s=1.0, silence_s=0.5)
     env = tgdsl.connect(touch, "emulator", calibration=NEWTON, timing=timing, lockstep=lockstep)
     assert isinstance(env.source, EmulatedSource)
     env.step()

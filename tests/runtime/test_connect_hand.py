@@ -22,13 +22,13 @@ from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits, joint_ids
 from tgdsl.runtime.xhand1.source import XHand1Source
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandDisconnectedError,
     HandTimeoutError,
     MotionError,
     StaleReadingError,
 )
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
@@ -99,7 +99,7 @@ def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touc
 
 
 def test_after_a_failed_step_nothing_old_is_observed(touch):
-    timing = LinkTiming(reply_timeout_s=2.0, silence_s=1.0)
+    timing = SerialTiming(reply_timeout_s=2.0, silence_s=1.0)
     with Emulator() as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=timing) as env:
         env.observe()
         emulator.set_faults(Faults(silence=1.0))

@@ -12,7 +12,7 @@ from tgdsl.runtime.known import known_sources
 from tgdsl.runtime.source_kind import SourceKind
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 
 CONTROL_STEP = 0.02
@@ -28,7 +28,7 @@ def connect(
     calibration: Calibration | str | Path | None = None,
     motion: MotionLimits | None = None,
     addresses: Addresses | None = None,
-    timing: LinkTiming | None = None,
+    timing: SerialTiming | None = None,
     lockstep: bool = False,
     **own: Any,
 ) -> Connection:

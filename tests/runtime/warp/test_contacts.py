@@ -17,7 +17,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Pair, contact_sensor_names
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.runtime.warp.lane import libraries
+from tgdsl.runtime.warp.stream import libraries
 
 STACK = """
 <mujoco>

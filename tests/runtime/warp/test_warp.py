@@ -30,12 +30,12 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.runtime.warp.lane import Lane, Replay
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import constraint_rows
 
 
-class PretendedGpu(Lane):
-    """A lane that captures: its replays are counted and do nothing."""
+class PretendedGpu(WarpStream):
+    """A stream that captures: its replays are counted and do nothing."""
 
     def __init__(self):
         super().__init__("cpu")
@@ -135,13 +135,13 @@ def test_stepping_and_reading_in_one(tmp_path):
 
 
 def test_work_is_captured_at_its_third_call_and_then_replayed():
-    lane, calls = PretendedGpu(), []
-    replay = Replay(lane, lambda: calls.append(0) or len(calls))
+    stream, calls = PretendedGpu(), []
+    replay = GraphedCall(stream, lambda: calls.append(0) or len(calls))
     assert [replay() for _ in range(5)] == [1, 2, 3, 3, 3]
-    assert (lane.captures, lane.replays) == (1, 3)
+    assert (stream.captures, stream.replays) == (1, 3)
     replay.forget()
     assert [replay() for _ in range(3)] == [4, 5, 6]
-    assert (lane.captures, lane.replays) == (2, 4)
+    assert (stream.captures, stream.replays) == (2, 4)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.batch.reading import BatchReader
 from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
-from tgdsl.runtime.simulators.joint_fields import JointPlaces, KeptJoints
+from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
@@ -93,7 +93,7 @@ class BatchSimulation(Simulation):
         self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
-        self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
+        self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
@@ -166,11 +166,11 @@ class BatchSimulation(Simulation):
             num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
-        is_faulty = self._faults.settle()
+        is_faulty = self._faults.update()
         if not is_faulty.any():
             return
         if self._faults.on_fault == "raise":
-            raise SimulationError("; ".join(self._faults.accounts(diverged=", and MuJoCo has started them anew")))
+            raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has started them anew")))
         self._begin_episodes(is_faulty, Rows({}))
         self._faults.note_restarted(is_faulty)
         self._faults.warn_once()

@@ -23,8 +23,8 @@ from torch import Tensor
 from tgdsl.module.state import shape_of
 from tgdsl.plan.plan import SLOT_FIELDS, Inputs, contact_sensor_names
 from tgdsl.runtime.simulators.model_ids import body_id, part_geoms
-from tgdsl.runtime.warp.lane import libraries
 from tgdsl.runtime.warp.private import constraint_contact_bit, contact_force_function
+from tgdsl.runtime.warp.stream import libraries
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
 """Fields of vectors, in the order of the kernel's arguments."""
@@ -82,7 +82,7 @@ class PairContacts:
         ]
 
     def update(self, warp_model: Any, warp_data: Any) -> None:
-        """Read MuJoCo Warp's contacts, of the instant that `forward` or `step` has left there: work for a `Replay`."""
+        """Read MuJoCo Warp's contacts, of the instant that `forward` or `step` has left there: for a `GraphedCall`."""
         if not self.arrays:
             return
         self._memory.zero_()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tgdsl.plan.plan import Inputs
 from tgdsl.runtime.simulators.bodies import BodyFields
-from tgdsl.runtime.simulators.joint_fields import JointPlaces
+from tgdsl.runtime.simulators.joint_fields import JointColumns
 from tgdsl.runtime.warp.contacts import PairContacts
 
 
@@ -43,10 +43,10 @@ class StateReader:
         self._sources, self._contacts = sources, contacts
         device = sources["xpos"].device
         self._bodies = BodyFields(inputs, model, index=lambda ids: torch.from_numpy(ids).to(device), cross=torch.linalg.cross)
-        places = JointPlaces.of(inputs, model)
+        indices = JointColumns.of(inputs, model)
         self._joints = {
-            name: ({**sources, **kept}[array], torch.from_numpy(places.by_array[array]).to(device))
-            for name, array in places.fields.items()
+            name: ({**sources, **kept}[array], torch.from_numpy(indices.by_array[array]).to(device))
+            for name, array in indices.fields.items()
         }
 
     def read(self) -> dict[str, Tensor]:

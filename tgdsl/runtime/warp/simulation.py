@@ -21,10 +21,10 @@ from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
-from tgdsl.runtime.warp.lane import Lane, Replay
-from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.reading import StateReader
+from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 
@@ -98,18 +98,18 @@ class WarpSimulation(Simulation):
         """
         refuse_unfit(touch, num_envs, substeps, model)
         self._touch, self.substeps = touch, substeps
-        self._lane = Lane(device, graph)
+        self._stream = WarpStream(device, graph)
         if model is None:
-            scenes = MeshedModels(touch.plan.scene)
+            scenes = SharedMeshModels(touch.plan.scene)
             model = scenes.model({})
             if touch.inputs.objects:
-                self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._lane.device)
+                self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
         self.model: mujoco.MjModel = model
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
             touch.inputs,
             num_envs,
-            self._lane,
+            self._stream,
             keyframe=keyframe_id(model, keyframe),
             nconmax=nconmax,
             njmax=njmax,
@@ -117,14 +117,14 @@ class WarpSimulation(Simulation):
             on_fault=on_fault,
         )
         self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
-        with self._lane.work():
+        with self._stream.scope():
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
-            self._objects.tell(self._worlds)
+            self._objects.write_to(self._worlds)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
-        self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
-        self._substep = Replay(self._lane, lambda: self._worlds.step(1))
-        self._step_and_read = Replay(self._lane, self._physics_and_touch)
+        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps))
+        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1))
+        self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
         claim(touch, self)
         self.reset()
@@ -168,8 +168,10 @@ class WarpSimulation(Simulation):
         Raises:
             SimulationError: As from `step`, or if the module is on another device than physics.
         """
-        if self._touch.device != self._lane.device:
-            raise SimulationError(f"the module is on {self._touch.device}, physics on {self._lane.device}; expected one device")
+        if self._touch.device != self._stream.device:
+            raise SimulationError(
+                f"the module is on {self._touch.device}, physics on {self._stream.device}; expected one device"
+            )
         self._forget_other_tensors()
         self._begin_step(control)
         readings = self._step_and_read()
@@ -180,7 +182,7 @@ class WarpSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._lane.device))
+        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._stream.device))
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -198,14 +200,14 @@ class WarpSimulation(Simulation):
         Raises:
             SimulationError: If an environment has diverged or its controls were not finite, or a pool was too small.
         """
-        account = self._worlds.account()
-        if account:
-            raise SimulationError(account)
+        message = self._worlds.message()
+        if message:
+            raise SimulationError(message)
 
     def recapture(self) -> None:
         """Capture the CUDA graphs anew: when an array of `warp_model` or `warp_data` was replaced."""
-        for replay in (self._step, self._substep, self._step_and_read):
-            replay.forget()
+        for call in (self._step, self._substep, self._step_and_read):
+            call.forget()
         self._worlds.forget_graphs()
 
     def _forget_other_tensors(self) -> None:
@@ -234,15 +236,15 @@ class WarpSimulation(Simulation):
 
     def _use_objects(self) -> None:
         assert self._objects is not None
-        self._objects.tell(self._worlds)
+        self._objects.write_to(self._worlds)
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        mask = env_mask(env_ids, self.num_envs, self._lane.device)
+        mask = env_mask(env_ids, self.num_envs, self._stream.device)
         self._worlds.reset(mask, rows)
         self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
     def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        self._worlds.put(env_mask(env_ids, self.num_envs, self._lane.device), rows)
+        self._worlds.put(env_mask(env_ids, self.num_envs, self._stream.device), rows)
 
     def _advance(self, num_steps: int) -> None:
         self._worlds.prepare()
@@ -252,11 +254,11 @@ class WarpSimulation(Simulation):
         self._finish_step()
 
     def _finish_step(self, is_evaluated: bool = False) -> None:
-        self._worlds.stepped(is_evaluated)
-        if self._lane.is_capturing:
+        self._worlds.note_step(is_evaluated)
+        if self._stream.is_capturing:
             return
         self._touch.slot_watch.warn()
-        to_raise, totals = self._worlds.faults.shown()
+        to_raise, totals = self._worlds.faults.polled()
         if to_raise:
             self.check()
         if self._faults.on_fault == "reset":

@@ -23,7 +23,7 @@ from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import list_ports
 from tgdsl.scene.scene import scene_model
@@ -146,7 +146,7 @@ def _open(
     calibration: Calibration | str | Path | None,
     motion: MotionLimits | None,
     addresses: Addresses | None,
-    timing: LinkTiming | None,
+    timing: SerialTiming | None,
     lockstep: bool,
 ) -> Connection:
     known = given_calibration(calibration) or Calibration.none()

@@ -15,7 +15,7 @@ from tgdsl.runtime.xhand1.emulator.simulated_tips import SimulatedTips
 from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 
 
 def _open(
@@ -26,7 +26,7 @@ def _open(
     keyframe: str | None,
     calibration: Calibration | str | Path | None,
     motion: MotionLimits | None,
-    timing: LinkTiming | None,
+    timing: SerialTiming | None,
     lockstep: bool,
 ) -> Connection:
     known = given_calibration(calibration) or Calibration.none()

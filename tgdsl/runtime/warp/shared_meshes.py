@@ -13,7 +13,7 @@ SPARE_BODY = "tgdsl/spare"
 """The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""
 
 
-class MeshedModels(SceneModels):
+class SharedMeshModels(SceneModels):
     """The models of a scene for simulators that share meshes among environments.
 
     MuJoCo makes the hulls of meshes that some geom collides with. Here a spare body, the last one, holds every mesh of every
