@@ -143,7 +143,7 @@ class Recorder:
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
-        """Make room for a rollout.
+        """Allocate memory for a rollout.
 
         Raises:
             SimulationError: If this computer has too little memory.

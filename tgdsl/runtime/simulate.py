@@ -65,8 +65,8 @@ def simulate(
         keyframe: Name of the keyframe to start from.
         on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
             until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
-        nconmax: On a GPU, room for contacts per environment, in a pool that all share: see `WarpSimulation`.
-        njmax: On a GPU, room for rows of constraints in each environment.
+        nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
+        njmax: On a GPU, capacity for rows of constraints in each environment.
 
     Raises:
         ArtifactError: If an asset of the scene is missing or has changed.

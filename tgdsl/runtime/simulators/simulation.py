@@ -32,7 +32,7 @@ class Simulation(ABC):
     """Environments of one model, read by one module.
 
     A module with state remembers each environment's episode: one simulation at a time reads it, from when it is made until it
-    is closed or let go of.
+    is closed or garbage-collected.
 
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
@@ -232,7 +232,7 @@ class Simulation(ABC):
         self.reset(ids)
 
     def close(self) -> None:
-        """Let go of the module, so that another simulation can read it; this one can no longer be used."""
+        """Release the module, so that another simulation can read it; this one can no longer be used."""
         self._is_closed = True
         release(self._touch, self)
 

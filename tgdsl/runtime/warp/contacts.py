@@ -1,6 +1,6 @@
 """Contacts between links and objects, read from MuJoCo Warp's own contacts and constraint forces by one kernel.
 
-They are what the contact sensors of `tgdsl.instrument` hand out, without what these cost in MuJoCo Warp: room for 64 contacts
+They are what the contact sensors of `tgdsl.instrument` hand out, without what these cost in MuJoCo Warp: memory for 64 contacts
 per environment and sensor, each contact matched with each sensor, a sort.
 
 Shapes: `env` environments, `pair` and `slot` as the module's `inputs` list them, `sensor` sensors of a model.
@@ -45,7 +45,7 @@ class PairContacts:
     arrays: dict[str, Float[Tensor, "env ..."]]
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
-        """Make room for what is wanted.
+        """Allocate memory for what is wanted.
 
         Args:
             inputs: What the module wants.

@@ -78,8 +78,8 @@ class WarpSimulation(Simulation):
             num_envs: Number of environments.
             substeps: Physics steps per control step.
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
-            nconmax: Room for contacts per environment, in a pool that all share; default 48.
-            njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts and all limits make.
+            nconmax: Capacity for contacts per environment, in a pool that all share; default 48.
+            njmax: Capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make.
             model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".

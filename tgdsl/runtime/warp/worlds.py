@@ -30,7 +30,7 @@ _VELOCITIES = ("cvel", "cdof_dot")
 _DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
-"""Contacts per environment that there is room for, unless said otherwise."""
+"""Default capacity for contacts per environment."""
 
 
 class Worlds:
@@ -68,8 +68,8 @@ class Worlds:
             num_envs: Number of environments.
             stream: Where to work.
             keyframe: Index of the keyframe to start from; -1: the model's own initial state.
-            nconmax: Room for contacts per environment; all environments share it.
-            njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts make.
+            nconmax: Capacity for contacts per environment; all environments share it.
+            njmax: Capacity for rows of constraints in each environment; default: as many as `nconmax` contacts make.
             per_env: Fields of the model that environments have of their own.
             on_fault: What becomes of environments with a fault of their own.
 

@@ -222,7 +222,7 @@ class XHand1:
         return self._run(lambda client: client.exchange(Command.VERSION).payload)
 
     def close(self) -> None:
-        """Make the hand passive, if it is not, and let go of the port.
+        """Make the hand passive, if it is not, and release the port.
 
         Raises:
             HandError: If the hand was moving and did not confirm that it is passive.

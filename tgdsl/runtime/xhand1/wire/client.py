@@ -147,7 +147,7 @@ class SerialClient:
         self.port.write(encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload)))
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Release the port."""
         self.port.close()
 
     def _ask(self, command: Command, payload: bytes, reply_size: int | None, hand_id: int) -> Reply:
