@@ -20,14 +20,14 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.wire.link import LinkCounters, LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
 from tgdsl.runtime.xhand1.wire.protocol import OVERHEAD
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD
 
 WIRE_S = 10 * (COMMAND_SIZE + STATE_SIZE + 2 * OVERHEAD) / BAUD
 """Time that an exchange's bytes are on the line [s]."""
-PATIENT = LinkTiming(reply_timeout_s=20.0, silence_s=10.0)
+PATIENT = SerialTiming(reply_timeout_s=20.0, silence_s=10.0)
 
 
 class NumberedStates:
@@ -66,7 +66,7 @@ class Soak:
     numbers: np.ndarray
     received_at: np.ndarray
     age: np.ndarray
-    counters: LinkCounters
+    counters: SerialCounters
     num_lost_bytes: int
 
     @property

@@ -155,8 +155,8 @@ def test_warp_is_imported_in_two_functions():
     ]
     assert sorted(found) == [
         ("geometry.bvh", "warp", True),
-        ("runtime.warp.lane", "mujoco_warp", True),
-        ("runtime.warp.lane", "warp", True),
+        ("runtime.warp.stream", "mujoco_warp", True),
+        ("runtime.warp.stream", "warp", True),
     ]
 
 

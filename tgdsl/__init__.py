@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from tgdsl.module.module import TactileModule
     from tgdsl.module.state import SceneState
     from tgdsl.runtime.batch.simulation import BatchSimulation
-    from tgdsl.runtime.batch.simulation import simulate as simulate
     from tgdsl.runtime.connect import connect as connect
+    from tgdsl.runtime.simulate import simulate as simulate
     from tgdsl.runtime.warp import WarpSimulation
 
 _PLACES = {
@@ -55,7 +55,7 @@ _PLACES = {
     "instrument": "compiler.scene",
     "load": "module.artifact",
     "save": "module.artifact",
-    "simulate": "runtime.batch.simulation",
+    "simulate": "runtime.simulate",
 }
 
 __all__ = [

@@ -10,13 +10,13 @@ from hand_logs import random_readings, write_log
 import tgdsl
 from tgdsl.calibrate.fit import FitError, fit_finger, time_offset
 from tgdsl.calibrate.loads import (
-    Frames,
     Load,
+    Samples,
     TipRecord,
-    frames_under_forces,
-    frames_under_loads,
     known_tip_forces,
     load_loads,
+    samples_under_forces,
+    samples_under_loads,
     simulated_tip_forces,
 )
 from tgdsl.calibrate.report import calibrated, drawing, report
@@ -191,19 +191,19 @@ def staircase(now: float) -> np.ndarray:
 LOADS = tuple(Load(finger="index", start=i + 0.1, end=i + 0.9, force=tuple(press)) for i, press in enumerate(PRESSES.tolist()))
 
 
-def test_frames_under_loads_and_what_is_left_out(tmp_path):
+def test_samples_under_loads_and_what_is_left_out(tmp_path):
     times = np.arange(0, len(PRESSES), 0.05)
     log = pressed_log(tmp_path / "a.npz", staircase, times, rotation(2), {25: (3, 99), 26: (3,), 0: (7,)})
-    frames = frames_under_loads(TipRecord.of(log), "index", LOADS)
+    samples = samples_under_loads(TipRecord.of(log), "index", LOADS)
     during = [i for i, now in enumerate(times - 0.008) if 0.1 <= now % 1 <= 0.9]
-    assert (frames.num_left_out, frames.saturated_taxels) == (2, (3, 99))
-    assert len(frames.counts) == len(during) - 2
+    assert (samples.num_left_out, samples.saturated_taxels) == (2, (3, 99))
+    assert len(samples.counts) == len(during) - 2
     expected = np.array([staircase(times[i]) for i in during if i not in (25, 26)])
-    assert (frames.force == expected).all()
-    fit = fit_finger(frames.counts, frames.force)
+    assert (samples.force == expected).all()
+    fit = fit_finger(samples.counts, samples.force)
     assert fit.scale == pytest.approx(SCALE, rel=0.02)
-    assert report({"index": fit}, {"index": frames})[-1] == "  left out at the end of the range: 2 readings; taxels 3, 99"
-    ignored = frames_under_loads(TipRecord.of(log, (3, 99)), "index", LOADS)
+    assert report({"index": fit}, {"index": samples})[-1] == "  left out at the end of the range: 2 readings; taxels 3, 99"
+    ignored = samples_under_loads(TipRecord.of(log, (3, 99)), "index", LOADS)
     assert (ignored.num_left_out, len(ignored.counts)) == (0, len(during))
     with pytest.raises(FitError, match="taxels 120: expected numbers from 0 to 119"):
         TipRecord.of(log, (120,))
@@ -214,25 +214,25 @@ def test_a_press_beyond_the_range_is_left_out(tmp_path):
         return staircase(now) * (20 if now >= 8 else 1)
 
     log = pressed_log(tmp_path / "a.npz", force, np.arange(0, len(PRESSES), 0.02))
-    frames = frames_under_loads(TipRecord.of(log), "index", LOADS)
-    assert frames.num_left_out == 40
-    assert frames.saturated_taxels == ()
-    fit = fit_finger(frames.counts, frames.force, axes="signs")
+    samples = samples_under_loads(TipRecord.of(log), "index", LOADS)
+    assert samples.num_left_out == 40
+    assert samples.saturated_taxels == ()
+    fit = fit_finger(samples.counts, samples.force, axes="signs")
     assert fit.scale == pytest.approx(SCALE, rel=0.02)
     with pytest.raises(FitError, match=r"index: in all 40 readings its sum is at the end of the range; expected smaller loads"):
-        frames_under_loads(TipRecord.of(log), "index", LOADS[8:])
+        samples_under_loads(TipRecord.of(log), "index", LOADS[8:])
 
 
 def test_loads_that_do_not_fit_the_log(tmp_path):
     record = TipRecord.of(pressed_log(tmp_path / "a.npz", staircase, np.arange(0, 2, 0.05)))
     late = Load(finger="index", start=7, end=8, force=(0, 0, 1))
     with pytest.raises(FitError, match=r"index: from 7 s to 8 s the log holds no reading; it goes from 0 s to 1\.942 s"):
-        frames_under_loads(record, "index", (late,))
+        samples_under_loads(record, "index", (late,))
     one, other = (Load(finger="index", start=0, end=1 + i, force=(0, 0, 1)) for i in (0, 0.5))
     with pytest.raises(FitError, match=r"index: from 0 s to 1\.5 s there are two loads at once"):
-        frames_under_loads(record, "index", (one, other))
+        samples_under_loads(record, "index", (one, other))
     with pytest.raises(FitError, match="index: there is no reading while its force is known"):
-        frames_under_forces(record, "index", np.array([50.0, 60.0]), np.zeros((2, 3)))
+        samples_under_forces(record, "index", np.array([50.0, 60.0]), np.zeros((2, 3)))
 
 
 def test_files_of_loads(tmp_path):
@@ -380,7 +380,7 @@ def test_fingers_without_loads_are_not_guessed():
 
 def test_the_report_and_the_picture():
     fit = a_fit()
-    lines = report({"index": fit}, {"index": Frames(PRESSES, PRESSES, 0, ())})
+    lines = report({"index": fit}, {"index": Samples(PRESSES, PRESSES, 0, ())})
     assert lines[0].startswith("index: 9 readings; scale 0.05000 0.08000 0.10000 N per count, rotation [")
     assert lines[0].endswith("tare 7.00 -12.00 21.00 counts")
     assert lines[3] == "  z: loads -2.00 to 4.00 N; RMS 0.0000 N, at most 0.0000 N, R² 1.00000"

@@ -10,15 +10,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from tgdsl.runtime.xhand1 import driver, pace, reader
+from tgdsl.runtime.xhand1 import driver, reader, step_timer
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.emulator.wire import EmulatedWire
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.reader import HandReader
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError
-from tgdsl.runtime.xhand1.wire.link import Link, LinkCounters, LinkTiming
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD, POLL_S
 
@@ -151,8 +151,10 @@ class _Event(threading.Event):
 
 
 class _Reader(HandReader):
-    def __init__(self, link: Link, connect: Callable[[LinkCounters], Link], motion: Motion | None, time: VirtualTime):
-        super().__init__(link, connect, motion)
+    def __init__(
+        self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None, time: VirtualTime
+    ):
+        super().__init__(client, connect, motion)
         self._time, self.changed, self._stopping = time, _Condition(time), _Event(time)
 
     def run(self) -> None:
@@ -174,21 +176,21 @@ def virtual_hand(
     hand: EmulatedHand | None = None,
     *,
     motion: MotionLimits | None = None,
-    timing: LinkTiming | None = None,
+    timing: SerialTiming | None = None,
     turnaround_s: float = 0.0002,
     seed: int = 0,
 ) -> Iterator[tuple[XHand1, VirtualPort, VirtualTime]]:
     """Open a hand as `XHand1.open` does, its line and its clock virtual."""
-    time, timing = VirtualTime(), timing or LinkTiming()
-    for module in (driver, pace, reader):
+    time, timing = VirtualTime(), timing or SerialTiming()
+    for module in (driver, reader, step_timer):
         monkeypatch.setattr(module, "time", time)
     port = VirtualPort(EmulatedWire(hand or EmulatedHand(), Faults(), BAUD, turnaround_s, seed), time)
 
-    def connect(counters: LinkCounters) -> Link:
+    def connect(counters: SerialCounters) -> SerialClient:
         port._check()
-        return Link(port, Addresses(), timing, counters, clock=time.monotonic)
+        return SerialClient(port, Addresses(), timing, counters, clock=time.monotonic)
 
-    own = _Reader(connect(LinkCounters()), connect, Motion(motion) if motion else None, time)
+    own = _Reader(connect(SerialCounters()), connect, Motion(motion) if motion else None, time)
     own.start()
     opened = XHand1(own, timing)
     try:

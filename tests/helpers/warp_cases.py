@@ -46,7 +46,7 @@ SCENE = """
 CUBE, JOINTS = slice(0, 6), slice(6, 8)
 
 
-def module(folder, text=SCENE, links=("table", "pad"), target=None, **sensor) -> TactileModule:
+def module(folder, text=SCENE, links=("table", "pad"), target=None, observations=None, **sensor) -> TactileModule:
     (folder / "scene.xml").write_text(text)
     probes = [{"pos": [x, y, 0.01], "normal": [0, 0, 1]} for x in (-0.01, 0.01) for y in (-0.01, 0.01)]
     points = {"method": "points", "points": probes, "radius": 0.005}
@@ -55,6 +55,7 @@ def module(folder, text=SCENE, links=("table", "pad"), target=None, **sensor) ->
         "robot": {"model": str(folder / "scene.xml"), "layout": {"resolutions": {"only": dict.fromkeys(links, points)}}},
         "objects": {"cube": {"body": "cube", **(target or {})}},
         "sensors": {"touch": {"kind": "kinematic_taxel", "links": list(links), "feels": ["cube"], **sensor}},
+        **({"observations": observations} if observations else {}),
     }
     return tgdsl.compile(document)
 

@@ -14,11 +14,11 @@ import numpy as np
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.body import TipForces
 from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandError
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.serial_port import open_serial_port
 
-PATIENT = LinkTiming(reply_timeout_s=5.0, silence_s=2.0)
+PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """So that a busy machine, whose pseudo-terminals may take half a second, is no failure of the line."""
 
 

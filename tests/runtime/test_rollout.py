@@ -7,8 +7,8 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.batch.simulation import simulate
 from tgdsl.runtime.rollout import Recorder, Step, recorded_controls, rollout, scripted_controls
+from tgdsl.runtime.simulate import simulate
 
 SCENE = """
 <mujoco>

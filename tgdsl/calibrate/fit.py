@@ -4,7 +4,7 @@ Rotation and scale minimise the sum of squared errors of the force, in turn: the
 *Psychometrika* 31, 1966), which also finds mirrored axes, the scales each by linear least squares. Starts at the linear map of
 least squares. Where the axes are known to be parallel to the link's, each axis is a straight line.
 
-Shapes: `frame` the frames used, `axis` x, y, z along the link (or, for scale and tare, along the sensor), `step` the instants
+Shapes: `sample` readings used, `axis` x, y, z along the link (or, for scale and tare, along the sensor), `step` the instants
 at which a force is known, `component` those of one or more fingertips.
 """
 
@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 
 from tgdsl.errors import TgdslError
 
-Forces = Float[np.ndarray, "frame 3"]
+Forces = Float[np.ndarray, "sample 3"]
 AxesModel = Literal["rotation", "signs"]
 
 _LOADED = 0.02
@@ -85,7 +85,7 @@ def fit_finger(
         tare: Counts without force; default: fitted, for which loads must differ in each direction; no load is one.
 
     Raises:
-        FitError: If there are fewer than four frames, or loads do not reach in all directions; it says which are missing.
+        FitError: If there are fewer than four samples, or loads do not reach in all directions; it says which are missing.
     """
     if len(counts) < 4:
         raise FitError(f"{len(counts)} frames, expected at least 4")
@@ -101,8 +101,8 @@ def fit_finger(
 
 
 def time_offset(
-    time: Float[np.ndarray, " frame"],
-    counts: Float[np.ndarray, "frame component"],
+    time: Float[np.ndarray, " sample"],
+    counts: Float[np.ndarray, "sample component"],
     known_time: Float[np.ndarray, " step"],
     known_force: Float[np.ndarray, "step component"],
     max_offset_s: float,
@@ -145,10 +145,10 @@ def time_offset(
 
 
 def forces_at(
-    time: Float[np.ndarray, " frame"],
+    time: Float[np.ndarray, " sample"],
     known_time: Float[np.ndarray, " step"],
     known_force: Float[np.ndarray, "step component"],
-) -> tuple[Float[np.ndarray, "frame component"], Bool[np.ndarray, " frame"]]:
+) -> tuple[Float[np.ndarray, "sample component"], Bool[np.ndarray, " sample"]]:
     """Return known forces at other times, linear in between, and which of the times lie within theirs."""
     found = np.column_stack([np.interp(time, known_time, component) for component in known_force.T])
     return found, (time >= known_time[0]) & (time <= known_time[-1])

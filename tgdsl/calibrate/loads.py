@@ -1,4 +1,4 @@
-"""What a log says of fingertips under known forces: which frames count, and what the forces were.
+"""What a log says of fingertips under known forces: which samples count, and what the forces were.
 
 Known are either constant loads over intervals of the log, as a YAML file says, or forces over time, as of a simulation.
 
@@ -106,13 +106,13 @@ class TipRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
-    """Frames of one fingertip with known forces.
+class Samples:
+    """Samples of one fingertip with known forces.
 
     Attributes:
         counts: What it read [counts].
         force: The force on it, along its link's axes [N].
-        num_left_out: Frames left out because the sum or a taxel was at the end of its range.
+        num_left_out: Samples left out because the sum or a taxel was at the end of its range.
         saturated_taxels: Numbers of the taxels that were.
     """
 
@@ -132,11 +132,11 @@ def load_loads(path: Path) -> tuple[Load, ...]:
     return spec.loads
 
 
-def frames_under_loads(record: TipRecord, finger: str, loads: tuple[Load, ...]) -> Frames:
-    """Return a fingertip's frames during its loads.
+def samples_under_loads(record: TipRecord, finger: str, loads: tuple[Load, ...]) -> Samples:
+    """Return a fingertip's samples during its loads.
 
     Raises:
-        FitError: If a load holds no frame, two overlap, or all frames are at the end of the range.
+        FitError: If a load holds no reading, two overlap, or all of them are at the end of the range.
     """
     own = [load for load in loads if load.finger == finger]
     force = np.full((len(record.time), 3), np.nan)
@@ -149,13 +149,13 @@ def frames_under_loads(record: TipRecord, finger: str, loads: tuple[Load, ...]) 
         if np.isfinite(force[is_during]).any():
             raise FitError(f"{when} there are two loads at once")
         force[is_during] = load.force
-    return _frames(record, finger, force)
+    return _samples(record, finger, force)
 
 
-def frames_under_forces(
+def samples_under_forces(
     record: TipRecord, finger: str, time: Float[np.ndarray, " step"], force: Float[np.ndarray, "step 3"]
-) -> Frames:
-    """Return a fingertip's frames while a force over time is known.
+) -> Samples:
+    """Return a fingertip's samples while a force over time is known.
 
     Args:
         record: The log's fingertips.
@@ -164,10 +164,10 @@ def frames_under_forces(
         force: The force on the fingertip, along its link's axes [N]; linear in between.
 
     Raises:
-        FitError: If they have no time in common, or all frames are at the end of the range.
+        FitError: If they have no time in common, or all samples are at the end of the range.
     """
     known, is_inside = forces_at(record.time, time, force)
-    return _frames(record, finger, np.where(is_inside[:, None], known, np.nan))
+    return _samples(record, finger, np.where(is_inside[:, None], known, np.nan))
 
 
 def known_tip_forces(path: Path) -> tuple[Float[np.ndarray, " step"], dict[str, Float[np.ndarray, "step 3"]]]:
@@ -221,8 +221,8 @@ def simulated_tip_forces(
     return time, forces
 
 
-def _frames(record: TipRecord, finger: str, force: Forces) -> Frames:
-    """Return the frames whose force is known (finite) and that are within range."""
+def _samples(record: TipRecord, finger: str, force: Forces) -> Samples:
+    """Return the samples whose force is known (finite) and that are within range."""
     i = FINGERS.index(finger)
     is_known = np.isfinite(force).all(axis=1)
     if not is_known.any():
@@ -235,7 +235,7 @@ def _frames(record: TipRecord, finger: str, force: Forces) -> Frames:
         where = f"its sum or a taxel ({', '.join(map(str, saturated))}) is" if saturated else "its sum is"
         what = f"{finger}: in all {int(is_known.sum())} readings {where} at the end of the range"
         raise FitError(f"{what}; expected smaller loads, or taxels that are always there left out of this")
-    return Frames(record.counts[is_used, i], force[is_used], int(is_left_out.sum()), saturated)
+    return Samples(record.counts[is_used, i], force[is_used], int(is_left_out.sum()), saturated)
 
 
 def _arrays(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

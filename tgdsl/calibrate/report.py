@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from tgdsl.calibrate.fit import FingerFit, FitError
-from tgdsl.calibrate.loads import Frames
+from tgdsl.calibrate.loads import Samples
 from tgdsl.files.files import whole
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS
@@ -52,11 +52,11 @@ def calibrated(base: Calibration, fits: Mapping[str, FingerFit], others: str | N
     return replace(base, units="N", scale=scale, rotation=rotation, bias=bias, tare=tare, contact_threshold=threshold)
 
 
-def report(fits: Mapping[str, FingerFit], frames: Mapping[str, Frames]) -> list[str]:
+def report(fits: Mapping[str, FingerFit], samples: Mapping[str, Samples]) -> list[str]:
     """Return a line per fit and axis: residuals, and what was left out."""
     lines = []
     for name, fit in fits.items():
-        own = frames[name]
+        own = samples[name]
         lines.append(f"{name}: {len(own.counts)} readings; {fit_text(fit)}")
         for i, axis in enumerate("xyz"):
             size = f"RMS {fit.rms[i]:.4f} N, at most {fit.max_error[i]:.4f} N, R² {fit.r_squared[i]:.5f}"

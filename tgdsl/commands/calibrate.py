@@ -15,7 +15,7 @@ from tgdsl.files.files import with_folder, write_whole
 if TYPE_CHECKING:
     import numpy as np
 
-    from tgdsl.calibrate.loads import Frames, Load, TipRecord
+    from tgdsl.calibrate.loads import Load, Samples, TipRecord
 
 Finger = Literal["thumb", "index", "middle", "ring", "pinky"]
 File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
@@ -82,16 +82,16 @@ class Calibrate:
             refuse_to_replace(file, self.force)
         log = open_log(self.log)
         base = load_calibration(self.calibration) if self.calibration else log.calibration or Calibration.none()
-        frames = self._frames(TipRecord.of(log, self.ignore_taxels))
+        samples = self._samples(TipRecord.of(log, self.ignore_taxels))
         fits = {}
-        for name, own in frames.items():
+        for name, own in samples.items():
             tare = base.tare[FINGERS.index(name)] if self.keep_tare else None
             try:
                 fits[name] = fit_finger(own.counts, own.force, axes=self.axes, tare=tare)
             except FitError as error:
                 raise FitError(f"{name}: {error}") from error
         result = calibrated(base, fits, self.others)
-        print("\n".join(report(fits, frames)))
+        print("\n".join(report(fits, samples)))
         notes = [f"# {name}: fitted to {self.log.name}; {fit_text(fit)}\n" for name, fit in fits.items()]
         origin = f"scale and rotation are those of {self.others}" if self.others else "as in the calibration before"
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
@@ -99,18 +99,18 @@ class Calibrate:
         print(f"calibration: {self.out}")
         print(f"picture:     {picture(fits, with_folder(self.plot), f'{self.log.name}: fingertip forces')}")
 
-    def _frames(self, record: TipRecord) -> dict[str, Frames]:
-        """Return the frames to fit to, by finger."""
-        from tgdsl.calibrate.loads import frames_under_loads, load_loads
+    def _samples(self, record: TipRecord) -> dict[str, Samples]:
+        """Return the samples to fit to, by finger."""
+        from tgdsl.calibrate.loads import load_loads, samples_under_loads
 
         given = [self.loads is not None, bool(self.load), self.simulation is not None]
         if sum(given) != 1:
             raise TgdslError("expected the known forces as one of --loads FILE, --finger with --load, or --simulation FILE")
         if self.simulation is not None:
-            return self._simulated_frames(record, self.simulation)
+            return self._simulated_samples(record, self.simulation)
         loads = load_loads(self.loads) if self.loads is not None else self._loads()
         fingers = dict.fromkeys(load.finger for load in loads)
-        return {finger: frames_under_loads(record, finger, loads) for finger in fingers}
+        return {finger: samples_under_loads(record, finger, loads) for finger in fingers}
 
     def _loads(self) -> tuple[Load, ...]:
         from pydantic import ValidationError
@@ -128,11 +128,11 @@ class Calibrate:
                 raise TgdslError(f"--load {start:g} {end:g} {' '.join(f'{value:g}' for value in force)}: {why}") from error
         return tuple(loads)
 
-    def _simulated_frames(self, record: TipRecord, path: Path) -> dict[str, Frames]:
+    def _simulated_samples(self, record: TipRecord, path: Path) -> dict[str, Samples]:
         import numpy as np
 
         from tgdsl.calibrate.fit import time_offset
-        from tgdsl.calibrate.loads import frames_under_forces
+        from tgdsl.calibrate.loads import samples_under_forces
         from tgdsl.runtime.xhand1.wire.payloads import FINGERS
 
         time, forces = self._known_forces(path)
@@ -145,7 +145,7 @@ class Calibrate:
         known = np.concatenate([forces[name] for name in loaded], axis=1)
         offset = time_offset(record.time[is_within], counts, time, known, self.max_offset)
         print(f"the log's clock is {offset:.4f} s ahead of the simulation's; fingertips with loads: {', '.join(loaded)}")
-        return {name: frames_under_forces(record, name, time + offset, forces[name]) for name in loaded}
+        return {name: samples_under_forces(record, name, time + offset, forces[name]) for name in loaded}
 
     def _known_forces(self, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         from tgdsl.calibrate.loads import known_tip_forces, simulated_tip_forces

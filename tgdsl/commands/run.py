@@ -74,8 +74,8 @@ class Run:
 
     def _start(self, touch: TactileModule) -> tuple[Simulator, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
-        from tgdsl.runtime.batch.simulation import simulate
         from tgdsl.runtime.rollout import default_keyframes, held_controls, recorded_controls, scripted_controls
+        from tgdsl.runtime.simulate import simulate
 
         sim = simulate(touch, self.num_envs, substeps=self.substeps)
         keyframes = default_keyframes(sim.model) if self.keyframes is None else self.keyframes

@@ -16,8 +16,8 @@ class Output:
     """One reading: its name, its sensor and that one's kind, its shape after `env`, and name and unit of each channel.
 
     The shape is (row, channel), or (step, row, channel) where calls, or samples of a block, are stacked. Rows are the sensor's
-    taxels (`rows` is "taxel"), the bodies that carry it ("body"), or what its kind says: see `TactileModule.rows`; `bodies` lists
-    the bodies. A reading that no sensor makes has its own name for sensor and kind; its rows are those of `inputs.joints`
+    taxels (`rows` is "taxel"), the bodies that carry it ("body"), or what its kind says: see `TactileModule.rows`. `bodies`
+    lists the bodies. A reading that no sensor makes has its own name for sensor and kind; its rows are those of `inputs.joints`
     ("joint") or `inputs.actuators` ("actuator").
     """
 

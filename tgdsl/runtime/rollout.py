@@ -21,7 +21,7 @@ from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.files.files import whole
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.controls import control_tensor
-from tgdsl.runtime.simulators.room import refuse_beyond_memory
+from tgdsl.runtime.simulators.memory import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
 
 PLACES = ("link", "body", "pos", "normal", "area")
@@ -143,7 +143,7 @@ class Recorder:
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
-        """Make room for a rollout.
+        """Allocate memory for a rollout.
 
         Raises:
             SimulationError: If this computer has too little memory.

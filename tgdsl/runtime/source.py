@@ -1,4 +1,4 @@
-"""What a source of scene states offers, whichever simulator or hardware is behind it."""
+"""What a source offers, whichever simulator, hardware or recording is behind it."""
 
 from __future__ import annotations
 
@@ -13,32 +13,34 @@ from torch import Tensor
 from tgdsl.module.state import SceneState
 from tgdsl.tensors.env_ids import EnvIds
 
+Control = Tensor | np.ndarray | None
+"""Controls of a step, (actuator,) or (env, actuator); None: as they were."""
 
+
+@runtime_checkable
 class Source(Protocol):
-    """Something that steps and can be felt."""
+    """Environments that are stepped: what a connection needs of a simulator, a hand or a recording."""
 
     @property
     def num_envs(self) -> int:
         """Number of environments."""
         ...
 
-    def step(self, control: Tensor | np.ndarray | None = None) -> None:
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        ...
+
+    def step(self, control: Control = None) -> None:
         """Advance all environments by one control step."""
         ...
 
-    def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
-        """Advance all environments by one control step, and yield the state after each of its physics steps.
-
-        The `dt` of these states is that of a physics step. What has no physics steps yields one state, of the control step.
-        """
-        ...
-
-    def state(self) -> SceneState:
-        """Return what the module wants, all of it from one instant; its `dt` is that of a control step."""
-        ...
-
     def reset(self, env_ids: EnvIds | None = None) -> None:
-        """Start some environments (default: all) anew, and what the module remembers of them."""
+        """Begin a new episode in some environments (default: all)."""
+        ...
+
+    def close(self) -> None:
+        """Release the simulator, the device or the file."""
         ...
 
 
@@ -52,9 +54,15 @@ class Simulator(Source, Protocol):
 
     model: mujoco.MjModel
 
-    @property
-    def control_step(self) -> float:
-        """Duration of one control step [s]."""
+    def state(self) -> SceneState:
+        """Return what the module wants, all of it from one instant; its `dt` is that of a control step."""
+        ...
+
+    def substates(self, control: Control = None) -> Iterator[SceneState]:
+        """Advance all environments by one control step, and yield the state after each of its physics steps.
+
+        The `dt` of these states is that of a physics step.
+        """
         ...
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from tgdsl.errors import ArtifactError, RobotError
+from tgdsl.errors import ArtifactError, RobotError, TgdslError
 from tgdsl.files.files import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.places import ROBOTS, located
@@ -149,12 +149,12 @@ def _absence(name: str) -> str:
     return f"{name}/is_absent"
 
 
-def _free_bit(spec: mujoco.MjSpec) -> int:
-    """Return a bit that no geom collides with."""
+def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError]) -> int:
+    """Return a bit that no geom collides with; if there is none, an error says who needs it."""
     used = int(np.bitwise_or.reduce([int(geom.conaffinity) for geom in spec.geoms]))
     free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
     if free is None:
-        raise RobotError("the scene's geoms use all bits of `conaffinity`; objects that vary need a free one")
+        raise error(f"the scene's geoms use all bits of `conaffinity`; {who} need a free one")
     return free
 
 
@@ -183,7 +183,7 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
         setattr(geom, name, getattr(template, name))
     spec.add_numeric(name=_absence(geom.name), data=[float(chosen is None)])
     if chosen is None:
-        geom.contype, geom.conaffinity = _free_bit(spec), 0
+        geom.contype, geom.conaffinity = free_bit(spec, "objects that vary", RobotError), 0
         geom.mass, geom.density = 0.0, 0.0
         geom.rgba = [0.0, 0.0, 0.0, 0.0]
         geom.material = ""

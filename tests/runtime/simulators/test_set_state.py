@@ -10,7 +10,7 @@ import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED
-from tgdsl.runtime.warp.lane import Lane
+from tgdsl.runtime.warp.stream import WarpStream
 
 DERIVED = ("xpos", "xquat", "cvel", "subtree_com", "sensordata", "qacc", "geom_xpos")
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
@@ -349,9 +349,9 @@ def test_in_a_graph_of_ones_own_a_reset_is_evaluated_at_once(tmp_path, monkeypat
     for one in (sim, twin):
         one.step()
     mask, qpos = torch.tensor([True, False, True]), sim.qpos + torch.eye(9)[2]
-    assert not sim._lane.is_capturing
-    monkeypatch.setattr(Lane, "is_capturing", property(lambda self: True))
-    monkeypatch.setattr(Lane, "work_in_capture", Lane.work)
+    assert not sim._stream.is_capturing
+    monkeypatch.setattr(WarpStream, "is_capturing", property(lambda self: True))
+    monkeypatch.setattr(WarpStream, "capture_scope", WarpStream.scope)
     sim.reset(mask, qpos=qpos)
     found = {name: sim.arrays[name].clone() for name in ("xpos", "cvel", "geom_xpos")}
     monkeypatch.undo()

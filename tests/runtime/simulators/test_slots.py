@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from test_object_parts import LOAD, MODELS, RESTING, compiled, of_kinds, simulated
+from pressed_pads import LOAD, MODELS, RESTING, compiled, of_kinds, simulated
 from warp_cases import warp
 
 import tgdsl

@@ -18,7 +18,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import contact_sensor_names
 from tgdsl.quantities.pairs import Pair
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.runtime.warp.lane import libraries
+from tgdsl.runtime.warp.stream import libraries
 
 STACK = """
 <mujoco>

@@ -102,7 +102,7 @@ def test_stepping_and_reading_in_one_is_one_after_the_other(tmp_path, fields):
 
 
 class Forgetful:
-    """Counts how often a graph is forgotten, in place of a `Replay`."""
+    """Counts how often a graph is forgotten, in place of a `GraphedCall`."""
 
     def __init__(self, body):
         self.body, self.count = body, 0

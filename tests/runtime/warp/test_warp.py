@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import trimesh
 from warp_cases import (
     MOVING_FORCE,
     SCENE,
@@ -29,11 +28,26 @@ from warp_cases import (
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.runtime.warp.lane import Lane, Replay
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import constraint_rows
+
+
+class PretendedGpu(WarpStream):
+    """A stream that captures: its replays are counted and do nothing."""
+
+    def __init__(self):
+        super().__init__("cpu")
+        self.is_captured, self.captures, self.replays = True, 0, 0
+
+    def capture(self, body):
+        self.captures += 1
+        return None, body()
+
+    def replay(self, graph):
+        self.replays += 1
+
 
 # the same readings as on the CPU
 
@@ -120,29 +134,14 @@ def test_stepping_and_reading_in_one(tmp_path):
     assert seen[0]
 
 
-class PretendedGpu(Lane):
-    """A lane that captures: its replays are counted and do nothing."""
-
-    def __init__(self):
-        super().__init__("cpu")
-        self.is_captured, self.captures, self.replays = True, 0, 0
-
-    def capture(self, body):
-        self.captures += 1
-        return None, body()
-
-    def replay(self, graph):
-        self.replays += 1
-
-
 def test_work_is_captured_at_its_third_call_and_then_replayed():
-    lane, calls = PretendedGpu(), []
-    replay = Replay(lane, lambda: calls.append(0) or len(calls))
+    stream, calls = PretendedGpu(), []
+    replay = GraphedCall(stream, lambda: calls.append(0) or len(calls))
     assert [replay() for _ in range(5)] == [1, 2, 3, 3, 3]
-    assert (lane.captures, lane.replays) == (1, 3)
+    assert (stream.captures, stream.replays) == (1, 3)
     replay.forget()
     assert [replay() for _ in range(3)] == [4, 5, 6]
-    assert (lane.captures, lane.replays) == (2, 4)
+    assert (stream.captures, stream.replays) == (2, 4)
 
 
 @pytest.mark.slow
@@ -326,124 +325,3 @@ def test_without_mujoco_warp(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     with pytest.raises(SimulationError, match=r'^physics on a GPU needs MuJoCo Warp: pip install "tgdsl\[gpu\]"$'):
         warp(touch, 1)
-
-
-# environments that differ
-
-VARIANTS = [
-    {"type": "box", "size": [0.02, 0.015, 0.01]},
-    {"type": "sphere", "size": [0.015], "pos": [0.004, 0, 0]},
-    {"type": "box", "size": [0.01, 0.02, 0.02]},
-    {"geoms": [{"type": "sphere", "size": [0.012], "pos": [0, 0, 0.02]}, {"type": "box", "size": [0.01, 0.01, 0.015]}]},
-]
-ITEMS = """
-<mujoco>
-  <option timestep="0.002" cone="elliptic" impratio="10" integrator="implicitfast"/>
-  <worldbody>
-    <body name="table"><geom type="box" size=".2 .2 .01"/></body>
-    <geom type="plane" size="1 1 .1" pos="0 0 -.1"/>
-    <body name="first" pos="0 0 .0297"><freejoint/><geom size=".01"/></body>
-    <body name="second" pos=".005 0 .0803"><freejoint/><geom size=".01"/></body>
-    <body name="rod" pos="-.1 0 .0198"><freejoint/><geom type="box" size=".01 .02 .01"/></body>
-    <body name="post" pos="-.5 0 0" euler="0 0 30"><geom size=".01"/></body>
-    <body name="finger" pos="-.5 0 .0695"><freejoint/><geom size=".02"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-
-def items(folder) -> TactileModule:
-    """Return a module of two objects with variants and one with a size, on a table, and a post that is not the same either."""
-    (folder / "items.xml").write_text(ITEMS)
-    points = [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.005}]
-    feels = ["first", "second", "rod"]
-    posts = [{"type": "box", "size": [0.03, 0.02, 0.05]}, {"type": "box", "size": [0.02, 0.02, 0.02], "pos": [0.005, 0, 0.03]}]
-    document = {
-        "tgdsl": 1,
-        "robot": {
-            "model": str(folder / "items.xml"),
-            "layout": {"resolutions": {"only": {link: {"method": "points", "points": points} for link in ("table", "finger")}}},
-        },
-        "objects": {
-            "first": {"body": "first", "variants": VARIANTS},
-            "second": {"body": "second", "variants": VARIANTS[::-1]},
-            "rod": {"body": "rod", "size": "per_env"},
-            "post": {"body": "post", "variants": posts},
-        },
-        "sensors": {
-            "touch": {"kind": "kinematic_taxel", "links": "table", "feels": feels},
-            "force": {"kind": "link_contact", "links": "table", "feels": feels},
-            "tip": {"kind": "link_contact", "links": "finger", "feels": ["post"]},
-        },
-    }
-    return tgdsl.compile(document)
-
-
-@pytest.mark.slow
-def test_environments_with_objects_of_their_own_are_those_of_the_cpu(tmp_path):
-    """Each environment against MuJoCo with a model compiled for it alone; geoms that it lacks must meet nothing at all."""
-    touch = items(tmp_path)
-    sim, cpu = warp(touch, 8), BatchSimulation(touch, 8)
-    sim.warp_model.opt.tolerance.fill_(sim.model.opt.tolerance)
-    rng = np.random.default_rng(2)
-    pairs = [pair.object for pair in touch.inputs.pairs]
-    num_touching = torch.zeros(8, len(pairs))
-    for attempt in range(3):
-        if attempt:
-            choice = {"first": rng.integers(4, size=4), "second": rng.integers(4, size=4)}
-            sizes = {"rod": rng.uniform(0.01, 0.03, size=(4, 3))}
-            ids = np.sort(rng.permutation(8)[:4])
-            cpu.set_objects(choice, sizes, ids)
-            sim.set_objects({k: v[::-1] for k, v in choice.items()}, {k: v[::-1] for k, v in sizes.items()}, ids[::-1].copy())
-        for name in ("body_mass", "body_inertia", "geom_size"):
-            expected = [getattr(cpu.batch.get_model(env), name) for env in range(8)]
-            np.testing.assert_allclose(sim.parameters[name], expected, rtol=1e-6, atol=1e-12, err_msg=name)
-        for _ in range(60):
-            hand_over(sim, cpu)
-            sim.step()
-            cpu.step()
-            state = sim.state()
-            assert_agree(state, cpu.state(), touch.inputs.fields, MOVING_FORCE)
-            num_touching += state.contact_found > 0
-    assert num_touching[:, [pairs.index("first"), pairs.index("rod"), pairs.index("post")]].min() > 0
-    assert num_touching[:, pairs.index("second")].any()
-
-
-@pytest.mark.slow
-def test_meshes_among_the_variants(tmp_path):
-    """MuJoCo makes hulls of meshes in use alone: all environments need those of all."""
-    trimesh.creation.icosphere(subdivisions=2, radius=0.03).apply_translation([0.01, 0.02, 0.02]).export(tmp_path / "ball.stl")
-    trimesh.creation.box(extents=[0.05, 0.03, 0.06]).apply_translation([0, 0.01, 0]).export(tmp_path / "brick.stl")
-    variants = [
-        {"mesh": str(tmp_path / "ball.stl")},
-        {"type": "box", "size": [0.02, 0.02, 0.02]},
-        {"mesh": str(tmp_path / "brick.stl"), "pos": [0.002, 0, 0.01]},
-        {"mesh": str(tmp_path / "ball.stl"), "scale": 0.5},
-    ]
-    text = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .06"')
-    touch = module(tmp_path, text, links=("table",), target={"variants": variants, "tolerance": 2e-4})
-    sim, cpu = warp(touch, 8), BatchSimulation(touch, 8)
-    sim.warp_model.opt.tolerance.fill_(sim.model.opt.tolerance)
-    num_touching = torch.zeros(8, 1)
-    for _ in range(200):
-        hand_over(sim, cpu)
-        sim.step()
-        cpu.step()
-        state = sim.state()
-        assert_agree(state, cpu.state(), touch.inputs.fields)
-        num_touching += state.contact_found > 0
-    assert num_touching.min() > 50
-
-
-@pytest.mark.slow
-def test_fields_of_the_model_that_environments_have_of_their_own(tmp_path):
-    """Coulomb: a cube that slides on friction μ loses μ g of its speed per second."""
-    touch = module(tmp_path, SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .03"').replace('impratio="10"', 'impratio="100"'))
-    sim = warp(touch, 2, per_env=["geom_friction"], substeps=50)
-    friction = torch.tensor([0.05, 0.2])
-    sim.parameters["geom_friction"][:, :, 0] = friction[:, None]
-    sim.step()
-    sim.arrays["qvel"][:, 0] = 0.3
-    sim.step()
-    lost = 0.3 - sim.arrays["qvel"][:, 0]
-    torch.testing.assert_close(lost, friction * 9.81 * 50 * 0.002, rtol=0.02, atol=0)

@@ -13,6 +13,8 @@ from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 from tgdsl.runtime.xhand1.wire import payloads, serial_port
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.discovery import find_hands
 from tgdsl.runtime.xhand1.wire.errors import (
     HandChecksumError,
     HandClosedError,
@@ -22,15 +24,13 @@ from tgdsl.runtime.xhand1.wire.errors import (
     HandTimeoutError,
     MotionError,
 )
-from tgdsl.runtime.xhand1.wire.find import find_hands
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.protocol import Frame, Register, encode_frame
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 
 READ = encode_frame(Frame(0xFE, 0x80, 2, payloads.encode_command(payloads.PASSIVE)))
 VERSION = bytes.fromhex("55aafe80130000efc3")
-CALM = LinkTiming(reply_timeout_s=0.5, silence_s=0.4)
-BRISK = LinkTiming(reply_timeout_s=0.2, silence_s=0.1)
+CALM = SerialTiming(reply_timeout_s=0.5, silence_s=0.4)
+BRISK = SerialTiming(reply_timeout_s=0.2, silence_s=0.1)
 
 
 def test_every_reading_is_new_and_knows_its_age():
@@ -151,7 +151,7 @@ def refusal(device: str) -> str:
 
 
 def test_a_line_that_damages_everything():
-    timing = LinkTiming(reply_timeout_s=5.0, silence_s=0.5)
+    timing = SerialTiming(reply_timeout_s=5.0, silence_s=0.5)
     with Emulator(faults=Faults(corrupt=1.0)) as emulator, pytest.raises(HandChecksumError, match="came damaged"):
         XHand1.open(emulator.device, timing=timing)
 
@@ -175,7 +175,7 @@ def test_the_wrong_hand():
             XHand1.open(emulator.device)
         with XHand1.open(emulator.device, Addresses(3), timing=PATIENT) as hand:
             hand.read(20.0)
-        found = find_hands(emulator.device, (1, 3), timing=LinkTiming(reply_timeout_s=2.0, silence_s=1.0))
+        found = find_hands(emulator.device, (1, 3), timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0))
     assert [(hand.addresses, hand.version) for hand in found] == [(Addresses(3, 0x83, 0xFE), b"tgdsl emulator")]
 
 

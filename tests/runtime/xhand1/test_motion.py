@@ -17,8 +17,8 @@ from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits, joint_ranges
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, MotionError, WatchdogError
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, Mode, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Frame, encode_frame
 
@@ -33,7 +33,7 @@ REST = np.array([0.5, 0.2, 0.3, 0.0] + [0.6] * 8)
 ZERO = np.zeros(12)
 
 
-CALM = LinkTiming(reply_timeout_s=0.5, silence_s=0.4)
+CALM = SerialTiming(reply_timeout_s=0.5, silence_s=0.4)
 """As patient as a failure of the line may be that is to be noticed before the watchdog bites, after 1 s."""
 
 
@@ -266,9 +266,9 @@ import sys, time
 import numpy as np
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
-from tgdsl.runtime.xhand1.link import LinkTiming
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.motion import MotionLimits
-patient = LinkTiming(reply_timeout_s=5.0, silence_s=2.0)
+patient = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 limits = MotionLimits((0.0,) * 12, (1.0,) * 12, (1.0,) * 12, (300,) * 12, kp=100, watchdog_s=1.0)
 hand = XHand1.open(sys.argv[1], motion=limits, timing=patient)
 while not hand._reader._is_driven:

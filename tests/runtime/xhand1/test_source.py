@@ -9,15 +9,15 @@ from xhand1_hands import PATIENT, wait_until
 
 from tgdsl.errors import StateError
 from tgdsl.runtime.source import Source
-from tgdsl.runtime.xhand1 import pace
+from tgdsl.runtime.xhand1 import step_timer
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.body import TipForces
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits
-from tgdsl.runtime.xhand1.pace import RealTime
 from tgdsl.runtime.xhand1.source import XHand1Source
+from tgdsl.runtime.xhand1.step_timer import RealTime
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, WatchdogError
 
@@ -94,7 +94,7 @@ class Clock:
 
 def test_steps_keep_their_time_and_late_ones_are_counted(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(pace, "time", clock)
+    monkeypatch.setattr(step_timer, "time", clock)
     steps, ends = RealTime(0.04), []
     for work in (0.0, 0.03, 0.01, 0.0399, 0.1, 0.0, 0.2, 0.0):
         clock.now += work

@@ -18,7 +18,7 @@ from tgdsl.errors import SimulationError, listed
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.simulators.lookup import geoms_of
+from tgdsl.runtime.simulators.model_ids import geoms_of
 
 CONTACT_FIELDS = ("contact_found", *SLOT_FIELDS, "contact_netforce")
 """Fields of a state that are read of contact sensors."""

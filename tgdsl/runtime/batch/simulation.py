@@ -5,8 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Literal, overload
+from collections.abc import Callable
 
 import mujoco
 import mujoco.batch
@@ -18,14 +17,14 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.batch.reading import BatchReader
+from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
-from tgdsl.runtime.simulators.joint_fields import JointPlaces, KeptJoints
-from tgdsl.runtime.simulators.lookup import keyframe_id
-from tgdsl.runtime.simulators.objects import EnvObjects, Values
-from tgdsl.runtime.simulators.room import bytes_per_env, refuse_beyond_memory
-from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
+from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.objects import EnvObjects
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
-from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices
 
@@ -45,6 +44,8 @@ class BatchSimulation(Simulation):
         batch: MuJoCo's batch: `batch.qpos`, `batch.qvel` and others are live arrays (env, …).
         substeps: Physics steps per control step.
     """
+
+    _objects: EnvObjects | None = None
 
     def __init__(
         self,
@@ -78,24 +79,21 @@ class BatchSimulation(Simulation):
                 module's state is another simulation's or of other environments.
         """
         refuse_unfit(touch, num_envs, substeps, model)
-        self._objects: EnvObjects | None = None
         if model is None:
             scenes = SceneModels(touch.plan.scene)
             model = scenes.model({})
-            self._objects = EnvObjects(scenes, touch.inputs, num_envs) if touch.inputs.objects else None
+            if touch.inputs.objects:
+                self._objects = EnvObjects(scenes, touch.inputs, num_envs)
         self.model: mujoco.MjModel = model
-        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
-        if self.model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-            what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
-            raise SimulationError(f'{what}; take <flag sleep="enable"/> out of its <option>')
+        what = "the scene has `sleep` enabled, and which trees sleep is not part of the state that environments share"
+        refuse_two_instants(model, f'{what}; take <flag sleep="enable"/> out of its <option>')
         refuse_beyond_memory(f"{num_envs} environments", num_envs * bytes_per_env(self.model))
         self.substeps = substeps
         self._touch = touch
-        self._keyframe = -1 if keyframe is None else keyframe_id(model, keyframe)
+        self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
-        self._kept = KeptJoints(JointPlaces.of(touch.inputs, self.model), self.batch)
+        self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
@@ -115,33 +113,6 @@ class BatchSimulation(Simulation):
         self._refuse_if_closed()
         self._evaluate(self._ascending(env_ids))
 
-    def set_objects(
-        self,
-        variants: Mapping[str, Values] | None = None,
-        sizes: Mapping[str, Values] | None = None,
-        env_ids: EnvIds | None = None,
-    ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew.
-
-        At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
-        the XHand1's palm, 10 ms and 3 MB.
-
-        Args:
-            variants: Which variant of an object these environments have: (env,) integers, or one for all.
-            sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
-            env_ids: Indices, or a boolean mask over environments.
-
-        Raises:
-            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
-        """
-        if self._objects is None:
-            raise SimulationError("no object of this module differs between environments")
-        ids = env_indices(env_ids, self.num_envs)
-        self._objects.choose(ids, variants or {}, sizes or {})
-        models = self._objects.models()
-        self._run(lambda: self.batch.set_models(models))
-        self.reset(ids)
-
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
         return self.batch.xpos[env], self.batch.xquat[env]
@@ -149,6 +120,11 @@ class BatchSimulation(Simulation):
     def env_model(self, env: int) -> mujoco.MjModel:
         """Return the model of one environment."""
         return self.batch.get_model(env)
+
+    def _use_objects(self) -> None:
+        assert self._objects is not None
+        models = self._objects.models()
+        self._run(lambda: self.batch.set_models(models))
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
         ids = self._ascending(env_ids)
@@ -190,92 +166,23 @@ class BatchSimulation(Simulation):
             num_steps = 1
         self._run(lambda: self.batch.step(nstep=num_steps))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
-        is_faulty = self._faults.settle()
+        is_faulty = self._faults.update()
         if not is_faulty.any():
             return
         if self._faults.on_fault == "raise":
-            raise SimulationError("; ".join(self._faults.accounts(diverged=", and MuJoCo has started them anew")))
+            raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has started them anew")))
         self._begin_episodes(is_faulty, Rows({}))
         self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
 
     def _state(self, dt: float) -> SceneState:
-        values: dict[str, Any] = self._reader.read() | self._kept.read()
+        values = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
-        tensors: dict[str, Any] = {name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}
-        tensors["dt"] = dt
-        return SceneState(**{name: value for name, value in tensors.items() if name in self._touch.inputs.fields})
+        return self._scene_state({name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}, dt)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:
             call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
-
-
-@overload
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: Literal["cpu"] = "cpu",
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-) -> BatchSimulation: ...
-@overload
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: str,
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-    nconmax: int | None = None,
-    njmax: int | None = None,
-) -> BatchSimulation | WarpSimulation: ...
-def simulate(
-    touch: TactileModule,
-    num_envs: int,
-    *,
-    device: str = "cpu",
-    substeps: int = 1,
-    threads: int = 0,
-    keyframe: str | None = None,
-    on_fault: OnFault = "raise",
-    nconmax: int | None = None,
-    njmax: int | None = None,
-) -> BatchSimulation | WarpSimulation:
-    """Simulate the scene that a module was compiled for.
-
-    Args:
-        touch: The module.
-        num_envs: Number of environments.
-        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. The state is handed out on the
-            module's device; both on one GPU need no copies.
-        substeps: Physics steps per control step. What `state` hands out after a step is of the start of the last one: with
-            `substeps=1`, of the instant before the step. `sim.forward()` evaluates where the environments are now.
-        threads: CPU threads; 0: one per CPU.
-        keyframe: Name of the keyframe to start from.
-        on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
-            until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
-        nconmax: On a GPU, room for contacts per environment, in a pool that all share: see `WarpSimulation`.
-        njmax: On a GPU, room for rows of constraints in each environment.
-
-    Raises:
-        ArtifactError: If an asset of the scene is missing or has changed.
-        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
-            wants.
-    """
-    if device == "cpu":
-        if nconmax is not None or njmax is not None:
-            raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
-        return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, on_fault=on_fault)
-    if threads:
-        raise SimulationError(f'threads is {threads}, but only physics on "cpu" has threads, and the device is "{device}"')
-    keys: dict[str, Any] = {"nconmax": nconmax, "njmax": njmax}
-    return WarpSimulation(touch, num_envs, device=device, substeps=substeps, keyframe=keyframe, on_fault=on_fault, **keys)

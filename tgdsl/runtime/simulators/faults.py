@@ -17,7 +17,7 @@ from tgdsl.errors import SimulationError, did_you_mean, listed
 OnFault = Literal["raise", "reset"]
 """What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew."""
 DIVERGED, BAD_CONTROL, BAD_VALUES = range(3)
-_ACCOUNTS = (
+_MESSAGES = (
     "environments {envs} diverged{diverged}",
     "control is not finite in environments {envs}",
     "values given for the state of environments {envs} are not finite, or hold a quaternion of length 0, and were left out",
@@ -79,7 +79,7 @@ class EnvFaults:
         if self.on_fault == "reset":
             self._restarted.zero_()
 
-    def settle(self) -> Bool[Tensor, " env"]:
+    def update(self) -> Bool[Tensor, " env"]:
         """Count faults that are new; return which environments have any."""
         is_new = self._held & ~self._is_counted
         self.counts += is_new.any(dim=0)
@@ -97,14 +97,14 @@ class EnvFaults:
         """Note environments that a step has started anew."""
         self._restarted |= where
 
-    def accounts(self, diverged: str = "") -> list[str]:
+    def messages(self, diverged: str = "") -> list[str]:
         """Return which environments have which fault, in words; it waits for a GPU.
 
         Args:
             diverged: What else to say of environments that diverged.
         """
         found = []
-        for text, where in zip(_ACCOUNTS, self._held.cpu(), strict=True):
+        for text, where in zip(_MESSAGES, self._held.cpu(), strict=True):
             if where.any():
                 envs = listed([str(env) for env in torch.nonzero(where).flatten().tolist()])
                 found.append(text.format(envs=envs, diverged=diverged) + "; reset them to go on")

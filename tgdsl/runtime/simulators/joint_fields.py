@@ -27,7 +27,7 @@ _SCALAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 @dataclass(frozen=True, eq=False)
-class JointPlaces:
+class JointColumns:
     """Where joints and actuators stand in a model's arrays.
 
     Attributes:
@@ -39,7 +39,7 @@ class JointPlaces:
     fields: dict[str, str]
 
     @classmethod
-    def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointPlaces:
+    def of(cls, inputs: Inputs, model: mujoco.MjModel) -> JointColumns:
         """Look them up.
 
         Raises:
@@ -64,12 +64,12 @@ class KeptJoints:
         is_wanted: Whether anything has to be kept from before a physics step.
     """
 
-    def __init__(self, places: JointPlaces, batch: mujoco.batch.Batch):
+    def __init__(self, columns: JointColumns, batch: mujoco.batch.Batch):
         """Look at a batch that has just been made."""
-        self._places, self._batch = places, batch
-        for array in places.fields.values():
+        self._columns, self._batch = columns, batch
+        for array in columns.fields.values():
             batch.bind(array)  # it is filled only by calls that come after its first use
-        self._kept = {name: self._now(name) for name in places.moved}
+        self._kept = {name: self._now(name) for name in columns.moved}
         self.is_wanted = bool(self._kept)
 
     def keep(self, env_ids: Int[np.ndarray, " n"] | slice = slice(None)) -> None:
@@ -79,11 +79,11 @@ class KeptJoints:
 
     def read(self) -> dict[str, np.ndarray]:
         """Return the fields of a state, (env, joint) or (env, actuator)."""
-        return {name: self._kept[name].copy() if name in self._kept else self._now(name) for name in self._places.fields}
+        return {name: self._kept[name].copy() if name in self._kept else self._now(name) for name in self._columns.fields}
 
     def _now(self, name: str) -> np.ndarray:
-        array = self._places.fields[name]
-        return np.array(getattr(self._batch, array)[:, self._places.by_array[array]], dtype=np.float64)
+        array = self._columns.fields[name]
+        return np.array(getattr(self._batch, array)[:, self._columns.by_array[array]], dtype=np.float64)
 
 
 def _joint_id(model: mujoco.MjModel, name: str) -> int:

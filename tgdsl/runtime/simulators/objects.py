@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -17,6 +17,14 @@ from tgdsl.schema.objects import NUM_SIZES
 
 Values = int | float | Sequence[Any] | np.ndarray
 """Numbers, one per environment or one for all."""
+
+
+class ObjectChoices(Protocol):
+    """Objects whose variants and sizes can be chosen."""
+
+    def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
+        """Choose variants and sizes for some environments: see `Simulation.set_objects`."""
+        ...
 
 
 class EnvObjects:
@@ -41,7 +49,7 @@ class EnvObjects:
         self._tabulate()
 
     def choose(self, ids: Int[np.ndarray, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Say what objects are like in some environments: see `BatchSimulation.set_objects`."""
+        """Say what objects are like in some environments: see `Simulation.set_objects`."""
         chosen = [dict(self._choices[env]) for env in ids]
         for name, value in variants.items():
             for choices, variant in zip(chosen, self._variants(name, value, len(ids)), strict=True):

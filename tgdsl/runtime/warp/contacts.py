@@ -1,6 +1,6 @@
 """Contacts between links and objects, read from MuJoCo Warp's own contacts and constraint forces by one kernel.
 
-They are what the contact sensors of `tgdsl.instrument` hand out, without what these cost in MuJoCo Warp: room for 64 contacts
+They are what the contact sensors of `tgdsl.instrument` hand out, without what these cost in MuJoCo Warp: memory for 64 contacts
 per environment and sensor, each contact matched with each sensor, a sort.
 
 Shapes: `env` environments, `pair` and `slot` as the module's `inputs` list them, `sensor` sensors of a model.
@@ -23,8 +23,9 @@ from torch import Tensor
 from tgdsl.module.state import shape_of
 from tgdsl.plan.inputs import Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.simulators.lookup import body_id, part_geoms
-from tgdsl.runtime.warp.lane import libraries
+from tgdsl.runtime.simulators.model_ids import body_id, part_geoms
+from tgdsl.runtime.warp.private import constraint_contact_bit, contact_force_function
+from tgdsl.runtime.warp.stream import libraries
 
 _VECTORS = ("contact_pos", "contact_normal", "contact_force", "contact_torque", "contact_netforce")
 """Fields of vectors, in the order of the kernel's arguments."""
@@ -45,7 +46,7 @@ class PairContacts:
     arrays: dict[str, Float[Tensor, "env ..."]]
 
     def __init__(self, inputs: Inputs, model: mujoco.MjModel, num_envs: int, device: torch.device):
-        """Make room for what is wanted.
+        """Allocate memory for what is wanted.
 
         Args:
             inputs: What the module wants.
@@ -82,7 +83,7 @@ class PairContacts:
         ]
 
     def update(self, warp_model: Any, warp_data: Any) -> None:
-        """Read MuJoCo Warp's contacts, of the instant that `forward` or `step` has left there: work for a `Replay`."""
+        """Read MuJoCo Warp's contacts, of the instant that `forward` or `step` has left there: for a `GraphedCall`."""
         if not self.arrays:
             return
         self._memory.zero_()
@@ -129,9 +130,8 @@ def _kernel(wp: Any, mjw: Any) -> Any:
     object. Else it turns the normal and the tangent, but not their cross product, and of force and torque in this frame
     the part along that: in the world both are turned, as the normal is.
     """
-    # Both are private, but a kernel can call a function and no kernel: the public `contact_force` is one.
-    wrench_of = mjw._src.support.contact_force_fn
-    constraint = wp.constant(int(mjw._src.types.ContactType.CONSTRAINT))
+    wrench_of = contact_force_function(mjw)
+    constraint = wp.constant(constraint_contact_bit(mjw))
 
     # fmt: off
     @wp.kernel(enable_backward=False)

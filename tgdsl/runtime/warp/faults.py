@@ -52,24 +52,24 @@ class Faults(EnvFaults):
         self._seen = torch.zeros(self._counts.shape, dtype=torch.int64, pin_memory=device.type == "cuda")
         self._copied: torch.cuda.Event | None = None
 
-    def look(self) -> None:
+    def check_divergence(self) -> None:
         """Look for divergence after a physics step, on the device."""
         for name in ("qpos", "qvel"):
             if self._arrays[name].shape[1]:
                 # Of what is no number, the maximum is none either.
                 torch.maximum(self._peak, self._arrays[name].abs().amax(dim=1), out=self._peak)
 
-    def settle(self) -> Bool[Tensor, " env"]:
+    def update(self) -> Bool[Tensor, " env"]:
         """Count faults that are new; return which environments have any of their own."""
         self.note(DIVERGED, ~(self._peak < _LARGEST))
         self._peak.zero_()
-        is_faulty = super().settle()
+        is_faulty = super().update()
         has_pool_fault = (self._arrays["overflow"] & _MASK) != 0
         to_raise = (has_pool_fault | is_faulty) if self.on_fault == "raise" else has_pool_fault
         self._counts.copy_(torch.cat([to_raise.any()[None].long(), self.totals]))
         return is_faulty
 
-    def shown(self) -> tuple[bool, list[int]]:
+    def polled(self) -> tuple[bool, list[int]]:
         """Return whether to raise, and the number of faults of each kind so far.
 
         A GPU is not waited for: there both are of an earlier call.
@@ -85,13 +85,13 @@ class Faults(EnvFaults):
         self._copied.record(torch.cuda.current_stream(self._counts.device))
         return bool(first), totals
 
-    def account(self, sizes: Mapping[str, int]) -> str:
+    def message(self, sizes: Mapping[str, int]) -> str:
         """Return what went wrong and where, in words; nothing if nothing did. It waits for a GPU.
 
         Args:
             sizes: Values for the pools' messages.
         """
-        found, overflow = self.accounts(), self._arrays["overflow"].cpu()
+        found, overflow = self.messages(), self._arrays["overflow"].cpu()
         for bit, text in POOLS.items():
             envs = torch.nonzero((overflow >> bit) & 1).flatten().tolist()
             if envs:

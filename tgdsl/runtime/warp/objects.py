@@ -18,7 +18,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.objects import EnvObjects, Values
-from tgdsl.runtime.warp.lane import libraries
+from tgdsl.runtime.warp.stream import libraries
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.scene import Choice, SceneModels, is_absent
 
@@ -73,10 +73,10 @@ class WorldObjects:
         self.object_size = torch.zeros(self._chosen.object_size.shape, device=device)
 
     def choose(self, ids: Int[Array, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
-        """Say what objects are like in some environments: see `BatchSimulation.set_objects`; then `tell` the environments."""
+        """Say what objects are like in some environments: see `Simulation.set_objects`; then `write_to` them."""
         self._chosen.choose(ids, variants, sizes)
 
-    def tell(self, worlds: Worlds) -> None:
+    def write_to(self, worlds: Worlds) -> None:
         """Write each environment's own fields, in place.
 
         Raises:

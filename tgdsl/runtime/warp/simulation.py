@@ -16,17 +16,17 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
-from tgdsl.runtime.simulators.lookup import keyframe_id
-from tgdsl.runtime.simulators.objects import Values
-from tgdsl.runtime.simulators.simulation import Simulation, claim, refuse_unfit
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
-from tgdsl.runtime.warp.lane import Lane, Replay
-from tgdsl.runtime.warp.meshed import MeshedModels
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.reading import StateReader
+from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
-from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
+from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 
 class WarpSimulation(Simulation):
@@ -54,6 +54,8 @@ class WarpSimulation(Simulation):
         warp_data: MuJoCo Warp's data.
     """
 
+    _objects: WorldObjects | None = None
+
     def __init__(
         self,
         touch: TactileModule,
@@ -76,8 +78,8 @@ class WarpSimulation(Simulation):
             num_envs: Number of environments.
             substeps: Physics steps per control step.
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
-            nconmax: Room for contacts per environment, in a pool that all share; default 48.
-            njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts and all limits make.
+            nconmax: Capacity for contacts per environment, in a pool that all share; default 48.
+            njmax: Capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make.
             model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
@@ -96,34 +98,33 @@ class WarpSimulation(Simulation):
         """
         refuse_unfit(touch, num_envs, substeps, model)
         self._touch, self.substeps = touch, substeps
-        self._lane = Lane(device, graph)
-        self._objects: WorldObjects | None = None
+        self._stream = WarpStream(device, graph)
         if model is None:
-            scenes = MeshedModels(touch.plan.scene)
+            scenes = SharedMeshModels(touch.plan.scene)
             model = scenes.model({})
             if touch.inputs.objects:
-                self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._lane.device)
+                self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
         self.model: mujoco.MjModel = model
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
             touch.inputs,
             num_envs,
-            self._lane,
-            keyframe=-1 if keyframe is None else keyframe_id(model, keyframe),
+            self._stream,
+            keyframe=keyframe_id(model, keyframe),
             nconmax=nconmax,
             njmax=njmax,
             per_env=list(dict.fromkeys([*per_env, *(OWN_FIELDS if self._objects else ())])),
             on_fault=on_fault,
         )
         self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
-        with self._lane.work():
+        with self._stream.scope():
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
-            self._objects.tell(self._worlds)
+            self._objects.write_to(self._worlds)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
-        self._step = Replay(self._lane, lambda: self._worlds.step(self.substeps))
-        self._substep = Replay(self._lane, lambda: self._worlds.step(1))
-        self._step_and_read = Replay(self._lane, self._physics_and_touch)
+        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps))
+        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1))
+        self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
         claim(touch, self)
         self.reset()
@@ -167,8 +168,10 @@ class WarpSimulation(Simulation):
         Raises:
             SimulationError: As from `step`, or if the module is on another device than physics.
         """
-        if self._touch.device != self._lane.device:
-            raise SimulationError(f"the module is on {self._touch.device}, physics on {self._lane.device}; expected one device")
+        if self._touch.device != self._stream.device:
+            raise SimulationError(
+                f"the module is on {self._touch.device}, physics on {self._stream.device}; expected one device"
+            )
         self._forget_other_tensors()
         self._begin_step(control)
         readings = self._step_and_read()
@@ -179,7 +182,7 @@ class WarpSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._lane.device))
+        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._stream.device))
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -191,46 +194,20 @@ class WarpSimulation(Simulation):
         """Return the model of one environment, its objects as they are there; `parameters` are not in it."""
         return self.model if self._objects is None else self._objects.env_model(env)
 
-    def set_objects(
-        self,
-        variants: Mapping[str, Values] | None = None,
-        sizes: Mapping[str, Values] | None = None,
-        env_ids: EnvIds | None = None,
-    ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew.
-
-        At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
-        the XHand1's palm, 10 ms; none is kept.
-
-        Args:
-            variants: Which variant of an object these environments have: (env,) integers, or one for all.
-            sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
-            env_ids: Indices, or a boolean mask over environments.
-
-        Raises:
-            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
-        """
-        if self._objects is None:
-            raise SimulationError("no object of this module differs between environments")
-        ids = env_indices(env_ids, self.num_envs)
-        self._objects.choose(ids, variants or {}, sizes or {})
-        self._objects.tell(self._worlds)
-        self.reset(ids)
-
     def check(self) -> None:
         """Look for what has gone wrong in any environment since it was last reset. It waits for a GPU.
 
         Raises:
             SimulationError: If an environment has diverged or its controls were not finite, or a pool was too small.
         """
-        account = self._worlds.account()
-        if account:
-            raise SimulationError(account)
+        message = self._worlds.message()
+        if message:
+            raise SimulationError(message)
 
     def recapture(self) -> None:
         """Capture the CUDA graphs anew: when an array of `warp_model` or `warp_data` was replaced."""
-        for replay in (self._step, self._substep, self._step_and_read):
-            replay.forget()
+        for call in (self._step, self._substep, self._step_and_read):
+            call.forget()
         self._worlds.forget_graphs()
 
     def _forget_other_tensors(self) -> None:
@@ -252,19 +229,22 @@ class WarpSimulation(Simulation):
         return self._read(dt).to(self._touch.device)
 
     def _read(self, dt: float) -> SceneState:
-        values: dict[str, Any] = dict(self._reader.read())
+        values = self._reader.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
-        values["dt"] = dt
-        return SceneState(**{name: value for name, value in values.items() if name in self._touch.inputs.fields})
+        return self._scene_state(values, dt)
+
+    def _use_objects(self) -> None:
+        assert self._objects is not None
+        self._objects.write_to(self._worlds)
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        mask = env_mask(env_ids, self.num_envs, self._lane.device)
+        mask = env_mask(env_ids, self.num_envs, self._stream.device)
         self._worlds.reset(mask, rows)
         self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
     def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
-        self._worlds.put(env_mask(env_ids, self.num_envs, self._lane.device), rows)
+        self._worlds.put(env_mask(env_ids, self.num_envs, self._stream.device), rows)
 
     def _advance(self, num_steps: int) -> None:
         self._worlds.prepare()
@@ -274,11 +254,11 @@ class WarpSimulation(Simulation):
         self._finish_step()
 
     def _finish_step(self, is_evaluated: bool = False) -> None:
-        self._worlds.stepped(is_evaluated)
-        if self._lane.is_capturing:
+        self._worlds.note_step(is_evaluated)
+        if self._stream.is_capturing:
             return
         self._touch.slot_watch.warn()
-        to_raise, totals = self._worlds.faults.shown()
+        to_raise, totals = self._worlds.faults.polled()
         if to_raise:
             self.check()
         if self._faults.on_fault == "reset":

@@ -16,20 +16,21 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.simulators.bodies import STATE_ARRAYS
+from tgdsl.runtime.simulators.claims import refuse_two_instants
 from tgdsl.runtime.simulators.faults import BAD_VALUES
-from tgdsl.runtime.simulators.joint_fields import FORCES, JointPlaces
+from tgdsl.runtime.simulators.joint_fields import FORCES, JointColumns
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
-from tgdsl.runtime.warp.lane import Lane, Replay, libraries
-from tgdsl.runtime.warp.reading import SOURCES
+from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
 
 _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
-_DERIVED = tuple(dict.fromkeys((*SOURCES, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
+_DERIVED = tuple(dict.fromkeys((*STATE_ARRAYS, *_VELOCITIES, "geom_xpos", "geom_xmat", *FORCES.values())))
 _WATCHED = ("overflow", "nefc", "nacon", "ncollision")
 DEFAULT_NCONMAX = 48
-"""Contacts per environment that there is room for, unless said otherwise."""
+"""Default capacity for contacts per environment."""
 
 
 class Worlds:
@@ -51,7 +52,7 @@ class Worlds:
         model: mujoco.MjModel,
         inputs: Inputs,
         num_envs: int,
-        lane: Lane,
+        stream: WarpStream,
         *,
         keyframe: int = -1,
         nconmax: int | None = None,
@@ -65,10 +66,10 @@ class Worlds:
             model: The scene.
             inputs: What the module wants.
             num_envs: Number of environments.
-            lane: Where to work.
+            stream: Where to work.
             keyframe: Index of the keyframe to start from; -1: the model's own initial state.
-            nconmax: Room for contacts per environment; all environments share it.
-            njmax: Room for rows of constraints in each environment; default: as many as `nconmax` contacts make.
+            nconmax: Capacity for contacts per environment; all environments share it.
+            njmax: Capacity for rows of constraints in each environment; default: as many as `nconmax` contacts make.
             per_env: Fields of the model that environments have of their own.
             on_fault: What becomes of environments with a fault of their own.
 
@@ -76,14 +77,14 @@ class Worlds:
             SimulationError: If MuJoCo Warp does not support something of the model, a field cannot differ, or the model lacks a
                 body.
         """
-        check_supported(model)
+        refuse_two_instants(model, "bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
         self.nconmax = DEFAULT_NCONMAX if nconmax is None else nconmax
         rows = constraint_rows(model, self.nconmax) if njmax is None else njmax
         wp, self._mjw = libraries()
         start = mujoco.MjData(model)
         if keyframe >= 0:
             mujoco.mj_resetDataKeyframe(model, start, keyframe)
-        with lane.work():
+        with stream.scope():
             try:
                 self.model: Any = self._mjw.put_model(model, batch_sizes=dict.fromkeys(per_env, num_envs))
                 self.data: Any = self._mjw.put_data(model, start, num_envs, self.nconmax, njmax=rows)
@@ -94,23 +95,23 @@ class Worlds:
             # face where two are nearly parallel. Otherwise it takes either, and normals differ by the angle between them.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
             self._leave_out_sensors(wp, model, inputs)
-            joints = JointPlaces.of(inputs, model)
+            joints = JointColumns.of(inputs, model)
             names = (*INTEGRATED, *_DERIVED, *_WATCHED)
-            self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), lane) for name in names}
-            self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), lane) for name in per_env}
+            self.arrays: dict[str, Tensor] = {name: _view(wp, getattr(self.data, name), stream) for name in names}
+            self.parameters: dict[str, Tensor] = {name: _view(wp, getattr(self.model, name), stream) for name in per_env}
             self.kept = {array: self.arrays[array].clone() for array in joints.moved.values()}
-            self.contacts = PairContacts(inputs, model, num_envs, lane.device)
+            self.contacts = PairContacts(inputs, model, num_envs, stream.device)
             self._start = {name: self.arrays[name][:1].clone() for name in (*INTEGRATED, "overflow")}
-            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=lane.device)
+            self._is_stale = torch.ones(num_envs, dtype=torch.bool, device=stream.device)
             self._is_reset = torch.zeros_like(self._is_stale)
             self.restarted = torch.zeros_like(self._is_stale)
             self.faults = Faults(self.arrays, on_fault)
-        self._has_stale, self._is_in_graphs, self._lane = True, False, lane
+        self._has_stale, self._is_in_graphs, self._stream = True, False, stream
         self._has_loops = model.neq > 0
-        self._reset, self._refresh = Replay(lane, self._restart), Replay(lane, self.evaluate_stale)
+        self._reset, self._refresh = GraphedCall(stream, self._restart), GraphedCall(stream, self.evaluate_stale)
 
     def step(self, num_steps: int) -> None:
-        """Advance all environments by some physics steps, and start those anew that shall not wait: work for a `Replay`.
+        """Advance all environments by some physics steps, and start those anew that shall not wait: for a `GraphedCall`.
 
         Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
         some of them remember earlier steps.
@@ -124,13 +125,13 @@ class Worlds:
                     for name, kept in self.kept.items():
                         kept.copy_(self.arrays[name])
                 self._mjw.step(self.model, self.data)
-                self.faults.look()
+                self.faults.check_divergence()
         finally:
             self.model.opt.disableflags = whole
         # MuJoCo Warp's integrators leave contacts and constraint forces as its last `forward` found them.
         self.contacts.update(self.model, self.data)
         self._is_stale.zero_()
-        is_faulty = self.faults.settle()
+        is_faulty = self.faults.update()
         if self.faults.on_fault == "reset":
             self.restarted.copy_(is_faulty)
             self._is_reset.copy_(is_faulty)
@@ -142,13 +143,13 @@ class Worlds:
         if self._has_loops:
             self.refresh()
 
-    def stepped(self, is_evaluated: bool = False) -> None:
+    def note_step(self, is_evaluated: bool = False) -> None:
         """Take note, on the host, that all environments have been stepped.
 
         Args:
             is_evaluated: Whether those that were started anew have been evaluated; which these are, only the device knows.
         """
-        if not self._lane.is_capturing:
+        if not self._stream.is_capturing:
             self._has_stale = False
         if self.faults.on_fault == "reset" and not is_evaluated:
             self._note_stale()
@@ -179,12 +180,12 @@ class Worlds:
 
     def refresh(self) -> None:
         """Evaluate poses, velocities and contacts of the environments that are elsewhere than at the last evaluation."""
-        self._is_in_graphs |= self._lane.is_capturing
+        self._is_in_graphs |= self._stream.is_capturing
         if not self._has_stale:
             return
         if self._is_stale.is_cuda or self._is_stale.any():
             self._refresh()
-        self._has_stale = self._lane.is_capturing
+        self._has_stale = self._stream.is_capturing
 
     def _note_stale(self) -> None:
         """Note, on the host, that environments are to be evaluated.
@@ -192,7 +193,7 @@ class Worlds:
         A graph of a user's own is replayed without the host. What is captured there is therefore evaluated in it; and once
         there is one, so is everything else at once, as the graph may read it.
         """
-        if self._lane.is_capturing:
+        if self._stream.is_capturing:
             self._is_in_graphs = True
             self._refresh()
             return
@@ -203,7 +204,7 @@ class Worlds:
     def evaluate_stale(self) -> None:
         """Evaluate all environments where they are now, then give those that are not stale back their earlier instant.
 
-        It is work for a `Replay`.
+        It is for a `GraphedCall`.
         """
         arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
         earlier = {name: array.clone() for name, array in arrays.items()}
@@ -223,7 +224,7 @@ class Worlds:
         self._reset.forget()
         self._refresh.forget()
 
-    def account(self) -> str:
+    def message(self) -> str:
         """Return what has gone wrong since the last reset, in words; it waits for a GPU."""
         sizes = {
             "njmax": int(self.data.njmax),
@@ -234,7 +235,7 @@ class Worlds:
             "nacon": int(self.arrays["nacon"].max()),
             "ncollision": int(self.arrays["ncollision"].max()),
         }
-        return self.faults.account(sizes)
+        return self.faults.message(sizes)
 
     def _leave_out_sensors(self, wp: Any, model: mujoco.MjModel, inputs: Inputs) -> None:
         """Keep MuJoCo Warp from evaluating the sensors that `contacts` stands in for; with no others, from looking for any."""
@@ -258,18 +259,6 @@ class Worlds:
         self._is_stale |= self._is_reset
 
 
-def check_supported(model: mujoco.MjModel) -> None:
-    """Raise what would make a state one of several instants.
-
-    Raises:
-        SimulationError: If the integrator is RK4, or sleeping is enabled.
-    """
-    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        raise SimulationError("with the integrator RK4 MuJoCo's poses and contacts are of two instants; choose another one")
-    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
-        raise SimulationError("bodies that sleep are not supported by physics on a GPU; disable the flag `sleep`")
-
-
 def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
     """Return how many rows of constraints a number of contacts makes at most, and all limits and equalities besides."""
     dim = max([1, *model.geom_condim.tolist(), *model.pair_dim.tolist()])
@@ -280,9 +269,9 @@ def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
     return int(num_contacts * per_contact + 6 * model.neq + 2 * limits + friction)
 
 
-def _view(wp: Any, array: Any, lane: Lane) -> Tensor:
+def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:
     """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
-    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=lane.device)
+    return wp.to_torch(array) if array.size else torch.empty(array.shape, device=stream.device)
 
 
 def _like(mask: Bool[Tensor, " env"], array: Tensor) -> Tensor:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from tgdsl.runtime.xhand1.motion import Motion, MotionLimits
 from tgdsl.runtime.xhand1.reader import HandReader, Reading
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandError, HandTimeoutError, MotionError, StaleReadingError
-from tgdsl.runtime.xhand1.wire.link import Link, LinkCounters, LinkTiming
 from tgdsl.runtime.xhand1.wire.payloads import NUM_JOINTS, encode_register_request
 from tgdsl.runtime.xhand1.wire.protocol import Command
 from tgdsl.runtime.xhand1.wire.replies import Addresses
@@ -54,7 +54,7 @@ class XHand1:
     last command is not published.
     """
 
-    def __init__(self, reader: HandReader, timing: LinkTiming, max_age_s: float | None = None):
+    def __init__(self, reader: HandReader, timing: SerialTiming, max_age_s: float | None = None):
         """Take over a reader that runs; use `open`."""
         self._reader = reader
         two_replies_s = 2 * timing.reply_timeout_s
@@ -71,7 +71,7 @@ class XHand1:
         addresses: Addresses | None = None,
         *,
         motion: MotionLimits | None = None,
-        timing: LinkTiming | None = None,
+        timing: SerialTiming | None = None,
         max_age_s: float | None = None,
         open_port: Callable[[str, int], Port] = open_serial_port,
     ) -> XHand1:
@@ -89,13 +89,13 @@ class XHand1:
             HandDisconnectedError: If the port cannot be opened.
             HandError: If the hand does not answer, or not as expected.
         """
-        timing = timing or LinkTiming()
+        timing = timing or SerialTiming()
         addresses = addresses or Addresses()
 
-        def connect(counters: LinkCounters) -> Link:
-            return Link(open_port(device, timing.baud), addresses, timing, counters)
+        def connect(counters: SerialCounters) -> SerialClient:
+            return SerialClient(open_port(device, timing.baud), addresses, timing, counters)
 
-        reader = HandReader(connect(LinkCounters()), connect, Motion(motion) if motion else None)
+        reader = HandReader(connect(SerialCounters()), connect, Motion(motion) if motion else None)
         reader.start()
         hand = cls(reader, timing, max_age_s)
         try:
@@ -178,7 +178,7 @@ class XHand1:
         return None if self._reader.motion is None else self._reader.motion.limits.watchdog_s
 
     @property
-    def counters(self) -> LinkCounters:
+    def counters(self) -> SerialCounters:
         """What happened on the line so far."""
         return replace(self._reader.counters)
 
@@ -211,7 +211,7 @@ class XHand1:
             HandError: If the hand does not answer.
         """
         request = encode_register_request(number)
-        return self._run(lambda link: link.exchange(Command.READ_REGISTER, request).payload)
+        return self._run(lambda client: client.exchange(Command.READ_REGISTER, request).payload)
 
     def version(self) -> bytes:
         """Return what the version's reply holds, as it came: its layout is unverified.
@@ -219,10 +219,10 @@ class XHand1:
         Raises:
             HandError: If the hand does not answer.
         """
-        return self._run(lambda link: link.exchange(Command.VERSION).payload)
+        return self._run(lambda client: client.exchange(Command.VERSION).payload)
 
     def close(self) -> None:
-        """Make the hand passive, if it is not, and let go of the port.
+        """Make the hand passive, if it is not, and release the port.
 
         Raises:
             HandError: If the hand was moving and did not confirm that it is passive.
@@ -255,7 +255,7 @@ class XHand1:
             return HandTimeoutError("the hand has not answered yet")
         return StaleReadingError(f"no new reading came in time; the newest is {1e3 * reading.age_s():.0f} ms old")
 
-    def _run(self, job: Callable[[Link], bytes]) -> bytes:
+    def _run(self, job: Callable[[SerialClient], bytes]) -> bytes:
         try:
             return self._reader.submit(job).result(self._patience_s)
         except TimeoutError as error:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialTiming
+from tgdsl.runtime.xhand1.wire.discovery import FoundHand
 from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandRefusedError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.find import FoundHand
-from tgdsl.runtime.xhand1.wire.link import Link, LinkTiming
 from tgdsl.runtime.xhand1.wire.payloads import encode_register_request
 from tgdsl.runtime.xhand1.wire.protocol import Command, Register
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
@@ -41,7 +41,7 @@ class HandIdentity:
 
 
 def identify(
-    found: FoundHand, *, timing: LinkTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
+    found: FoundHand, *, timing: SerialTiming | None = None, open_port: Callable[[str, int], Port] = open_serial_port
 ) -> HandIdentity:
     """Ask a hand that was found for its registers.
 
@@ -53,12 +53,12 @@ def identify(
     Raises:
         HandDisconnectedError: If the port cannot be opened, or went away.
     """
-    timing = timing or LinkTiming()
-    link = Link(open_port(found.device, timing.baud), found.addresses, timing)
+    timing = timing or SerialTiming()
+    client = SerialClient(open_port(found.device, timing.baud), found.addresses, timing)
     try:
-        told = [_register(link, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
+        told = [_register(client, number) for number in (Register.SIDE, Register.SERIAL_NUMBER, Register.NAME)]
     finally:
-        link.close()
+        client.close()
     return HandIdentity(found.device, found.addresses.hand_id, found.version, *told)
 
 
@@ -72,9 +72,9 @@ def shown(value: bytes | None) -> str:
     return value.hex(" ") or "empty"
 
 
-def _register(link: Link, number: int) -> bytes | None:
+def _register(client: SerialClient, number: int) -> bytes | None:
     """Return what a register holds; None if the hand refuses to tell, or does not answer."""
     try:
-        return link.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
+        return client.exchange(Command.READ_REGISTER, encode_register_request(number)).payload
     except (HandRefusedError, HandTimeoutError, HandChecksumError):
         return None

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from tgdsl.runtime.xhand1.motion import Motion
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialCounters
 from tgdsl.runtime.xhand1.wire.errors import HandClosedError, HandDisconnectedError, HandError, ProtocolError
-from tgdsl.runtime.xhand1.wire.link import Link, LinkCounters
 from tgdsl.runtime.xhand1.wire.payloads import (
     JOINTS,
     PASSIVE,
@@ -66,11 +66,11 @@ class HandReader(threading.Thread):
         left_driven: Why the hand did not confirm, at the end, that it is passive; None if it did or never moved.
     """
 
-    def __init__(self, link: Link, connect: Callable[[LinkCounters], Link], motion: Motion | None):
-        """Take over a link.
+    def __init__(self, client: SerialClient, connect: Callable[[SerialCounters], SerialClient], motion: Motion | None):
+        """Take over a client.
 
         Args:
-            link: The link to begin with.
+            client: The client to begin with.
             connect: Opens another after that went away.
             motion: What may move; None: nothing.
         """
@@ -80,17 +80,17 @@ class HandReader(threading.Thread):
         self.failure: tuple[HandError, float] | None = None
         self.ended: HandClosedError | None = None
         self.motion = motion
-        self.counters = link.counters
+        self.counters = client.counters
         self.num_connects = 0
         self.left_driven: HandError | None = None
-        self._link: Link | None = link
+        self._client: SerialClient | None = client
         self._connect = connect
-        self._jobs: queue.SimpleQueue[tuple[Callable[[Link], Any], Future[Any]]] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[tuple[Callable[[SerialClient], Any], Future[Any]]] = queue.SimpleQueue()
         self._stopping = threading.Event()
         self._is_driven = False
 
-    def submit(self, job: Callable[[Link], Any]) -> Future[Any]:
-        """Run something on the link between two exchanges."""
+    def submit(self, job: Callable[[SerialClient], Any]) -> Future[Any]:
+        """Run something on the client between two exchanges."""
         future: Future[Any] = Future()
         with self.changed:
             if self.ended is not None:
@@ -121,13 +121,13 @@ class HandReader(threading.Thread):
 
     def _turn(self) -> None:
         try:
-            if self._link is None:
-                self._link = self._connect(self.counters)
+            if self._client is None:
+                self._client = self._connect(self.counters)
                 self.num_connects += 1
-            self._do_jobs(self._link)
+            self._do_jobs(self._client)
             with self.changed:
                 joints = PASSIVE if self.motion is None else self.motion.joints(time.monotonic())
-            reply = self._exchange(self._link, joints)
+            reply = self._exchange(self._client, joints)
             state = _plausible(decode_state(reply.payload))
         except HandError as error:
             self._fail(error)
@@ -137,18 +137,18 @@ class HandReader(threading.Thread):
             self.reading = reading
             self.changed.notify_all()
 
-    def _exchange(self, link: Link, joints: tuple[JointCommand, ...]) -> Reply:
+    def _exchange(self, client: SerialClient, joints: tuple[JointCommand, ...]) -> Reply:
         is_driven = joints is not PASSIVE
         self._is_driven = self._is_driven or is_driven
-        reply = link.exchange(Command.EXCHANGE, encode_command(joints), STATE_SIZE)
+        reply = client.exchange(Command.EXCHANGE, encode_command(joints), STATE_SIZE)
         self._is_driven = is_driven
         return reply
 
-    def _do_jobs(self, link: Link) -> None:
+    def _do_jobs(self, client: SerialClient) -> None:
         while not self._jobs.empty():
             job, future = self._jobs.get()
             try:
-                future.set_result(job(link))
+                future.set_result(job(client))
             except Exception as error:
                 future.set_exception(error)
                 if isinstance(error, HandError):
@@ -162,7 +162,7 @@ class HandReader(threading.Thread):
                 self.motion.fail(error)
             self.failure = error, time.monotonic()
             self.changed.notify_all()
-        if self._link is None:
+        if self._client is None:
             self._stopping.wait(_RECONNECT_S)
 
     def _leave(self) -> None:
@@ -171,29 +171,29 @@ class HandReader(threading.Thread):
             if not self._is_driven:
                 break
             try:
-                if self._link is None:
-                    self._link = self._connect(self.counters)
-                self._exchange(self._link, PASSIVE)
+                if self._client is None:
+                    self._client = self._connect(self.counters)
+                self._exchange(self._client, PASSIVE)
                 self.left_driven = None
             except HandError as error:
                 self.left_driven = error
                 self._drop_if_gone(error)
                 self._post_passive()
-        if self._link is not None:
-            self._link.close()
+        if self._client is not None:
+            self._client.close()
 
     def _post_passive(self) -> None:
         """Tell a hand that moves to be passive, also where its replies cannot be understood."""
-        if self._is_driven and self._link is not None:
+        if self._is_driven and self._client is not None:
             try:
-                self._link.post(Command.EXCHANGE, encode_command(PASSIVE))
+                self._client.post(Command.EXCHANGE, encode_command(PASSIVE))
             except HandError as error:
                 self._drop_if_gone(error)
 
     def _drop_if_gone(self, error: HandError) -> None:
-        if isinstance(error, HandDisconnectedError) and self._link is not None:
-            self._link.close()
-            self._link = None
+        if isinstance(error, HandDisconnectedError) and self._client is not None:
+            self._client.close()
+            self._client = None
 
 
 def _plausible(state: HandState) -> HandState:

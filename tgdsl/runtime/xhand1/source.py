@@ -19,8 +19,8 @@ from tgdsl.errors import StateError
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
-from tgdsl.runtime.xhand1.pace import Pace, RealTime
 from tgdsl.runtime.xhand1.reader import Reading
+from tgdsl.runtime.xhand1.step_timer import RealTime, StepTimer
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import HandError, MotionError, StaleReadingError
 from tgdsl.tensors.env_ids import EnvIds
@@ -98,7 +98,7 @@ class XHand1Source:
         control_step: float,
         calibration: Calibration | None = None,
         velocity_time_constant: float = 0.02,
-        pace: Pace | None = None,
+        timer: StepTimer | None = None,
         read_timeout_s: float | None = None,
     ):
         """Take an open hand.
@@ -108,7 +108,7 @@ class XHand1Source:
             control_step: Duration of one control step [s].
             calibration: What its counts mean; default: they stay counts.
             velocity_time_constant: Time constant of the filter of joint speeds [s].
-            pace: What control steps wait for; default: that their time is over.
+            timer: What control steps wait for; default: that their time is over.
             read_timeout_s: How long to wait for a new reading after a step [s]; default: as `hand.read`.
 
         Raises:
@@ -125,7 +125,7 @@ class XHand1Source:
         self._velocity = VelocityFilter(velocity_time_constant)
         self._control_step = control_step
         self._read_timeout_s = read_timeout_s
-        self._pace = RealTime(control_step) if pace is None else pace
+        self._timer = RealTime(control_step) if timer is None else timer
         self._target: np.ndarray | None = None
         self._sample: HandSample | None = self._read(-math.inf)
 
@@ -140,9 +140,14 @@ class XHand1Source:
         return self._control_step
 
     @property
+    def is_over(self) -> bool:
+        """Never: there is always more to read."""
+        return False
+
+    @property
     def num_late_steps(self) -> int:
         """Steps that began after they should have ended."""
-        return self._pace.num_late_steps
+        return self._timer.num_late_steps
 
     def step(self, control: Tensor | np.ndarray | None = None) -> None:
         """Command the joints, wait until the control step is over, and read the hand.
@@ -161,7 +166,7 @@ class XHand1Source:
             self._target = values[0] if values.ndim == 2 and len(values) == 1 else values
         self._sample = None
         self._command()
-        self._sample = self._read(self._pace.wait(self._target, self._command))
+        self._sample = self._read(self._timer.wait(self._target, self._command))
 
     def sample(self) -> HandSample:
         """Return what the hand said at the end of the last step, or after a reset.
@@ -179,8 +184,7 @@ class XHand1Source:
         Raises:
             StateError: Always; it lists what the hand can give.
         """
-        able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
-        raise StateError(f"a real XHand1 cannot give the poses and contacts of a SceneState; its sample() gives {able}")
+        raise no_scene_state("a real XHand1")
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Forget the speeds and the last target, make the hand passive until the next command, and read it.
@@ -198,8 +202,12 @@ class XHand1Source:
         self._velocity.reset()
         self._target, self._sample = None, None
         self.hand.relax()
-        self._pace.restart()
+        self._timer.restart()
         self._sample = self._read(time.monotonic())
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again."""
+        self.hand.resume()
 
     def close(self) -> None:
         """Close the hand.
@@ -216,7 +224,13 @@ class XHand1Source:
     def _read(self, requested_after: float) -> HandSample:
         while (reading := self.hand.read(self._read_timeout_s)).requested_at < requested_after:
             continue
-        return HandSample.of(reading, self.calibration, self._velocity, self._pace.time_of(reading))
+        return HandSample.of(reading, self.calibration, self._velocity, self._timer.time_of(reading))
+
+
+def no_scene_state(who: str) -> StateError:
+    """Return the error of a source that does not know where objects are; it lists what a `HandSample` holds."""
+    able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
+    return StateError(f"{who} cannot give the poses and contacts of a SceneState; its sample() gives {able}")
 
 
 def is_chosen(env_ids: EnvIds) -> bool:

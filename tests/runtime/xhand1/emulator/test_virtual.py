@@ -11,6 +11,7 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.motion import MotionLimits
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import (
     HandChecksumError,
     HandDisconnectedError,
@@ -20,7 +21,6 @@ from tgdsl.runtime.xhand1.wire.errors import (
     StaleReadingError,
     WatchdogError,
 )
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 
 FAULTS = ["corrupt", "truncate", "drop", "delay", "duplicate", "noise", "foreign", "silence"]
 EXCHANGE_S = 2514 * 10 / 3e6
@@ -158,7 +158,7 @@ def test_a_pulled_cable_is_named_in_time_and_a_new_one_found(monkeypatch):
 
 
 def test_a_slow_line_is_stale_by_name(monkeypatch):
-    with virtual_hand(monkeypatch, timing=LinkTiming(reply_timeout_s=5.0), turnaround_s=0.3) as (hand, _, time):
+    with virtual_hand(monkeypatch, timing=SerialTiming(reply_timeout_s=5.0), turnaround_s=0.3) as (hand, _, time):
         hand.read()
         with pytest.raises(StaleReadingError, match="no new reading came in time; the newest is 310 ms old"):
             hand.read(0.001)
@@ -179,7 +179,7 @@ def test_a_reading_that_nobody_fetched_grows_stale(monkeypatch):
 
 def test_a_call_waits_as_long_as_two_replies_may_take(monkeypatch):
     """And a reading may be as old: where the line is given time, the caller gives it too."""
-    with virtual_hand(monkeypatch, timing=LinkTiming(reply_timeout_s=0.5), turnaround_s=0.4) as (hand, _, time):
+    with virtual_hand(monkeypatch, timing=SerialTiming(reply_timeout_s=0.5), turnaround_s=0.4) as (hand, _, time):
         hand.read()
         for _ in range(3):
             assert hand.read().age_s(time.now) == pytest.approx(0.4 + EXCHANGE_S, abs=0.005)

@@ -22,8 +22,8 @@ from tgdsl.runtime.xhand1.log.record import LogWriter
 from tgdsl.runtime.xhand1.log.replay import ReplayOverError, ReplaySource
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import HandSample, XHand1Source
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError, HandTimeoutError, StaleReadingError
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.payloads import saturated
 
 RNG = np.random.default_rng(5)
@@ -56,7 +56,7 @@ def run_live(path) -> list[HandSample | Fault]:
     live: list[HandSample | Fault] = []
     with (
         Emulator(EmulatedHand(forces=swelling, time_constant_s=0.1)) as emulator,
-        XHand1.open(emulator.device, motion=LIMITS, timing=LinkTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
+        XHand1.open(emulator.device, motion=LIMITS, timing=SerialTiming(reply_timeout_s=2.0, silence_s=1.0)) as hand,
         LogWriter(path, calibration=NEWTON) as log,
     ):
         source = XHand1Source(hand, control_step=0.02, calibration=NEWTON, velocity_time_constant=0.05)

@@ -152,12 +152,12 @@ class SimulatedBody:
 
 
 class Lockstep:
-    """A pace that lets a simulated body make its control step when the set-points have arrived: the same at every run."""
+    """A step timer that lets a simulated body make its control step when the set-points have arrived: the same at every run."""
 
     num_late_steps = 0
 
     def __init__(self, body: SimulatedBody):
-        """Pace a source whose hand has this body."""
+        """Time the steps of a source whose hand has this body."""
         self._body = body
 
     def wait(self, target: Float[np.ndarray, " joint"] | None, command: Callable[[], None]) -> float:

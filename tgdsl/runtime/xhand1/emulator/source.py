@@ -17,11 +17,11 @@ from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.emulator.simulated_body import Lockstep, SimulatedBody
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.source import XHand1Source, is_chosen
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import WatchdogError
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.tensors.env_ids import EnvIds
 
-PATIENT = LinkTiming(reply_timeout_s=5.0, silence_s=2.0)
+PATIENT = SerialTiming(reply_timeout_s=5.0, silence_s=2.0)
 """For an emulator on a busy machine, where what is late is not lost: pseudo-terminals then take up to half a second."""
 
 
@@ -40,7 +40,7 @@ class EmulatedSource(XHand1Source):
         control_step: float,
         calibration: Calibration,
         motion: MotionLimits | None = None,
-        timing: LinkTiming | None = None,
+        timing: SerialTiming | None = None,
         lockstep: bool = False,
     ):
         """Plug the hand in and open it.
@@ -63,8 +63,8 @@ class EmulatedSource(XHand1Source):
             hand = opened.enter_context(XHand1.open(emulator.device, motion=motion, timing=timing or PATIENT))
             if not lockstep:
                 body.run()
-            pace = Lockstep(body) if lockstep else None
-            super().__init__(hand, control_step=control_step, calibration=calibration, pace=pace)
+            timer = Lockstep(body) if lockstep else None
+            super().__init__(hand, control_step=control_step, calibration=calibration, timer=timer)
             self.emulator, self.body = emulator, body
             self._opened = opened.pop_all()
         self._told = False

@@ -15,13 +15,13 @@ from typing import NoReturn
 import numpy as np
 from torch import Tensor
 
-from tgdsl.errors import StateError, TgdslError
+from tgdsl.errors import TgdslError
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import MAX_AGE_S, READ_TIMEOUT_S
 from tgdsl.runtime.xhand1.log.log import Fault, LogError, open_log
 from tgdsl.runtime.xhand1.reader import Reading
-from tgdsl.runtime.xhand1.source import HandSample, is_chosen
+from tgdsl.runtime.xhand1.source import HandSample, is_chosen, no_scene_state
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.errors import StaleReadingError
 from tgdsl.tensors.env_ids import EnvIds
@@ -132,8 +132,7 @@ class ReplaySource:
         Raises:
             StateError: Always; it lists what the log can give.
         """
-        able = "joint_pos, joint_vel, tip_force, taxel_counts, joint_temperature, tip_temperature, joint_error"
-        raise StateError(f"the log of an XHand1 cannot give the poses and contacts of a SceneState; its sample() gives {able}")
+        raise no_scene_state("the log of an XHand1")
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Forget the speeds, count steps from now, and deliver the first reading that was asked for from then on.
@@ -169,8 +168,11 @@ class ReplaySource:
         self._began_at = self._clock()
         self._take(0)
 
+    def resume(self) -> None:
+        """Nothing: what was recorded moves or not as it did."""
+
     def close(self) -> None:
-        """Let go of the file."""
+        """Release the file."""
         self._readings = iter(())
         self._now = self._end
         self._next_reading, self._next_fault = self.log.num_readings, len(self.log.faults)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.discovery import FoundHand, find_hands
 from tgdsl.runtime.xhand1.wire.errors import HandDisconnectedError, HandError
-from tgdsl.runtime.xhand1.wire.find import FoundHand, find_hands
-from tgdsl.runtime.xhand1.wire.link import LinkTiming
 from tgdsl.runtime.xhand1.wire.serial_port import PortInfo, list_ports
 
 _ALL_IDS = tuple(range(8))
-_PATIENT = LinkTiming(reply_timeout_s=0.1)
+_PATIENT = SerialTiming(reply_timeout_s=0.1)
 """A reply that comes later is taken for that of the next id which is asked, so a busy computer is given time."""
-_MORE_PATIENT = LinkTiming(reply_timeout_s=0.4)
+_MORE_PATIENT = SerialTiming(reply_timeout_s=0.4)
 
 
 @dataclass(frozen=True)

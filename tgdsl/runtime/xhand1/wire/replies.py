@@ -34,7 +34,7 @@ class Reply:
 
     Attributes:
         payload: Its bytes.
-        requested_at: When the request went out, on the link's clock [s]: the reply is not older than this.
+        requested_at: When the request went out, on the client's clock [s]: the reply is not older than this.
         received_at: When the reply was complete [s].
         source: Address that it came from.
         destination: Address that it was for.

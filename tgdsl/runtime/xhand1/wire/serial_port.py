@@ -32,7 +32,7 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Release the port."""
         ...
 
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import mujoco
-import numpy as np
 
 from tgdsl.errors import SimulationError
-from tgdsl.scene.scene import Choice, SceneModels, with_choices
+from tgdsl.scene.scene import Choice, SceneModels, free_bit, with_choices
 
 SPARE_BODY = "tgdsl/spare"
 """The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""
 
 
-class MeshedModels(SceneModels):
+class SharedMeshModels(SceneModels):
     """The models of a scene for simulators that share meshes among environments.
 
     MuJoCo makes the hulls of meshes that some geom collides with. Here a spare body, the last one, holds every mesh of every
@@ -32,22 +31,9 @@ class MeshedModels(SceneModels):
             body.explicitinertial = True
             body.mass, body.inertia = plain.body_mass[id], plain.body_inertia[id]
             body.iquat, body.ipos = plain.body_iquat[id], plain.body_ipos[id]
-        bit = _free_bit(spec)
+        bit = free_bit(spec, "meshes among variants", SimulationError)
         spare = spec.worldbody.add_body(name=SPARE_BODY)
         for name in meshes:
             kind = mujoco.mjtGeom.mjGEOM_MESH
             spare.add_geom(type=kind, meshname=name, contype=bit, conaffinity=0, mass=0, rgba=[0, 0, 0, 0])
         return spec.compile()
-
-
-def _free_bit(spec: mujoco.MjSpec) -> int:
-    """Return a bit that no geom collides with.
-
-    Raises:
-        SimulationError: If there is none.
-    """
-    used = int(np.bitwise_or.reduce([int(geom.conaffinity) for geom in spec.geoms]))
-    free = [1 << bit for bit in range(31) if not used >> bit & 1]
-    if not free:
-        raise SimulationError("the scene's geoms use all bits of `conaffinity`; meshes among variants need a free one")
-    return free[-1]

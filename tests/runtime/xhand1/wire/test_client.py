@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tgdsl.runtime.xhand1.wire import payloads
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandAddressError, HandChecksumError, HandRefusedError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.link import Link, LinkTiming
 from tgdsl.runtime.xhand1.wire.protocol import Command, Frame, encode_frame
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import POLL_S
@@ -69,21 +69,21 @@ def paced(raw: bytes, end: float) -> list[tuple[float, bytes]]:
     return [(end - 10 * (len(raw) - min(at + 62, len(raw))) / 3e6, raw[at : at + 62]) for at in starts]
 
 
-def linked(
+def connected(
     *answers: list[tuple[float, bytes]], addresses: Addresses | None = None, tells_version: bool = False, **timing
-) -> tuple[Link, ScriptedLine]:
+) -> tuple[SerialClient, ScriptedLine]:
     line = ScriptedLine(*answers, tells_version=tells_version)
-    return Link(line, addresses or Addresses(), LinkTiming(**timing), clock=line.clock), line
+    return SerialClient(line, addresses or Addresses(), SerialTiming(**timing), clock=line.clock), line
 
 
-def ask(link: Link) -> int:
+def ask(client: SerialClient) -> int:
     """Exchange and return the tag of the reply."""
-    return link.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE).payload[0]
+    return client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE).payload[0]
 
 
 def test_a_reply_says_when_it_was_asked_for_and_when_it_was_there():
-    link, line = linked([(9 * MS, reply(1))])
-    found = link.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+    client, line = connected([(9 * MS, reply(1))])
+    found = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
     assert found.payload == bytes([1]) * 2208
     assert found.requested_at == line.written[0][0]
     assert found.received_at == pytest.approx(found.requested_at + 9 * MS, abs=1e-9)
@@ -91,64 +91,64 @@ def test_a_reply_says_when_it_was_asked_for_and_when_it_was_there():
 
 
 def test_a_clean_line_costs_one_poll_beyond_the_reply():
-    link, line = linked(*[[(9 * MS, reply(i))] for i in range(5)])
-    assert [ask(link) for _ in range(5)] == list(range(5))
+    client, line = connected(*[[(9 * MS, reply(i))] for i in range(5)])
+    assert [ask(client) for _ in range(5)] == list(range(5))
     periods = [b - a for (a, _), (b, _) in zip(line.written, line.written[1:], strict=False)]
     assert periods == pytest.approx([9 * MS + POLL_S] * 4, abs=1e-9)
 
 
 def test_a_reply_at_the_lines_rate():
-    link, _ = linked(paced(reply(1), 8.5 * MS))
-    assert ask(link) == 1
+    client, _ = connected(paced(reply(1), 8.5 * MS))
+    assert ask(client) == 1
 
 
 def test_no_reply_is_a_timeout_and_the_next_request_works():
-    link, line = linked([], [(9 * MS, reply(2))])
+    client, line = connected([], [(9 * MS, reply(2))])
     with pytest.raises(HandTimeoutError, match=r"no reply to command 0x02 \(exchange\) within 30 ms"):
-        ask(link)
+        ask(client)
     assert line.now - line.written[0][0] == pytest.approx(30 * MS, abs=POLL_S)
-    assert ask(link) == 2
+    assert ask(client) == 2
 
 
 def test_a_damaged_reply_is_told_from_silence_and_costs_no_more_silence():
     raw = bytearray(reply(1))
     raw[700] ^= 1
-    link, line = linked([(9 * MS, bytes(raw))], [(9 * MS, reply(2))])
+    client, line = connected([(9 * MS, bytes(raw))], [(9 * MS, reply(2))])
     with pytest.raises(HandChecksumError, match=r"the reply to command 0x02 \(exchange\) came damaged: 2217 bytes"):
-        ask(link)
-    assert ask(link) == 2
+        ask(client)
+    assert ask(client) == 2
     assert line.written[1][0] - line.written[0][0] == pytest.approx((9 + 18) * MS, abs=2 * POLL_S)
 
 
 def test_a_reply_that_is_on_its_way_when_time_is_up_is_late_and_not_damaged():
-    link, _ = linked([(29.9 * MS, reply(1)[:1000]), (30.5 * MS, reply(1)[1000:])], [(9 * MS, reply(2))])
+    client, _ = connected([(29.9 * MS, reply(1)[:1000]), (30.5 * MS, reply(1)[1000:])], [(9 * MS, reply(2))])
     with pytest.raises(HandTimeoutError, match=r"\(exchange\) was not complete within 30 ms: 1000 bytes had come"):
-        ask(link)
-    assert ask(link) == 2
+        ask(client)
+    assert ask(client) == 2
 
 
 def test_a_reply_cut_short_is_damaged():
-    link, _ = linked([(9 * MS, reply(1)[:-1])], [(9 * MS, reply(2))])
+    client, _ = connected([(9 * MS, reply(1)[:-1])], [(9 * MS, reply(2))])
     with pytest.raises(HandChecksumError):
-        ask(link)
-    assert ask(link) == 2
+        ask(client)
+    assert ask(client) == 2
 
 
 def test_garbage_around_a_reply_costs_nothing():
-    link, _ = linked([(1 * MS, b"\x55\xaa\x00"), (9 * MS, b"\xff" * 50 + reply(1) + b"\x01")])
-    assert ask(link) == 1
-    assert link.counters.num_discarded_bytes == 54
+    client, _ = connected([(1 * MS, b"\x55\xaa\x00"), (9 * MS, b"\xff" * 50 + reply(1) + b"\x01")])
+    assert ask(client) == 1
+    assert client.counters.num_discarded_bytes == 54
 
 
 def test_a_reply_behind_a_head_that_promises_more_is_found():
-    link, _ = linked([(9 * MS, b"\x55\xaa\x80\xfe\x02\x00\x20" + reply(1))])
-    assert ask(link) == 1
+    client, _ = connected([(9 * MS, b"\x55\xaa\x80\xfe\x02\x00\x20" + reply(1))])
+    assert ask(client) == 1
 
 
 def test_a_repeated_reply_is_never_taken_for_the_next():
-    link, _ = linked([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, reply(1))], [(9 * MS, reply(2))])
-    assert [ask(link), ask(link)] == [1, 2]
-    assert link.counters.num_unexpected == 1
+    client, _ = connected([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, reply(1))], [(9 * MS, reply(2))])
+    assert [ask(client), ask(client)] == [1, 2]
+    assert client.counters.num_unexpected == 1
 
 
 @pytest.mark.parametrize("late_by", [31, 35, 40, 47, 48, 49, 52, 55, 56, 58, 60, 65])
@@ -158,23 +158,23 @@ def test_a_late_reply_is_never_taken_for_the_next(late_by):
     begins = late_by - wire
     next_request = timeout + settle if begins >= timeout + settle else late_by + settle
     following = max(late_by - next_request, request) + wire
-    link, line = linked(paced(reply(1), late_by * MS), paced(reply(2), following * MS))
+    client, line = connected(paced(reply(1), late_by * MS), paced(reply(2), following * MS))
     with pytest.raises((HandTimeoutError, HandChecksumError)):
-        ask(link)
-    assert ask(link) == 2
+        ask(client)
+    assert ask(client) == 2
     assert not line.pending()
 
 
 @pytest.mark.parametrize("late_by", [31, 40, 47, 48, 49, 56, 60, 65, 80, 120, 250, 1000])
 @pytest.mark.parametrize("next_late_by", [9, 25, 100])
 def test_of_a_hand_that_tells_its_version_no_reply_however_late_is_taken_for_another(late_by, next_late_by):
-    link, line = linked(
+    client, line = connected(
         paced(reply(1), late_by * MS), paced(reply(2), next_late_by * MS), paced(reply(3), 9 * MS), tells_version=True
     )
     found = []
     for _ in range(40):
         try:
-            exchange = link.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+            exchange = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
         except (HandTimeoutError, HandChecksumError):
             continue
         sent_at = line.written[exchange.payload[0] - 1][0]
@@ -186,46 +186,46 @@ def test_of_a_hand_that_tells_its_version_no_reply_however_late_is_taken_for_ano
 
 
 def test_a_stalled_adapter_that_hands_out_an_old_reply_and_only_then_sends_the_new_request():
-    link, line = linked([(200 * MS, reply(1))], [(9 * MS, reply(2))], tells_version=True)
+    client, line = connected([(200 * MS, reply(1))], [(9 * MS, reply(2))], tells_version=True)
     for _ in range(10):
         try:
-            assert ask(link) == 2
+            assert ask(client) == 2
             break
         except HandTimeoutError:
             assert line.now - 100 < 0.3
 
 
 def test_a_hand_that_tells_its_version_is_asked_for_it_only_after_a_failure():
-    link, line = linked(*[[(9 * MS, reply(i))] for i in range(3)], [], [(9 * MS, reply(4))], tells_version=True)
-    assert [ask(link) for _ in range(3)] == [0, 1, 2]
+    client, line = connected(*[[(9 * MS, reply(i))] for i in range(3)], [], [(9 * MS, reply(4))], tells_version=True)
+    assert [ask(client) for _ in range(3)] == [0, 1, 2]
     assert line.num_versions == 1
     with pytest.raises(HandTimeoutError):
-        ask(link)
+        ask(client)
     failed_at = line.now
-    assert ask(link) == 4
+    assert ask(client) == 4
     assert line.num_versions == 2
     assert line.written[-1][0] - failed_at == pytest.approx(0.2 * MS + POLL_S, abs=POLL_S)
 
 
 def test_a_hand_that_does_not_tell_its_version_is_asked_thrice_and_no_more():
-    link, line = linked([(9 * MS, reply(1))], [], [(9 * MS, reply(3))])
-    assert ask(link) == 1
+    client, line = connected([(9 * MS, reply(1))], [], [(9 * MS, reply(3))])
+    assert ask(client) == 1
     with pytest.raises(HandTimeoutError):
-        ask(link)
-    assert ask(link) == 3
+        ask(client)
+    assert ask(client) == 3
     assert line.num_versions == 3
 
 
 def test_a_damaged_reply_after_a_sound_one_leaves_neither():
-    link, _ = linked([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, reply(2)[:2000])], [(9 * MS, reply(3))])
+    client, _ = connected([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, reply(2)[:2000])], [(9 * MS, reply(3))])
     with pytest.raises(HandChecksumError, match="2000 bytes are in no sound frame"):
-        ask(link)
-    assert ask(link) == 3
+        ask(client)
+    assert ask(client) == 3
 
 
 def test_a_glitch_after_a_reply_is_no_damaged_reply():
-    link, _ = linked([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, b"\x00\xff")])
-    assert ask(link) == 1
+    client, _ = connected([(9 * MS, reply(1)), (9 * MS + POLL_S / 2, b"\x00\xff")])
+    assert ask(client) == 1
 
 
 BYTES = st.one_of(
@@ -241,11 +241,11 @@ TRAFFIC = st.lists(st.tuples(st.floats(0, 0.1), BYTES), max_size=6)
 @given(st.lists(TRAFFIC, max_size=4), st.booleans())
 @settings(max_examples=300, deadline=None)
 def test_whatever_comes_each_exchange_ends_in_time_with_a_whole_reply_or_a_named_error(traffic, tells_version):
-    link, line = linked(*traffic, tells_version=tells_version)
+    client, line = connected(*traffic, tells_version=tells_version)
     for _ in range(4):
         start = line.now
         try:
-            found = link.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
+            found = client.exchange(Command.EXCHANGE, REQUEST, payloads.STATE_SIZE)
         except (HandTimeoutError, HandChecksumError, HandAddressError, HandRefusedError):
             pass
         else:
@@ -255,68 +255,68 @@ def test_whatever_comes_each_exchange_ends_in_time_with_a_whole_reply_or_a_named
 
 
 def test_a_reply_before_the_wire_could_carry_it_is_an_earlier_ones():
-    link, _ = linked([(7.5 * MS, reply(1)), (16 * MS, reply(2))])
-    assert ask(link) == 2
+    client, _ = connected([(7.5 * MS, reply(1)), (16 * MS, reply(2))])
+    assert ask(client) == 2
 
 
 def test_only_an_early_reply_says_so():
-    link, _ = linked([(3 * MS, reply(1))])
+    client, _ = connected([(3 * MS, reply(1))])
     with pytest.raises(HandTimeoutError, match="sooner than 3000000 baud allow"):
-        ask(link)
-    link, _ = linked([(3 * MS, reply(1))], checks_wire_time=False)
-    assert ask(link) == 1
+        ask(client)
+    client, _ = connected([(3 * MS, reply(1))], checks_wire_time=False)
+    assert ask(client) == 1
 
 
 def test_a_second_hands_replies_are_not_this_hands():
-    link, _ = linked([(9 * MS, reply(7, source=0x81)), (16 * MS, reply(1))], [(9 * MS, reply(7, source=0x81))])
-    assert ask(link) == 1
+    client, _ = connected([(9 * MS, reply(7, source=0x81)), (16 * MS, reply(1))], [(9 * MS, reply(7, source=0x81))])
+    assert ask(client) == 1
     with pytest.raises(HandAddressError, match=r"a reply came from 0x81 to 0xfe, expected from 0x80 to 0xfe"):
-        ask(link)
-    assert link.counters.num_foreign == 2
+        ask(client)
+    assert client.counters.num_foreign == 2
 
 
 def test_a_hand_whose_replies_have_other_addresses_can_be_told():
-    link, _ = linked([(9 * MS, reply(1, 0xFE, 0x00))], addresses=Addresses(0, reply_source=0xFE, reply_destination=0))
-    assert ask(link) == 1
+    client, _ = connected([(9 * MS, reply(1, 0xFE, 0x00))], addresses=Addresses(0, reply_source=0xFE, reply_destination=0))
+    assert ask(client) == 1
 
 
 def test_an_adapter_that_hears_its_own_requests():
-    link, _ = linked([(1 * MS, encode_frame(Frame(0xFE, 0x80, 2, REQUEST))), (9 * MS, reply(1))])
-    assert ask(link) == 1
-    assert link.counters.num_foreign == 0
+    client, _ = connected([(1 * MS, encode_frame(Frame(0xFE, 0x80, 2, REQUEST))), (9 * MS, reply(1))])
+    assert ask(client) == 1
+    assert client.counters.num_foreign == 0
 
 
 def test_a_refusal():
-    link, _ = linked([(9 * MS, encode_frame(Frame(0x80, 0xFE, 0, b"\x07")))])
+    client, _ = connected([(9 * MS, encode_frame(Frame(0x80, 0xFE, 0, b"\x07")))])
     with pytest.raises(HandRefusedError, match=r"the hand refused command 0x02 \(exchange\); its error reply holds 07"):
-        ask(link)
+        ask(client)
 
 
 def test_a_reply_of_another_size_or_command():
-    link, _ = linked([(9 * MS, reply(1, size=100))], [(9 * MS, reply(1, command=3))])
+    client, _ = connected([(9 * MS, reply(1, size=100))], [(9 * MS, reply(1, command=3))])
     with pytest.raises(HandTimeoutError, match=r"the reply to command 0x02 \(exchange\) has 100 bytes, expected 2208"):
-        ask(link)
+        ask(client)
     with pytest.raises(HandTimeoutError, match="no reply"):
-        ask(link)
+        ask(client)
 
 
 def test_a_babbling_line():
-    link, line = linked([(i * 0.4 * MS, b"\x00") for i in range(1000)])
+    client, line = connected([(i * 0.4 * MS, b"\x00") for i in range(1000)])
     with pytest.raises(HandChecksumError, match="came damaged"):
-        ask(link)
+        ask(client)
     with pytest.raises(HandTimeoutError, match="the line does not fall silent"):
-        ask(link)
+        ask(client)
     assert len(line.written) == 1
 
 
 def test_a_reply_after_which_the_line_babbles_is_not_trusted():
-    link, _ = linked([(9 * MS, reply(1))] + [((9 + i * 0.4) * MS, b"\x00") for i in range(1000)])
+    client, _ = connected([(9 * MS, reply(1))] + [((9 + i * 0.4) * MS, b"\x00") for i in range(1000)])
     with pytest.raises(HandTimeoutError, match="the line does not fall silent"):
-        ask(link)
+        ask(client)
 
 
 def test_what_came_before_the_first_request_is_no_reply():
-    link, line = linked([(9 * MS, reply(2))])
+    client, line = connected([(9 * MS, reply(2))])
     line.coming = [(line.now + 5 * MS, reply(1))]
-    assert ask(link) == 2
-    assert link.counters.num_discarded_bytes == 2217
+    assert ask(client) == 2
+    assert client.counters.num_discarded_bytes == 2217

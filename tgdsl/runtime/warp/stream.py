@@ -1,4 +1,4 @@
-"""Where the work of Warp and torch is done, in one order, and how it is captured as CUDA graphs."""
+"""The CUDA stream that Warp and torch share, and calls that are captured on it as CUDA graphs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import torch
 
 from tgdsl.errors import SimulationError
+from tgdsl.runtime.simulators.devices import checked_device
 
 T = TypeVar("T")
 _EAGER_CALLS = 2
@@ -30,7 +31,7 @@ def libraries() -> tuple[Any, Any]:
     return warp, mujoco_warp
 
 
-class Lane:
+class WarpStream:
     """A device, and on a GPU the stream that Warp and torch share there.
 
     Attributes:
@@ -49,12 +50,7 @@ class Lane:
             SimulationError: If there is no such device, or Warp is not installed.
         """
         self._warp = libraries()[0]
-        try:
-            self.device = torch.empty(0, device=device).device
-        except (RuntimeError, AssertionError) as error:
-            raise SimulationError(f'there is no device "{device}" to run physics on: {error}') from error
-        if self.device.type not in ("cpu", "cuda"):
-            raise SimulationError(f'physics on "{device}" is not supported, expected "cuda" or "cpu"')
+        self.device = checked_device(device, ("cuda", "cpu"))
         self.is_captured = graph and self.device.type == "cuda"
         with self._quiet():
             self._warp.init()
@@ -67,8 +63,8 @@ class Lane:
         return self.device.type == "cuda" and torch.cuda.is_current_stream_capturing()
 
     @contextlib.contextmanager
-    def work(self) -> Iterator[None]:
-        """Put what Warp and torch are told inside after all that torch has been told before, and before what comes then.
+    def scope(self) -> Iterator[None]:
+        """Queue Warp's and torch's work inside after all that torch has queued before, and before all that it queues later.
 
         Tensors made inside are ordinary ones without gradients, also under `inference_mode`: compiled code is the same in both.
         """
@@ -84,10 +80,10 @@ class Lane:
                 torch.cuda.current_stream(self.device).wait_stream(self._stream)
 
     @contextlib.contextmanager
-    def work_in_capture(self) -> Iterator[None]:
-        """Put what Warp and torch are told inside into the graph that torch is capturing, and tell Warp of it.
+    def capture_scope(self) -> Iterator[None]:
+        """Put Warp's and torch's work inside into the graph that torch is capturing.
 
-        It is done on the stream where the capture has begun: only there can Warp put loops into a graph.
+        Warp learns of the capture. It is on the stream where this has begun: only there can Warp put loops into a graph.
         """
         stream = self._warp.stream_from_torch(torch.cuda.current_stream(self.device))
         was_enabled = gc.isenabled()
@@ -115,7 +111,7 @@ class Lane:
             SimulationError: If the work cannot be captured.
         """
         graph = torch.cuda.CUDAGraph()
-        with self.work():
+        with self.scope():
             gc.collect()
             was_enabled = gc.isenabled()
             gc.disable()
@@ -133,7 +129,7 @@ class Lane:
         return graph, result
 
     def replay(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Do what was captured, after all that torch has been told before."""
+        """Replay a graph, after all that torch has queued before."""
         with torch.cuda.device(self.device):
             graph.replay()
 
@@ -148,12 +144,12 @@ class Lane:
             self._warp.config.log_level = before
 
 
-class Replay(Generic[T]):
+class GraphedCall(Generic[T]):
     """Work that is done again and again on the same arrays: on a GPU captured at its third call, and replayed from then on."""
 
-    def __init__(self, lane: Lane, body: Callable[[], T]):
+    def __init__(self, stream: WarpStream, body: Callable[[], T]):
         """Take work that reads and writes the same arrays each time, and nothing of the host."""
-        self._lane, self._body = lane, body
+        self._stream, self._body = stream, body
         self.forget()
 
     def forget(self) -> None:
@@ -163,15 +159,15 @@ class Replay(Generic[T]):
 
     def __call__(self) -> T:
         """Do the work; tensors that a replay returns are the same each time."""
-        if self._lane.is_capturing:
-            with self._lane.work_in_capture():
+        if self._stream.is_capturing:
+            with self._stream.capture_scope():
                 return self._body()
-        if not self._lane.is_captured or self._eager_calls < _EAGER_CALLS:
+        if not self._stream.is_captured or self._eager_calls < _EAGER_CALLS:
             self._eager_calls += 1
-            with self._lane.work():
+            with self._stream.scope():
                 return self._body()
         if self._captured is None:
-            self._captured = self._lane.capture(self._body)
+            self._captured = self._stream.capture(self._body)
         graph, result = self._captured
-        self._lane.replay(graph)
+        self._stream.replay(graph)
         return result

@@ -1,4 +1,4 @@
-"""How long a control step of a hand takes: in its own time, or as long as someone else says."""
+"""Timing of a hand's control steps: in real time, or as a simulated body makes them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tgdsl.runtime.xhand1.reader import Reading
 
 
 @runtime_checkable
-class Pace(Protocol):
+class StepTimer(Protocol):
     """Waits for the end of control steps."""
 
     num_late_steps: int

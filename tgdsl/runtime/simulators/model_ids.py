@@ -46,12 +46,14 @@ def geoms_of(model: mujoco.MjModel, body: int, with_below: bool) -> Int[np.ndarr
     return np.flatnonzero(np.isin(model.geom_bodyid, bodies))
 
 
-def keyframe_id(model: mujoco.MjModel, name: str) -> int:
-    """Return the index of a keyframe.
+def keyframe_id(model: mujoco.MjModel, name: str | None) -> int:
+    """Return the index of a keyframe; without a name −1, the model's own initial state.
 
     Raises:
         SimulationError: If there is none of that name.
     """
+    if name is None:
+        return -1
     try:
         return int(model.key(name).id)
     except KeyError as error:

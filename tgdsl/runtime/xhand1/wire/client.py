@@ -39,7 +39,7 @@ _BABBLE = "the line does not fall silent: something else is sending on it"
 
 
 @dataclass(frozen=True)
-class LinkTiming:
+class SerialTiming:
     """Times of the line.
 
     Attributes:
@@ -61,7 +61,7 @@ class LinkTiming:
 
 
 @dataclass
-class LinkCounters:
+class SerialCounters:
     """What happened on the line so far.
 
     Attributes:
@@ -83,15 +83,15 @@ class LinkCounters:
     num_discarded_bytes: int = 0
 
 
-class Link:
+class SerialClient:
     """A port on which one hand answers, one request at a time. Not for use by two threads."""
 
     def __init__(
         self,
         port: Port,
         addresses: Addresses | None,
-        timing: LinkTiming,
-        counters: LinkCounters | None = None,
+        timing: SerialTiming,
+        counters: SerialCounters | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Take over an open port.
@@ -105,7 +105,7 @@ class Link:
         """
         self.port = port
         self.timing = timing
-        self.counters = LinkCounters() if counters is None else counters
+        self.counters = SerialCounters() if counters is None else counters
         self._addresses = addresses
         self._clock = clock
         self._parser = FrameParser()
@@ -120,7 +120,7 @@ class Link:
             command: What is asked.
             payload: The request's bytes.
             reply_size: Length of the reply's payload, if it is known.
-            hand_id: Whom to ask where the link has no addresses.
+            hand_id: Whom to ask where the client has no addresses.
 
         Raises:
             HandTimeoutError: If no reply came in time, or the line does not fall silent.
@@ -147,7 +147,7 @@ class Link:
         self.port.write(encode_frame(Frame(HOST_ADDRESS, hand_address(hand_id), command, payload)))
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Release the port."""
         self.port.close()
 
     def _ask(self, command: Command, payload: bytes, reply_size: int | None, hand_id: int) -> Reply:

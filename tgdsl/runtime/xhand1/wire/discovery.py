@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from tgdsl.runtime.xhand1.wire.client import SerialClient, SerialTiming
 from tgdsl.runtime.xhand1.wire.errors import HandChecksumError, HandTimeoutError
-from tgdsl.runtime.xhand1.wire.link import Link, LinkTiming
 from tgdsl.runtime.xhand1.wire.protocol import Command
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import Port, open_serial_port
@@ -31,7 +31,7 @@ def find_hands(
     device: str,
     hand_ids: Iterable[int] = range(8),
     *,
-    timing: LinkTiming | None = None,
+    timing: SerialTiming | None = None,
     open_port: Callable[[str, int], Port] = open_serial_port,
 ) -> tuple[FoundHand, ...]:
     """Ask each id on a port for its version and return those that answer.
@@ -46,16 +46,16 @@ def find_hands(
         HandDisconnectedError: If the port cannot be opened, or went away.
         HandRefusedError: If a hand answers with its error command.
     """
-    timing = timing or LinkTiming()
-    link = Link(open_port(device, timing.baud), None, timing)
+    timing = timing or SerialTiming()
+    client = SerialClient(open_port(device, timing.baud), None, timing)
     found = []
     try:
         for hand_id in hand_ids:
             try:
-                reply = link.exchange(Command.VERSION, hand_id=hand_id)
+                reply = client.exchange(Command.VERSION, hand_id=hand_id)
             except (HandTimeoutError, HandChecksumError):
                 continue
             found.append(FoundHand(device, Addresses(hand_id, reply.source, reply.destination), reply.payload))
     finally:
-        link.close()
+        client.close()
     return tuple(found)

@@ -1,0 +1,59 @@
+"""MuJoCo on CPU threads as a source: "simulation"."""
+
+from __future__ import annotations
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_only, set_control_step
+from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.source_kind import SimulatorKind
+
+
+def simulate_on_cpu(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+    on_fault: OnFault = "raise",
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> BatchSimulation:
+    """Simulate the module's scene, as `tgdsl.simulate` says it.
+
+    Raises:
+        SimulationError: As from `BatchSimulation`, or if an argument is for a GPU.
+    """
+    if nconmax is not None or njmax is not None:
+        raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
+    return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, on_fault=on_fault)
+
+
+def simulate_at(touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None) -> BatchSimulation:
+    """Simulate the module's scene with control steps of some duration [s].
+
+    Raises:
+        SimulationError: If the scene cannot be stepped like this.
+    """
+    sim = BatchSimulation(touch, num_envs, keyframe=keyframe, threads=0 if num_envs > 1 else 1)
+    set_control_step(sim, control_step)
+    return sim
+
+
+def _open(touch: TactileModule, source: str, *, num_envs: int, control_step: float, keyframe: str | None) -> Connection:
+    refuse_hand_only(touch)
+    return SimulationConnection(touch, simulate_at(touch, num_envs, control_step, keyframe))
+
+
+SIMULATION = SimulatorKind(
+    "simulation",
+    '"simulation"',
+    _open,
+    recognise=lambda source: source == "simulation",
+    devices=("cpu",),
+    simulate=simulate_on_cpu,
+)
+"""The module's own scene, in MuJoCo's `Batch`."""

@@ -1,0 +1,122 @@
+"""A source as a policy sees it: stepped, observed and reset, whatever is behind it.
+
+Shapes: `env` environments, `feature` numbers of an observation.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import ObservationError
+from tgdsl.runtime.source import Control, Source
+from tgdsl.tensors.env_ids import EnvIds
+
+
+class Connection(ABC):
+    """A source, as a policy sees it. Use it as a context manager, or call `close`.
+
+    A kind of source supplies `read`, and where it differs `send`, `restart` and `concerns`.
+
+    Attributes:
+        source: What is behind it: a `BatchSimulation`, an `XHand1Source`, an `EmulatedSource`, a `ReplaySource` or another.
+    """
+
+    def __init__(self, source: Source):
+        """Connect a source; users call `tgdsl.connect`."""
+        self.source = source
+        self._groups: dict[str, Tensor] | None = None
+        self._is_read = True
+
+    @abstractmethod
+    def read(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Read the sensors: the module's observation groups at this instant. `observe` calls it once per step or reset."""
+
+    def send(self, control: Control) -> None:
+        """Advance the source by one control step, with controls in the order of the model's actuators."""
+        self.source.step(control)
+
+    def restart(self, env_ids: EnvIds | None) -> None:
+        """Reset the source, and forget past observations."""
+        self.source.reset(env_ids)
+
+    def concerns(self, env_ids: EnvIds) -> bool:
+        """Return whether a reset of these environments does anything; if not, the last observation stays."""
+        return True
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments; of a hand or a log, 1."""
+        return self.source.num_envs
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        return self.source.control_step
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a log is at its end; other sources never are."""
+        return False
+
+    def step(self, control: Control = None) -> None:
+        """Advance by one control step.
+
+        Args:
+            control: In the order of the model's actuators, (actuator,) or (env, actuator); of a hand, joint angles to go to
+                [rad]; default: as they were. A log ignores them, and a hand without leave to move too: a warning says so once.
+
+        Raises:
+            SimulationError: If a simulation cannot make the step.
+            HandError: If a hand may not go there, or gives no new reading. It is then passive until `resume`.
+        """
+        self._groups, self._is_read = None, False
+        self.send(control)
+        self._is_read = True
+
+    def observe(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the module's observation groups, in its dtype and on its device; the same until the next step or reset.
+
+        The sensors are read at the first call after a step or a reset: `rate` and `history` count these.
+
+        Raises:
+            ObservationError: If the last step or reset failed: what was observed before is not handed out as if it were new.
+        """
+        if not self._is_read:
+            raise ObservationError("the last step or reset failed, so there is nothing new to observe; step or reset again")
+        if self._groups is None:
+            self._groups = self.read()
+        return dict(self._groups)
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Start some environments anew (default: all): a simulation from its keyframe, a hand where it is, passive.
+
+        Raises:
+            HandError: If a hand gives no new reading.
+        """
+        if env_ids is not None and not self.concerns(env_ids):
+            return
+        self._groups, self._is_read = None, False
+        self.restart(env_ids)
+        self._is_read = True
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again; for other sources, nothing."""
+        return
+
+    def close(self) -> None:
+        """Release the source; a hand becomes passive.
+
+        Raises:
+            HandError: If a hand was moving and did not confirm that it is passive.
+        """
+        self.source.close()
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

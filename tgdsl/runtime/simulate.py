@@ -1,0 +1,98 @@
+"""Simulation of a module's scene, by the simulator that is taken for a device."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, overload
+
+from tgdsl.errors import SimulationError, listed
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.known import known_sources
+from tgdsl.runtime.simulators.devices import checked_device
+from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.source_kind import SimulatorKind, keyword_options
+from tgdsl.runtime.warp import WarpSimulation
+
+_DEFAULTS = {"substeps": 1, "threads": 0, "keyframe": None, "on_fault": "raise", "nconmax": None, "njmax": None}
+
+
+@overload
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: Literal["cpu"] = "cpu",
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+    on_fault: OnFault = "raise",
+) -> BatchSimulation: ...
+@overload
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: str,
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+    on_fault: OnFault = "raise",
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> BatchSimulation | WarpSimulation: ...
+def simulate(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    device: str = "cpu",
+    substeps: int = 1,
+    threads: int = 0,
+    keyframe: str | None = None,
+    on_fault: OnFault = "raise",
+    nconmax: int | None = None,
+    njmax: int | None = None,
+) -> BatchSimulation | WarpSimulation:
+    """Simulate the scene that a module was compiled for.
+
+    Args:
+        touch: The module.
+        num_envs: Number of environments.
+        device: Where physics runs: "cpu" is MuJoCo's Batch, "cuda" or "cuda:1" is MuJoCo Warp. The state is handed out on the
+            module's device; both on one GPU need no copies.
+        substeps: Physics steps per control step. What `state` hands out after a step is of the start of the last one: with
+            `substeps=1`, of the instant before the step. `sim.forward()` evaluates where the environments are now.
+        threads: CPU threads; 0: one per CPU.
+        keyframe: Name of the keyframe to start from.
+        on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
+            until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
+        nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
+        njmax: On a GPU, capacity for rows of constraints in each environment.
+
+    Raises:
+        ArtifactError: If an asset of the scene is missing or has changed.
+        SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
+            wants.
+    """
+    given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
+    given |= {"nconmax": nconmax, "njmax": njmax}
+    kind = _simulator_on(device)
+    known = keyword_options(kind.simulate)
+    if unknown := [name for name, value in given.items() if name not in known and value != _DEFAULTS[name]]:
+        what = f'"{kind.name}", which simulates on "{device}", has no option {listed(unknown)}'
+        raise SimulationError(f"{what}; it knows {listed(known)}")
+    options = {name: value for name, value in (given | {"device": device}).items() if name in known}
+    return kind.simulate(touch, num_envs, **options)
+
+
+def _simulator_on(device: str) -> SimulatorKind:
+    """Return the simulator that is taken for a device.
+
+    Raises:
+        SimulationError: If there is no such device, or no simulator for it.
+    """
+    simulators = [kind for kind in known_sources() if isinstance(kind, SimulatorKind)]
+    type_ = device.partition(":")[0]
+    found = [kind for kind in simulators if type_ in kind.devices]
+    if not found:
+        checked_device(device, sorted({type_ for kind in simulators for type_ in kind.devices}, reverse=True))
+    return found[0]

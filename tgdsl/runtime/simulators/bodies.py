@@ -1,0 +1,72 @@
+"""Poses and velocities of bodies, from MuJoCo's arrays: NumPy's or torch's.
+
+Shapes: `env` environments, `body` as the module's `inputs` list them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import mujoco
+import numpy as np
+import torch
+
+from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.simulators.model_ids import body_id
+
+T = TypeVar("T", np.ndarray, torch.Tensor)
+STATE_ARRAYS = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
+"""Arrays of MuJoCo that poses, velocities and contacts of a state are read from."""
+
+
+class BodyFields:
+    """Gathers the fields of a state that are poses and velocities of bodies."""
+
+    def __init__(
+        self, inputs: Inputs, model: mujoco.MjModel, *, index: Callable[[np.ndarray], Any], cross: Callable[[Any, Any], Any]
+    ):
+        """Look the bodies up.
+
+        Args:
+            inputs: What the module wants.
+            model: The scene.
+            index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
+            cross: Their cross product along the last axis.
+
+        Raises:
+            SimulationError: If the model lacks a body.
+        """
+        ids = np.array([body_id(model, name) for name in inputs.bodies], dtype=np.int64)
+        self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
+        self._fields = inputs.fields
+        self._cross = cross
+
+    def read(self, arrays: Mapping[str, T]) -> dict[str, T]:
+        """Return the fields that the module wants, (env, body, …), each an array of its own."""
+        values: dict[str, T] = {}
+        if "body_pos" in self._fields:
+            values["body_pos"] = arrays["xpos"][:, self._bodies]
+        if "body_quat" in self._fields:
+            values["body_quat"] = arrays["xquat"][:, self._bodies]
+        if "body_linvel" in self._fields or "body_angvel" in self._fields:
+            spatial = arrays["cvel"][:, self._bodies]
+            if "body_linvel" in self._fields:
+                arm = arrays["xpos"][:, self._bodies] - arrays["subtree_com"][:, self._roots]
+                values["body_linvel"] = origin_velocity(spatial, arm, self._cross)
+            if "body_angvel" in self._fields:
+                values["body_angvel"] = spatial[..., :3]
+        return values
+
+
+def origin_velocity(spatial: T, arm: T, cross: Callable[[T, T], T]) -> T:
+    """Return the velocity of a body frame's origin from MuJoCo's spatial velocity `cvel`.
+
+    MuJoCo gives the latter at the centre of mass of the body's kinematic tree.
+
+    Args:
+        spatial: Angular and linear velocity, (…, 6), in the world [rad/s], [m/s].
+        arm: From that centre of mass to the origin, (…, 3), in the world [m].
+        cross: Cross product along the last axis.
+    """
+    return spatial[..., 3:] + cross(spatial[..., :3], arm)

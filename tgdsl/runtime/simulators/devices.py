@@ -1,0 +1,29 @@
+"""Devices that physics can run on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from tgdsl.errors import SimulationError
+
+
+def checked_device(device: str, supported: Sequence[str]) -> torch.device:
+    """Return a device with its index, as torch finds it.
+
+    Args:
+        device: As torch names it: "cpu", "cuda" or "cuda:1".
+        supported: Types of devices that physics can run on.
+
+    Raises:
+        SimulationError: If there is no such device, or its type is not among these.
+    """
+    try:
+        found = torch.empty(0, device=device).device
+    except (RuntimeError, AssertionError) as error:
+        raise SimulationError(f'there is no device "{device}" to run physics on: {error}') from error
+    if found.type not in supported:
+        expected = " or ".join(f'"{name}"' for name in supported)
+        raise SimulationError(f'physics on "{device}" is not supported, expected {expected}')
+    return found

@@ -1,0 +1,180 @@
+"""The XHand1 as a source: "xhand1" or "xhand1:PORT"; and what connections to a hand, an emulated one and a log share."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import HandError, listed
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.source import Control, Source
+from tgdsl.runtime.source_kind import SourceKind
+from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
+from tgdsl.runtime.xhand1.controls import JointControls, check_ranges
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.fingertips import warn_of_noise
+from tgdsl.runtime.xhand1.motion import MotionLimits
+from tgdsl.runtime.xhand1.observe import HandObserver
+from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
+from tgdsl.runtime.xhand1.wire.replies import Addresses
+from tgdsl.runtime.xhand1.wire.serial_port import list_ports
+from tgdsl.scene.scene import scene_model
+from tgdsl.tensors.env_ids import EnvIds
+
+_USB_PORTS = ("/dev/ttyUSB", "/dev/ttyACM", "/dev/cu.usb", "COM")
+
+
+@runtime_checkable
+class HandSource(Source, Protocol):
+    """A source that is an XHand1, or the log of one."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing more to read."""
+        ...
+
+    def sample(self) -> HandSample:
+        """Return what the hand said at the end of the last step."""
+        ...
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again."""
+        ...
+
+
+class HandConnection(Connection):
+    """A connection to an XHand1, or to the log of one.
+
+    Shapes: `env` one, `feature` numbers of an observation.
+    """
+
+    def __init__(self, source: HandSource, observer: HandObserver, targets: JointTargets | None = None):
+        """Connect a hand.
+
+        Args:
+            source: The hand.
+            observer: Observes it for the module.
+            targets: Where controls send its joints; default: nowhere, and nothing is said of it.
+        """
+        super().__init__(source)
+        self._hand, self._observer, self._targets = source, observer, targets
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a log is at its end."""
+        return self._hand.is_over
+
+    def read(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Observe what the hand said at the end of the last step."""
+        return self._observer.observe(self._hand.sample())
+
+    def send(self, control: Control) -> None:
+        """Send the joints where the controls say, and take note of the controls once the step is made."""
+        self._hand.step(None if self._targets is None else self._targets.of(control))
+        self._observer.note(control)
+
+    def restart(self, env_ids: EnvIds | None) -> None:
+        """Reset the hand, and forget its past."""
+        self._hand.reset(env_ids)
+        self._observer.reset()
+
+    def concerns(self, env_ids: EnvIds) -> bool:
+        """Return whether the one environment is among these."""
+        return is_chosen(env_ids)
+
+    def resume(self) -> None:
+        """Allow a hand that was made passive by an error to move again."""
+        self._hand.resume()
+
+
+class JointTargets:
+    """From a model's controls to joint angles; without leave to move, to none, which is said once."""
+
+    def __init__(self, touch: TactileModule, motion: MotionLimits | None, name: str):
+        """Look whether the scene's actuators are the hand's, and the limits within the robot file's.
+
+        Raises:
+            MotionError: If they are not.
+        """
+        self._name = name
+        self._joints: JointControls | None = None
+        self._is_told = False
+        if motion is not None:
+            model = scene_model(touch.plan.scene)
+            self._joints = JointControls.of_model(model)
+            check_ranges(model, motion)
+
+    def of(self, control: Control) -> Float[np.ndarray, " joint"] | None:
+        """Return the joint angles to go to [rad].
+
+        Raises:
+            MotionError: If there are not as many controls as joints.
+        """
+        if control is None:
+            return None
+        if self._joints is None:
+            if not self._is_told:
+                self._is_told = True
+                what = f"{self._name} was connected for reading alone: its controls go nowhere"
+                warnings.warn(f"{what}; to move it, connect with motion=MotionLimits(...)", stacklevel=4)
+            return None
+        return self._joints.targets(control.detach().cpu().numpy() if isinstance(control, Tensor) else np.asarray(control))
+
+
+def given_calibration(calibration: Calibration | str | Path | None) -> Calibration | None:
+    """Return a calibration, read from its file if that is given.
+
+    Raises:
+        SpecError: If the file has mistakes.
+    """
+    return load_calibration(Path(calibration)) if isinstance(calibration, (str, Path)) else calibration
+
+
+def _open(
+    touch: TactileModule,
+    source: str,
+    *,
+    control_step: float,
+    calibration: Calibration | str | Path | None,
+    motion: MotionLimits | None,
+    addresses: Addresses | None,
+    timing: SerialTiming | None,
+    lockstep: bool,
+) -> Connection:
+    known = given_calibration(calibration) or Calibration.none()
+    if lockstep:
+        raise HandError("a real hand moves in its own time: lockstep is for emulators and logs")
+    port = source.partition(":")[2]
+    observer = HandObserver(touch, known, control_step)
+    targets = JointTargets(touch, motion, "the hand")
+    warn_of_noise(touch.plan)
+    with ExitStack() as opened:
+        hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing))
+        stepped = XHand1Source(hand, control_step=control_step, calibration=known)
+        opened.pop_all()
+    return HandConnection(stepped, observer, targets)
+
+
+def _only_port() -> str:
+    """Return the only USB serial port.
+
+    Raises:
+        HandError: If there are none or several.
+    """
+    ports = [port.device for port in list_ports() if port.device.startswith(_USB_PORTS)]
+    if len(ports) != 1:
+        found = listed(ports) or "none"
+        raise HandError(f'expected one USB serial port, found {found}; name the hand\'s: source="xhand1:/dev/ttyUSB0"')
+    return ports[0]
+
+
+XHAND1 = SourceKind("xhand1", '"xhand1", "xhand1:PORT"', _open)
+"""The hand on a serial port."""
