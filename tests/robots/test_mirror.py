@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import KDTree
 
 from tgdsl.compiler.resolve import resolve
-from tgdsl.files.files import layout_file, robot_names
+from tgdsl.files.find import layout_file, robot_names
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.sample.sample import sample
 from tgdsl.schema.load import load

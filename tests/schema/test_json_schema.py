@@ -10,7 +10,7 @@ from documents import DOCUMENT, LAYOUT, POISSON, read, valid
 from wrong import WRONG, WRONG_LAYOUT
 
 from tgdsl.errors import SpecError
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.schema import yaml
 from tgdsl.schema.document import json_schema
 from tgdsl.schema.load import load

@@ -14,7 +14,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection, SpecModel
 from tgdsl.fields.regions import OnGeoms, RegionPart
-from tgdsl.files.files import is_file, robot_names
+from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.robot import Geom, Model, load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 
 from tgdsl.errors import RobotError
-from tgdsl.files.files import is_file
+from tgdsl.files.find import is_file
 from tgdsl.formats.robot import Model
 from tgdsl.plan.plan import Asset, SceneGeom, SceneObject
 from tgdsl.scene.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices

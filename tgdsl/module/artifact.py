@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError, TgdslError
-from tgdsl.files.files import write_whole
+from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.scene.places import check_scene
@@ -66,7 +66,7 @@ def load(
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
     """Write a plan, as `save` does; return the bytes written."""
     content = serialized({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
-    write_whole(Path(path), content)
+    atomic_write(Path(path), content)
     return len(content)
 
 

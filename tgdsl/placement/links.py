@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
-from tgdsl.files.files import layout_file, robot_file, robot_names
+from tgdsl.files.find import layout_file, robot_file, robot_names
 from tgdsl.formats.robot import SHAPE_NAMES, Model, load_model
 from tgdsl.schema.load import LoadedLayout, load_layout
 from tgdsl.schema.select import select

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import ArtifactError, RobotError
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.plan.plan import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.places import ROBOTS, located
 

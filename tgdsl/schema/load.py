@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
-from tgdsl.files import files
+from tgdsl.files import find
 from tgdsl.observations.proprioception import QUANTITIES
 from tgdsl.schema import yaml
 from tgdsl.schema.document import Spec, document_model
@@ -64,7 +64,7 @@ class Loaded:
     @property
     def robot_file(self) -> FilePath | None:
         """The robot's model file, if it exists."""
-        return files.robot_file(self.spec.robot.model, self.folder)
+        return find.robot_file(self.spec.robot.model, self.folder)
 
     @property
     def resolution(self) -> str | None:
@@ -200,13 +200,13 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
 def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     if wanted is not None:
         path = loaded.folder / wanted
-        if files.is_file(path):
+        if find.is_file(path):
             return path
         hint = "paths are relative to this document"
         loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', hint))
         return None
-    known = files.robot_names().get(loaded.spec.robot.model)
-    if known is not None and (path := files.layout_file(known)) is not None:
+    known = find.robot_names().get(loaded.spec.robot.model)
+    if known is not None and (path := find.layout_file(known)) is not None:
         return path
     loaded.problems.append(
         loaded.source.problem(

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.files.files import whole, with_folder
+from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.source import Simulator
 from tgdsl.view.dots import Dots, dots_of, touched
@@ -57,7 +57,7 @@ def overview(
         FileError: If the file cannot be written.
     """
     figure = drawing(touch, sim, readings, env=env, title=title, view=view)
-    with whole(with_folder(path)) as file:
+    with atomic_open(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
 

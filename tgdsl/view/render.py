@@ -22,7 +22,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from scipy.ndimage import gaussian_filter
 
 from tgdsl.errors import FileError
-from tgdsl.files.files import whole, with_folder, writable
+from tgdsl.files.write import atomic_open, check_writable, with_folder
 from tgdsl.layout.layout import Layout
 from tgdsl.view.cameras import ViewError, angles_of, camera_of, pose_of
 from tgdsl.view.discs import discs, group_of, legend, radii, taxels_of
@@ -70,9 +70,9 @@ def render(
         ViewError: If there is no such keyframe or view, if there is nothing to draw, or if the file cannot be written.
     """
     try:
-        writable(out)
+        check_writable(out)
         figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
-        with whole(with_folder(out)) as file:
+        with atomic_open(with_folder(out)) as file:
             figure.savefig(file, format="png", pil_kwargs={"optimize": True})
     except FileError as error:
         raise ViewError(f"cannot write {error}") from error

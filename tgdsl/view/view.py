@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from tgdsl.errors import did_you_mean
-from tgdsl.files.files import whole, with_folder
+from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator
@@ -88,7 +88,7 @@ def picture(
     count = f"{dots.is_touched.sum()} of {len(table)} taxels touched"
     parts += [count + ("" if dots.would_read is None else " before noise"), dots.headline, f"environment {env}"]
     figure.text(0.016, 0.912, "   ·   ".join(parts), size=11.5, color=FAINT, va="center")
-    with whole(with_folder(path)) as file:
+    with atomic_open(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
 

@@ -19,9 +19,7 @@ The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
 from __future__ import annotations
 
 import math
-import os
 import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from tgdsl.errors import RobotError
-from tgdsl.files.files import naming
+from tgdsl.files.write import atomic_write_all
 from tgdsl.formats.usd.filters import exclusions
 from tgdsl.formats.usd.geoms import Geom, Site, read_geoms, read_sites
 from tgdsl.formats.usd.joints import MEETING, Joint, read_joints
@@ -266,7 +264,7 @@ def _add_loop(
 def write_mjcf(text: str, out: Path) -> None:
     """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
 
-    All is written under temporary names first, then renamed, so that nothing half-written is left behind.
+    Nothing half-written is left behind.
 
     Args:
         text: What `usd_to_mjcf` returns.
@@ -276,24 +274,17 @@ def write_mjcf(text: str, out: Path) -> None:
         FileError: If it cannot be written.
     """
     root, out = ET.fromstring(text), Path(out)
-    folder = out.with_name(f"{out.stem}_assets")
-    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
-        files: list[str] = []
-        for mesh in root.iterfind("asset/mesh[@vertex]"):
-            file = _file_name(mesh.get("name", ""), files)
-            (Path(temporary) / file).write_text(
-                _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")), encoding="utf-8"
-            )
-            mesh.set("file", file)
-        if files:
-            root.findall("compiler")[0].set("meshdir", folder.name)
-        ET.indent(root)
-        draft = Path(temporary) / "model.xml"
-        draft.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-        for file in files:
-            folder.mkdir(exist_ok=True)
-            os.replace(Path(temporary) / file, folder / file)
-        os.replace(draft, out)
+    folder, contents = out.with_name(f"{out.stem}_assets"), {}
+    names: list[str] = []
+    for mesh in root.iterfind("asset/mesh[@vertex]"):
+        name = _file_name(mesh.get("name", ""), names)
+        contents[folder / name] = _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")).encode()
+        mesh.set("file", name)
+    if names:
+        root.findall("compiler")[0].set("meshdir", folder.name)
+    ET.indent(root)
+    contents[out] = (ET.tostring(root, encoding="unicode") + "\n").encode()
+    atomic_write_all(contents)
 
 
 def _file_name(name: str, taken: list[str]) -> str:

@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import FileError, RobotError, listed
-from tgdsl.files.files import whole_file
+from tgdsl.files.write import atomic_path
 from tgdsl.formats.robot import load_model
 from tgdsl.formats.usd.export.draft import Draft, note, place, put, usd
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
@@ -207,7 +207,7 @@ def _left_out(draft: Draft) -> list[str]:
 def _write(draft: Draft, out: Path) -> None:
     """Write the stage to a file that is whole whenever it is there."""
     try:
-        with whole_file(out) as temporary:
+        with atomic_path(out) as temporary:
             if not draft.stage.GetRootLayer().Export(str(temporary)):
                 raise OSError(0, "USD did not say why")
     except FileError as error:
