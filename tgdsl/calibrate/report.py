@@ -16,7 +16,7 @@ from tgdsl.calibrate.loads import Frames
 from tgdsl.files.write import atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS
-from tgdsl.view.view import DPI, FAINT, INK
+from tgdsl.view.style import DPI, FAINT, INK
 
 AXIS_COLOURS = ("#c8553d", "#588157", "#3d5a80")
 _PANEL = (3.6, 5.4)

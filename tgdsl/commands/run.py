@@ -87,8 +87,9 @@ class Run:
         """Make all steps, and return the last readings."""
         from tqdm import tqdm
 
+        from tgdsl.console.live import LiveTable
         from tgdsl.runtime.rollout import rollout
-        from tgdsl.view.table import LiveTable, table
+        from tgdsl.view.table import table
 
         live, readings = LiveTable(), {}
         what = "compiling kernels" if self.compiled else "stepping"
@@ -104,7 +105,7 @@ class Run:
 
     def _draw(self, touch: TactileModule, sim: Simulator, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
         from tgdsl.view.overview import overview
-        from tgdsl.view.view import picture
+        from tgdsl.view.picture import picture
 
         drawn = []
         with StatusLine() as progress:

@@ -25,7 +25,7 @@ class Monitor:
         from tgdsl.runtime.xhand1.driver import XHand1
         from tgdsl.runtime.xhand1.log.record import events
         from tgdsl.runtime.xhand1.wire.ports import the_hand
-        from tgdsl.view.hand import HandView
+        from tgdsl.view.hand_table import HandView
 
         calibration, found = calibration_of(self.calibration), the_hand(self.port, self.hand_id)
         view = HandView(calibration, f"{found.device}: hand {found.addresses.hand_id}")

@@ -35,7 +35,7 @@ class Record:
         from tgdsl.runtime.xhand1.identity import identify
         from tgdsl.runtime.xhand1.log.record import LogWriter, events
         from tgdsl.runtime.xhand1.wire.ports import the_hand
-        from tgdsl.view.hand import HandView
+        from tgdsl.view.hand_table import HandView
 
         refuse_to_replace(self.out, self.force)
         if not self.seconds > 0:

@@ -28,7 +28,7 @@ class Replay:
         from tgdsl.runtime.xhand1.log.log import Fault
         from tgdsl.runtime.xhand1.log.replay import ReplaySource
         from tgdsl.runtime.xhand1.wire.errors import HandError
-        from tgdsl.view.hand import HandView
+        from tgdsl.view.hand_table import HandView
 
         source = ReplaySource(self.log, speed=self.speed, calibration=calibration_of(self.calibration))
         log = source.log
