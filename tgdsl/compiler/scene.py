@@ -14,8 +14,8 @@ from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.robot import Model
 from tgdsl.plan.plan import Asset, ContactPart, Inputs, SceneFile, contact_sensor_names
-from tgdsl.scene.compare import differing
-from tgdsl.scene.places import ENDINGS, FOLDER_ATTRIBUTES
+from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
+from tgdsl.scene.compare import differing_fields
 from tgdsl.scene.scene import compiled, muted_mujoco, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
@@ -259,9 +259,9 @@ def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
     """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted.
 
     Raises:
-        RobotError: If any field of its compiled model differs: see `compare.differing`.
+        RobotError: If any field of its compiled model differs: see `compare.differing_fields`.
     """
     with muted_mujoco():
         loaded = instrument(model.spec.copy(), inputs).compile()
-    if names := differing(loaded, again, model.is_urdf):
+    if names := differing_fields(loaded, again, model.is_urdf):
         raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")

@@ -15,7 +15,7 @@ from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
-from tgdsl.scene.places import check_scene
+from tgdsl.scene.asset_paths import check_scene
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tensors.devices import device_of, dtype_of

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.module.memory import Memory
 from tgdsl.module.module import TactileModule
-from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import PlannedObject, PlannedPoints, PlannedSensor
 from tgdsl.sensors.noise.lower import quantity
 
@@ -281,7 +281,7 @@ def _gradients(accuracy: Mapping[str, float]) -> str:
 def _observations(touch: TactileModule) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
-        of = f" of {term.reading}" if term.reading not in (None, *QUANTITIES) else ""
+        of = f" of {term.reading}" if term.reading not in (None, *PROPRIOCEPTION) else ""
         what = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
         groups.setdefault(term.group, []).append(what)
     if not groups:

@@ -12,12 +12,12 @@ from pydantic import BaseModel
 
 from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
 from tgdsl.files import find
-from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.schema import yaml
 from tgdsl.schema.document import Spec, document_model
-from tgdsl.schema.faults import read_as
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.schema.unusual import warn_of_unusual
+from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Path, Source
 from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
@@ -122,7 +122,7 @@ def load(
     model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
-    spec = read_as(source, (), model, problems, required)
+    spec = validate(source, (), model, problems, required)
     if spec is None:
         raise SpecError(problems)
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
@@ -157,7 +157,7 @@ def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tupl
     """
     source = _read_file(path, str(path))
     problems = list(source.problems)
-    spec = read_as(source, (), model, problems, required=required)
+    spec = validate(source, (), model, problems, required=required)
     if problems or not isinstance(spec, model):
         raise SpecError(problems)
     return spec, source
@@ -188,12 +188,12 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
         if path is None:
             return None
         try:
-            source, prefix, folder = _read_file(path, _shown(path, loaded, wanted)), (), path.parent
+            source, prefix, folder = _read_file(path, _display_name(path, loaded, wanted)), (), path.parent
         except SpecError as error:
             loaded.problems += error.problems
             return None
         loaded.problems += source.problems
-    spec = read_as(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
+    spec = validate(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
     return LoadedLayout(spec, source, prefix, folder) if isinstance(spec, LayoutSpec) else None
 
 
@@ -216,53 +216,70 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     return None
 
 
-def _shown(path: FilePath, loaded: Loaded, wanted: str | None) -> str:
+def _display_name(path: FilePath, loaded: Loaded, wanted: str | None) -> str:
     """Return the name a layout file has in messages: as the user would type it from where the document's name counts."""
     return str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
 
 
 def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
     """Return references within the document that lead nowhere, and knobs that a kind does not have."""
-    spec, source = loaded.spec, loaded.source
-    problems: list[Problem] = []
-
-    def names(key: str) -> list[str] | None:
-        """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
-        found = source.value.get(key, {})
-        return list(found) if isinstance(found, dict) else None
-
-    objects, sensors = names("objects"), names("sensors") or []
     by_name = {kind.name: kind for kind in kinds}
-    for name, sensor in spec.sensors.items():
-        path: Path = ("sensors", name)
-        for i, target in enumerate(sensor.feels):
-            if objects is not None and target not in objects:
-                hint = did_you_mean(target, objects, "objects")
-                problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
-            elif target in sensor.feels[:i]:
-                problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
+    problems: list[Problem] = []
+    for name, sensor in loaded.spec.sensors.items():
+        problems += _object_problems(loaded, name, sensor.feels)
         problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
-    for name in QUANTITIES.keys() & set(sensors):
+    return problems + _observation_problems(loaded) + _resolution_problems(loaded)
+
+
+def _names(loaded: Loaded, key: str) -> list[str] | None:
+    """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
+    found = loaded.source.value.get(key, {})
+    return list(found) if isinstance(found, dict) else None
+
+
+def _object_problems(loaded: Loaded, sensor: str, feels: tuple[str, ...]) -> list[Problem]:
+    """Return what is wrong with the objects that a sensor feels: unknown ones, and those that are listed twice."""
+    objects, problems = _names(loaded, "objects"), []
+    for i, target in enumerate(feels):
+        path: Path = ("sensors", sensor, "feels", i)
+        if objects is not None and target not in objects:
+            hint = did_you_mean(target, objects, "objects")
+            problems.append(loaded.source.problem(path, f'unknown object "{target}"', hint))
+        elif target in feels[:i]:
+            problems.append(loaded.source.problem(path, f'object "{target}" is listed twice', "name it once"))
+    return problems
+
+
+def _observation_problems(loaded: Loaded) -> list[Problem]:
+    """Return sensors that have the name of a reading that none makes, and observations of sensors that are not there."""
+    source, sensors, problems = loaded.source, _names(loaded, "sensors") or [], []
+    for name in PROPRIOCEPTION.keys() & set(sensors):
         what = f'"{name}" is the name of a reading that no sensor makes'
         problems.append(source.problem(("sensors", name), what, "give the sensor another name", on_key=True))
-    for group in names("observations") or []:
+    for group in _names(loaded, "observations") or []:
         terms = source.get(("observations", group))
         for i, term in enumerate(terms if isinstance(terms, list) else []):
             target = term.get("of") if isinstance(term, dict) else None
             if isinstance(target, str) and target.split("/")[0] not in sensors:
                 hint = did_you_mean(target, sensors, "sensors")
-                if target in QUANTITIES:
+                if target in PROPRIOCEPTION:
                     hint = f"no sensor makes it: {{type: {target}}} observes it"
                 problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
-    if loaded.layout is not None:
-        resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})
-        if loaded.resolution is None and source.get(("resolution",)) is None:
-            hint = f"the layout has {', '.join(resolutions)}"
-            problems.append(source.problem((), 'missing key "resolution"', hint, on_key=True))
-        elif loaded.resolution is not None and loaded.resolution not in resolutions:
-            hint = did_you_mean(loaded.resolution, resolutions, "resolutions")
-            problems.append(source.problem(("resolution",), f'unknown resolution "{loaded.resolution}"', hint))
     return problems
+
+
+def _resolution_problems(loaded: Loaded) -> list[Problem]:
+    """Return that the resolution is not one of the layout's, or that one must be named."""
+    if loaded.layout is None:
+        return []
+    resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})
+    if loaded.resolution is None and loaded.source.get(("resolution",)) is None:
+        hint = f"the layout has {', '.join(resolutions)}"
+        return [loaded.source.problem((), 'missing key "resolution"', hint, on_key=True)]
+    if loaded.resolution is not None and loaded.resolution not in resolutions:
+        hint = did_you_mean(loaded.resolution, resolutions, "resolutions")
+        return [loaded.source.problem(("resolution",), f'unknown resolution "{loaded.resolution}"', hint)]
+    return []
 
 
 def _noise_problems(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kind | None) -> list[Problem]:
