@@ -31,7 +31,7 @@ from tgdsl.plan.plan import (
 )
 from tgdsl.quantities.moments.tables import moment_tables
 from tgdsl.quantities.points.tables import cloud, own_geoms, planned_skin
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind

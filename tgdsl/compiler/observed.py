@@ -15,7 +15,7 @@ from tgdsl.observations import observations
 from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
 from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
 from tgdsl.plan.plan import PlannedObservation, PlannedReading, PlannedSensor
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
 

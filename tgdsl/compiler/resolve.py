@@ -18,7 +18,7 @@ from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.robot import Geom, Model, load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample
-from tgdsl.schema.load import Loaded, LoadedLayout
+from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path

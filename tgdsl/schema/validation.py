@@ -63,7 +63,7 @@ def _is_follow_up(error: ErrorDetails) -> bool:
 def _raw_path(value: Any, error: ErrorDetails, known: Mapping[int, type[BaseModel]]) -> Path:
     """Return the path through the plain value to where pydantic found an error: without the tags of unions, no keys."""
     path: list[str | int] = []
-    location = error["loc"]
+    location: tuple[Any, ...] = error["loc"]
     is_tagged = False
     for i, part in enumerate(location):
         if i == len(location) - 1 and error["type"] in ("missing", "extra_forbidden"):
