@@ -91,7 +91,16 @@ def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S,
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    source = _read_file(path, str(path))
+    return parse_spec(_content(path, str(path)), str(path), model, required)
+
+
+def parse_spec(content: bytes, name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+    """Read what `read_spec` reads from a file's content, whose mistakes then go by a name.
+
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
+    source = _source(content, name)
     problems = list(source.problems)
     spec = validate(source, (), model, problems, required=required)
     if problems or not isinstance(spec, model):
@@ -100,14 +109,23 @@ def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S,
 
 
 def _read_file(path: Path, name: str) -> Source:
+    return _source(_content(path, name), name)
+
+
+def _content(path: Path, name: str) -> bytes:
+    """Return what is in a file, or as much of it as shows that it is too large."""
     try:
         with path.open("rb") as file:
-            content = file.read(yaml.MAX_BYTES + 1)
-        if large := yaml.too_large(content, name):
-            raise SpecError([large])
-        text = content.decode("utf-8")
+            return file.read(yaml.MAX_BYTES + 1)
     except OSError as error:
         raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
+
+
+def _source(content: bytes, name: str) -> Source:
+    if large := yaml.too_large(content, name):
+        raise SpecError([large])
+    try:
+        text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
     source = yaml.parse(text, name)
