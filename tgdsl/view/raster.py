@@ -14,7 +14,7 @@ Array = np.ndarray
 
 
 class Camera(NamedTuple):
-    """An orthographic camera: unit vectors in the world to the image's right, up and toward the viewer; the point at its centre."""
+    """An orthographic camera: world unit vectors to the right and top of its image and to the viewer; the point it looks at."""
 
     right: Float[Array, " 3"]
     up: Float[Array, " 3"]
