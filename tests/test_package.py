@@ -69,6 +69,14 @@ def test_testing_and_version_are_reached_by_importing_tgdsl_alone():
     assert said == ["False", "KindConformance", version("tgdsl")]
 
 
+def test_help_waits_for_nothing_heavy():
+    """All commands are known without what any of them needs to run; no robot, document or module is looked at."""
+    heavy = {"torch", "mujoco", "numpy", "scipy", "pydantic", "ruamel", "matplotlib", "trimesh", "tgdsl.compiler"}
+    said = in_python("import sys, tgdsl.commands.cli; print(*sys.modules)")
+    assert "tgdsl.commands.cli" in said
+    assert not heavy & set(said)
+
+
 def test_the_version_on_the_command_line(here, tmp_path):
     assert here(tmp_path, "--version") == (0, f"tgdsl {version('tgdsl')}\n", "")
 

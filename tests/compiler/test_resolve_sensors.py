@@ -167,7 +167,7 @@ def test_files_that_are_not_there(folder):
 
 def _robots() -> str:
     from tgdsl.errors import did_you_mean
-    from tgdsl.files.files import robot_names
+    from tgdsl.files.find import robot_names
 
     return did_you_mean("hnd.xml", robot_names(), "robots")
 

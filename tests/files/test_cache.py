@@ -1,4 +1,4 @@
-"""The cache has a bound: what was not used for longest goes first, whoever else uses it at the same time."""
+"""The cache has a bound: the least recently used entries go first, whoever else uses it at the same time."""
 
 import os
 import subprocess
@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cache_entries import VALUES, key, value_of
 
 from tgdsl.errors import TgdslError
 from tgdsl.files import cache
 
-VALUES = 1000
-"""Numbers of an entry, 8 bytes each; its file is a little larger."""
+REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -23,26 +23,11 @@ def place(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache"
 
 
-def key(i: int) -> str:
-    return cache.digest(b"test", [np.array(i)])
-
-
-def value_of(i: int, made: list[int] | None = None) -> np.ndarray:
-    """Return entry i from the cache, or make it."""
-
-    def make() -> np.ndarray:
-        if made is not None:
-            made.append(i)
-        return np.full(VALUES, float(i))
-
-    return cache.cached(key(i), make, lambda value: {"value": value}, lambda found: found["value"])
-
-
 def bounded(monkeypatch, count: int) -> int:
     """Bound the cache to so many entries; return the size of one."""
     value_of(-1)
     (entry,) = cache.entries()
-    cache.forget(-1)
+    cache.evict(-1)
     monkeypatch.setenv("TGDSL_CACHE_BYTES", str(count * entry.size))
     return entry.size
 
@@ -56,7 +41,7 @@ def there() -> set[int]:
     return {i for i in range(40) if (cache.folder() / f"{key(i)}.npz").exists()}
 
 
-def test_what_was_not_used_for_longest_goes_first(monkeypatch):
+def test_the_least_recently_used_goes_first(monkeypatch):
     size = bounded(monkeypatch, 4)
     for i in range(4):
         value_of(i)
@@ -77,20 +62,40 @@ def test_what_was_not_used_for_longest_goes_first(monkeypatch):
 def test_other_peoples_files_are_left_alone_and_unfinished_ones_are_not(place, monkeypatch):
     bounded(monkeypatch, 1)
     (place / "mine.npz").write_bytes(bytes(10**6))
-    (place / "notes.tmp").write_bytes(bytes(10**6))
-    old, new = place / f"{key(1)}.abc.tmp", place / f"{key(2)}.abc.tmp"
+    (place / ".notes.npz").write_bytes(bytes(10**6))
+    old, new = place / ".0123456789abcdef.npz", place / ".fedcba9876543210.npz"
     old.write_bytes(bytes(10**6))
     new.write_bytes(bytes(10**6))
     os.utime(old, (1.7e9, 1.7e9))
     value_of(0)
     assert there() == {0}
-    assert {path.name for path in place.iterdir()} == {"mine.npz", "notes.tmp", new.name, f"{key(0)}.npz"}
+    assert {path.name for path in place.iterdir()} == {"mine.npz", ".notes.npz", new.name, f"{key(0)}.npz"}
 
 
 def test_an_entry_larger_than_the_bound_is_not_kept(monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE_BYTES", "100")
     np.testing.assert_array_equal(value_of(3), np.full(VALUES, 3.0))
     assert cache.entries() == []
+
+
+def test_an_entry_is_a_new_file_like_any_other(place):
+    """Several users may share a cache folder; and nothing but the entry is left."""
+    value_of(0)
+    (entry,) = place.iterdir()
+    (place / "plain").touch()
+    assert entry.stat().st_mode == (place / "plain").stat().st_mode
+
+
+def test_an_entry_that_cannot_be_written_is_still_returned(place, monkeypatch):
+    """Half of it was written, say, before the disk was full: nothing is left."""
+
+    def full(file, *_, **__):
+        file.write(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    np.testing.assert_array_equal(value_of(3), np.full(VALUES, 3.0))
+    assert list(place.iterdir()) == []
 
 
 @pytest.mark.parametrize("text", ["2 GB", "-1", "1e9", "x"])
@@ -104,28 +109,28 @@ def test_a_bound_that_is_none(monkeypatch, text):
 
 
 def test_a_file_that_another_process_removes_first_counts_once(monkeypatch):
-    """Two that forget at once take the same files, so that no more goes than must."""
+    """Two that evict at once take the same files, so that no more goes than must."""
     size = bounded(monkeypatch, 40)
     for i in range(10):
         value_of(i)
         used(i, 100.0 - i)
     real: Callable[[], list[cache.Entry]] = cache.entries
 
-    def then_another_forgets() -> list[cache.Entry]:
+    def then_another_evicts() -> list[cache.Entry]:
         found = real()
         monkeypatch.setattr(cache, "entries", real)
-        assert len(cache.forget(6 * size)) == 4
+        assert len(cache.evict(6 * size)) == 4
         return found
 
-    monkeypatch.setattr(cache, "entries", then_another_forgets)
-    assert cache.forget(6 * size) == []
+    monkeypatch.setattr(cache, "entries", then_another_evicts)
+    assert cache.evict(6 * size) == []
     assert there() == {4, 5, 6, 7, 8, 9}
 
 
 PROGRAM = """
 import sys
 sys.path[:0] = sys.argv[1:3]
-from test_cache import VALUES, value_of
+from cache_entries import VALUES, value_of
 import numpy as np
 for turn in range(6):
     for i in range(12):
@@ -136,12 +141,12 @@ for turn in range(6):
 def test_several_processes_at_once(monkeypatch):
     """Each reads what the others write and remove; nobody fails, and what is left is whole and within the bound."""
     size = bounded(monkeypatch, 5)
-    paths = [str(Path(__file__).parent), str(Path(cache.__file__).parents[2])]
+    paths = [str(REPOSITORY / "tests" / "helpers"), str(REPOSITORY)]
     running = [subprocess.Popen([sys.executable, "-c", PROGRAM, *paths], stderr=subprocess.PIPE) for _ in range(3)]
     for process in running:
         _, errors = process.communicate()
         assert process.returncode == 0, errors.decode()
-    cache.forget(cache.max_bytes())
+    cache.evict(cache.max_bytes())
     assert sum(entry.size for entry in cache.entries()) <= 5 * size
     for i in there():
         made: list[int] = []

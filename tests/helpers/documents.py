@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from tgdsl.errors import SpecError
-from tgdsl.schema.load import Loaded, load
+from tgdsl.schema.load import load
+from tgdsl.schema.loaded import Loaded
 
 DOCUMENT = """\
 tgdsl: 1

@@ -2,10 +2,10 @@
 
 import numpy as np
 import torch
-from tgdsl.formats.usd.export.writer import export_usd
 from warp_cases import warp
 
 import tgdsl
+from tgdsl.formats.robot import export_model
 
 G = 9.81
 LOAD = 0.3 * G
@@ -22,7 +22,7 @@ def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", as
     )
     model = folder / ("scene.usda" if as_usd else "scene.xml")
     if as_usd:
-        export_usd(folder / "scene.xml", model)
+        export_model(folder / "scene.xml", model)
     line = np.linspace(-0.025, 0.025, 6)
     points = [{"pos": [float(x), float(y), 0.01], "normal": [0, 0, 1], "radius": 0.004} for x in line for y in line]
     layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}

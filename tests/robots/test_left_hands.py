@@ -7,7 +7,7 @@ import trimesh
 from mirrored_hands import EXACT, ROBOTS, check_dynamics, check_frames, check_meshes, check_taxels, mirror, posed, reflection
 
 from tgdsl.compiler.resolve import resolve
-from tgdsl.files.files import layout_file, robot_names
+from tgdsl.files.find import layout_file, robot_names
 from tgdsl.schema.load import load
 
 HANDS = {

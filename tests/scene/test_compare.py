@@ -16,7 +16,7 @@ from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.plan.inputs import Inputs
 from tgdsl.quantities.pairs import Pair
-from tgdsl.scene.compare import PLACES, differing
+from tgdsl.scene.compare import PATH_FIELDS, differing_fields
 from tgdsl.scene.scene import compiled, scene_model
 
 NOTHING = Inputs((), (), (), {}, 0)
@@ -132,7 +132,7 @@ def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(ri
         if other is None:
             continue
         tried.append(name)
-        assert differing(model, other) == ([] if name in PLACES else SHARED.get(name, [name]))
+        assert differing_fields(model, other) == ([] if name in PATH_FIELDS else SHARED.get(name, [name]))
     assert {"opt.timestep", "opt.cone", "stat.extent", "vis.map.znear", "geom_solimp", "actuator_gear", "site_pos"} <= {*tried}
     assert {name.split("_")[0] for name in tried} >= {"tendon", "eq", "sensor", "mat", "tex", "light", "cam", "hfield", "flex"}
     assert len(tried) > 450, "nearly all of them"
@@ -141,9 +141,9 @@ def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(ri
 def test_nothing_of_mujocos_model_is_left_out(rich):
     """Counts, which cannot be changed, and the bytes of names are compared in models that have other ones."""
     empty = mujoco.MjModel.from_xml_string("<mujoco model='none'><option timestep='.1'/></mujoco>")
-    found = {*differing(rich.compiled, empty)}
+    found = {*differing_fields(rich.compiled, empty)}
     alike = {name for name in FIELDS if np.array_equal(*(getattr(*owner_of(m, name)) for m in (rich.compiled, empty)))}
-    assert {*FIELDS} - found == alike | {name for name in FIELDS if name in PLACES}
+    assert {*FIELDS} - found == alike | {name for name in FIELDS if name in PATH_FIELDS}
     assert found >= {"names", "nbody", "ngeom", "text_data", "signature"}
 
 
@@ -155,9 +155,9 @@ def test_a_rich_scene_is_kept_to_the_last_bit(rich, wanted, has_objects):
     own = OwnObjects(bodies=bodies if has_objects else ())
     scene = with_bodies(rich, own.bodies)
     expected = instrument(scene.spec.copy(), wanted).compile()
-    assert differing(expected, scene_model(scene_file(scene, wanted, own))) == []
+    assert differing_fields(expected, scene_model(scene_file(scene, wanted, own))) == []
     same = [name for name in FIELDS if not name.startswith(("sensor", "name", "nname", "nsensor", "signature"))]
-    assert not {*differing(scene.compiled, expected)} & {*same}, "sensors alone were added"
+    assert not {*differing_fields(scene.compiled, expected)} & {*same}, "sensors alone were added"
 
 
 CASES = {
@@ -204,12 +204,12 @@ def test_urdf_is_kept_to_the_digits_that_mujoco_writes(tmp_path):
     (tmp_path / "hand.urdf").write_text(URDF)
     loaded = load_model(tmp_path / "hand.urdf")
     kept = scene_model(scene_file(loaded, NOTHING))
-    assert {"geom_pos", "jnt_range"} <= {*differing(loaded.compiled, kept)}, "six digits of nine"
-    assert differing(loaded.compiled, kept, is_rounded=True) == []
+    assert {"geom_pos", "jnt_range"} <= {*differing_fields(loaded.compiled, kept)}, "six digits of nine"
+    assert differing_fields(loaded.compiled, kept, is_rounded=True) == []
     for name in ("opt.timestep", "geom_solimp", "jnt_range", "dof_damping", "geom_contype"):
         owner, last = owner_of(other := copy.copy(kept), name)
         setattr(owner, last, getattr(owner, last) * 1.001 + 1)
-        assert differing(loaded.compiled, other, is_rounded=True) == [name]
+        assert differing_fields(loaded.compiled, other, is_rounded=True) == [name]
 
 
 DOCUMENT = """
@@ -229,5 +229,5 @@ def test_what_is_saved_and_loaded_again_is_the_scene_with_its_sensors(rich, tmp_
     for file in ("scene.xml", "hand.xml", "hand.yaml"):
         Path(tmp_path / file).unlink()
     again = scene_model(load_plan(tmp_path / "hand.safetensors").scene)
-    assert differing(instrument(rich.spec.copy(), plan.inputs).compile(), again) == []
+    assert differing_fields(instrument(rich.spec.copy(), plan.inputs).compile(), again) == []
     assert again.nsensor > rich.compiled.nsensor

@@ -10,7 +10,7 @@ from documents import DOCUMENT, LAYOUT, POISSON, read, valid
 from wrong import WRONG, WRONG_LAYOUT
 
 from tgdsl.errors import SpecError
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.schema import yaml
 from tgdsl.schema.document import json_schema
 from tgdsl.schema.load import load
@@ -96,13 +96,13 @@ def places(schema: dict[str, Any], value: Any, path: yaml.Path = ()) -> set[str]
             part = wanted if key == "additionalProperties" else next(iter(wanted.values()))
             found |= {place for k, v in value.items() if k not in known for place in places(part, v, (*path, k))}
         elif key == "additionalProperties":
-            found |= {yaml.spelled((*path, k)) for k in value if k not in schema.get("properties", {})}
+            found |= {yaml.path_text((*path, k)) for k in value if k not in schema.get("properties", {})}
         elif key in ("items", "prefixItems"):
             parts = [wanted] * len(value) if key == "items" else wanted
             pairs = zip(parts, value, strict=False)
             found |= {place for i, (part, v) in enumerate(pairs) for place in places(part, v, (*path, i))}
         else:
-            found.add(yaml.spelled(path))
+            found.add(yaml.path_text(path))
     return found
 
 

@@ -7,7 +7,7 @@ import pytest
 from documents import DOCUMENT, LAYOUT, POISSON, valid, write
 
 from tgdsl.fields import units
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.propose.text import new_layout
 from tgdsl.schema.load import load

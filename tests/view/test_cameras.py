@@ -10,11 +10,13 @@ import torch
 import tgdsl
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.rollout import held_controls, rollout
-from tgdsl.view.cameras import VIEWS, ViewError, angles_of, best_camera, camera_of
-from tgdsl.view.dots import Dots, Pose, dots_of, touched
-from tgdsl.view.shot import Camera, camera_for, solid_of
+from tgdsl.view.cameras import VIEWS, ViewError, angles_of, best_camera, camera_of, facing_camera
+from tgdsl.view.markers import Markers, markers_of, touched
+from tgdsl.view.meshes import mesh_of
+from tgdsl.view.picture import picture
+from tgdsl.view.raster import Camera
 from tgdsl.view.table import table
-from tgdsl.view.view import picture
+from tgdsl.view.taxels import Pose
 
 FINGER = """
 <mujoco>
@@ -47,42 +49,42 @@ def finger(folder: Path, side: list[float]) -> tuple[tgdsl.TactileModule, BatchS
     return touch, tgdsl.simulate(touch, 1)
 
 
-def in_view(sim: BatchSimulation, dots: Dots, camera: Camera) -> int:
+def in_view(sim: BatchSimulation, markers: Markers, camera: Camera) -> int:
     """Return how many taxels MuJoCo's rays to the camera reach; the ball hides nothing."""
     state = mujoco.MjData(sim.model)
     mujoco.mj_forward(sim.model, state)
     ball, count = sim.model.body("ball").id, 0
-    for start, normal in zip(dots.pos + 1e-6 * dots.normal, dots.normal, strict=True):
+    for start, normal in zip(markers.pos + 1e-6 * markers.normal, markers.normal, strict=True):
         hit = mujoco.mj_ray(sim.model, state, start, camera.toward, None, 1, ball, np.zeros(1, dtype=np.int32))
         count += hit < 0 and normal @ camera.toward > 0
     return count
 
 
-def cameras(touch, sim) -> tuple[Dots, Camera, Camera]:
+def cameras(touch, sim) -> tuple[Markers, Camera, Camera]:
     """Return the taxels, the camera that these face, and the one that is chosen."""
     state = sim.state()
-    dots = dots_of(touch, sim, touch.outputs[0], touch(state)["depth"], 0)
+    markers = markers_of(touch, sim, touch.outputs[0], touch(state)["depth"], 0)
     pose, palm = Pose(*sim.body_poses(0)), sim.model.body("palm").id
-    hand = solid_of(sim.model, pose, {palm, sim.model.body("tip").id})
-    chosen = best_camera(dots, hand, sim.model, touch.plan.layout, pose, palm)
-    return dots, camera_for(dots, pose.pos[palm]), chosen
+    hand = mesh_of(sim.model, pose, {palm, sim.model.body("tip").id})
+    chosen = best_camera(markers, hand, sim.model, touch.plan.layout, pose, palm)
+    return markers, facing_camera(markers, pose.pos[palm]), chosen
 
 
 def test_a_fingertip_is_not_drawn_from_behind(tmp_path):
     touch, sim = finger(tmp_path, [1, 0, 0])
     sim.batch.qpos[:, 1] += 0.5  # nothing is touched: all taxels count
     sim.step()
-    dots, first, chosen = cameras(touch, sim)
-    assert in_view(sim, dots, first) == 0
+    markers, first, chosen = cameras(touch, sim)
+    assert in_view(sim, markers, first) == 0
     layout, pose = touch.plan.layout, Pose(*sim.body_poses(0))
-    most = max(in_view(sim, dots, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
-    assert in_view(sim, dots, chosen) >= max(most, 1)
+    most = max(in_view(sim, markers, camera_of(view, sim.model, [layout], pose, 1)) for view in VIEWS)
+    assert in_view(sim, markers, chosen) >= max(most, 1)
 
 
 def test_a_view_that_shows_enough_is_kept(tmp_path):
     touch, sim = finger(tmp_path, [-1, 0, 0])
-    dots, first, chosen = cameras(touch, sim)
-    assert in_view(sim, dots, first) == len(dots.pos)
+    markers, first, chosen = cameras(touch, sim)
+    assert in_view(sim, markers, first) == len(markers.pos)
     for part, expected in zip(chosen, first, strict=True):
         np.testing.assert_array_equal(part, expected)
 
@@ -90,10 +92,10 @@ def test_a_view_that_shows_enough_is_kept(tmp_path):
 def test_taxels_that_are_touched_count_first(tmp_path):
     touch, sim = finger(tmp_path, [1, 0, 0])
     sim.step()
-    dots, _, chosen = cameras(touch, sim)
-    assert 0 < dots.is_read.sum() < len(dots.pos)
-    own = Dots(*(getattr(dots, name)[dots.is_read] for name in ("pos", "normal", "size", "value")), "depth", "mm")
-    assert in_view(sim, own, chosen) == dots.is_read.sum()
+    markers, _, chosen = cameras(touch, sim)
+    assert 0 < markers.is_read.sum() < len(markers.pos)
+    own = Markers(*(getattr(markers, name)[markers.is_read] for name in ("pos", "normal", "size", "value")), "depth", "mm")
+    assert in_view(sim, own, chosen) == markers.is_read.sum()
 
 
 @pytest.mark.parametrize(
@@ -182,7 +184,7 @@ def test_noise_is_not_touched(tmp_path, more, env):
     assert found is not None
     assert (found | ~under).all() if env == 0 else not found.any()
     assert not (found & ~near).any()
-    assert dots_of(touch, sim, output, last.readings["touch"], env).is_read.sum() > found.sum()
+    assert markers_of(touch, sim, output, last.readings["touch"], env).is_read.sum() > found.sum()
 
 
 def test_without_noise_what_reads_is_touched(tmp_path):
@@ -190,7 +192,7 @@ def test_without_noise_what_reads_is_touched(tmp_path):
     sim.step()
     readings = touch(sim.state())
     assert touched(touch, sim, touch.outputs[0], readings, 0) is None
-    assert dots_of(touch, sim, touch.outputs[0], readings["touch"], 0).is_touched.any()
+    assert markers_of(touch, sim, touch.outputs[0], readings["touch"], 0).is_touched.any()
 
 
 def test_table_and_picture_sum_alike(tmp_path):
@@ -198,12 +200,12 @@ def test_table_and_picture_sum_alike(tmp_path):
     touch, sim = pad(tmp_path)
     sim.step()
     force = torch.randn(2, 36, 3, generator=torch.Generator().manual_seed(1)).double() + torch.tensor([0, 0, -1.0])
-    dots = dots_of(touch, sim, touch.outputs[0], force, 0)
+    markers = markers_of(touch, sim, touch.outputs[0], force, 0)
     expected = force[0].sum(dim=0).norm().item()
-    assert dots.summary() == f"|Σ| {expected:.3g} N · max {force[0].norm(dim=-1).max().item():.2g} N"
-    assert dots.headline.startswith(f"|Σ force| {expected:.3g} N")
+    assert markers.summary() == f"|Σ| {expected:.3g} N · max {force[0].norm(dim=-1).max().item():.2g} N"
+    assert markers.headline.startswith(f"|Σ force| {expected:.3g} N")
     assert table(touch, {"touch": force})[2].split()[1] == f"{expected:.3f}"
-    small = dots_of(touch, sim, touch.outputs[0], 1e-4 * force, 0)
+    small = markers_of(touch, sim, touch.outputs[0], 1e-4 * force, 0)
     assert small.summary().startswith(f"|Σ| {0.1 * expected:.3g} mN")
 
 

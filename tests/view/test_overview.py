@@ -7,9 +7,9 @@ from matplotlib.quiver import Quiver
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.view.dots import dots_of
+from tgdsl.view.cameras import ViewError
+from tgdsl.view.markers import markers_of
 from tgdsl.view.overview import drawing, overview
-from tgdsl.view.view import ViewError
 
 SCENE = """
 <mujoco><worldbody>
@@ -48,13 +48,13 @@ def test_arrows_are_the_vectors_in_the_plane_of_the_picture(scene):
     assert [axes.get_title("left").split()[0] for axes in figure.axes] == ["force", "depth"]
     (arrows,) = [part for part in figure.axes[0].collections if isinstance(part, Quiver)]
     assert not any(isinstance(part, Quiver) for part in figure.axes[1].collections)
-    dots = dots_of(touch, sim, touch.outputs[0], readings["force"], 1)
+    markers = markers_of(touch, sim, touch.outputs[0], readings["force"], 1)
     world = Rotation.from_euler("XYZ", [20, 30, 40], degrees=True).apply(force[1])
-    np.testing.assert_allclose(dots.vector, world, atol=1e-12)
+    np.testing.assert_allclose(markers.vector, world, atol=1e-12)
     # Pixels are a linear map of the plane of the pad: fit it to the taxels' places, and apply it to the vectors.
     read = np.arange(6) != 4
     at, drawn = np.column_stack([arrows.X, arrows.Y]), np.column_stack([arrows.U, arrows.V])
-    to_pixels = np.linalg.lstsq(np.column_stack([dots.pos[read], np.ones(5)]), at, rcond=None)[0][:3]
+    to_pixels = np.linalg.lstsq(np.column_stack([markers.pos[read], np.ones(5)]), at, rcond=None)[0][:3]
     expected = world[read] @ to_pixels
     np.testing.assert_allclose(drawn / np.linalg.norm(drawn), expected / np.linalg.norm(expected), atol=1e-9)
 

@@ -13,9 +13,9 @@ from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
-from tgdsl.view.discs import discs, group_of, legend, radii, taxels_of
-from tgdsl.view.dots import Pose
+from tgdsl.view.discs import discs, group_of, legend, radii
 from tgdsl.view.render import FEWEST, HEIGHT, drawing, render
+from tgdsl.view.taxels import Pose, taxels_of
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 
 from tgdsl.calibrate.fit import FingerFit, FitError
 from tgdsl.calibrate.loads import Samples
-from tgdsl.files.files import whole
+from tgdsl.files.write import atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS
-from tgdsl.view.view import DPI, FAINT, INK
+from tgdsl.view.style import DPI, FAINT, INK
 
 AXIS_COLOURS = ("#c8553d", "#588157", "#3d5a80")
 _PANEL = (3.6, 5.4)
@@ -83,7 +83,7 @@ def picture(fits: Mapping[str, FingerFit], path: Path, title: str) -> Path:
         title: What to write above it all.
     """
     figure = drawing(fits, title)
-    with whole(path) as file:
+    with atomic_open(path) as file:
         figure.savefig(file, format="png")
     return path
 

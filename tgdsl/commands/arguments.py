@@ -1,4 +1,4 @@
-"""What commands take: documents and artefacts, robots, and values to override."""
+"""What commands share: kinds of argument, each with its help, and what becomes of documents, robots, overrides and outputs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,32 @@ import tyro
 
 from tgdsl.console.progress import Progress
 from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.files.write import check_writable
 
 if TYPE_CHECKING:
     from tgdsl.module.module import TactileModule
 
-Overrides = Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="KEY=VALUE"), tyro.conf.UseAppendAction]
-Document = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
+FILE = tyro.conf.arg(metavar="FILE")
+"""Marks the path of a file."""
+OUT = tyro.conf.arg(aliases=["-o"], metavar="FILE")
+"""Marks the path of the file that a command writes."""
+OptionalFile = Annotated[Path | None, FILE]
+Document = Annotated[tyro.conf.Positional[Path], FILE]
+DocumentOrArtefact = Annotated[Document, tyro.conf.arg(help="The YAML document, or an artefact (.safetensors).")]
+Robot = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(help="A file (MJCF, URDF, USD), or the name of a robot that tgdsl brings.", metavar="ROBOT"),
+]
+Replace = Annotated[bool, tyro.conf.arg(help="Replace the file if it is there.")]
+Overrides = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        name="set",
+        help="Override a value of the document, as in `--set resolution=high`; may be repeated.",
+        metavar="KEY=VALUE",
+    ),
+    tyro.conf.UseAppendAction,
+]
 
 
 def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
@@ -23,7 +43,7 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
     Raises:
         TgdslError: If it names nothing, or a robot that comes without a layout.
     """
-    from tgdsl.files.files import is_file, layout_file, robot_names
+    from tgdsl.files.find import is_file, layout_file, robot_names
 
     path, names = Path(hand), robot_names()
     if path.suffix in (".yaml", ".yml"):
@@ -69,3 +89,19 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
             raise TgdslError("an artefact cannot be overridden; compile the document with --set instead")
         return load(document)
     return compile(document, overrides=parsed_overrides(overrides), progress=progress)
+
+
+def in_working_folder(source: str | Path, suffix: str) -> Path:
+    """Return what a command writes by default: the name of what it is made from, with another ending, in the working folder."""
+    return Path(Path(source).with_suffix(suffix).name)
+
+
+def refuse_to_replace(out: Path, is_forced: bool) -> None:
+    """Raise an error if a file cannot be written, or is there and may not be replaced.
+
+    Raises:
+        TgdslError: If so.
+    """
+    if out.is_file() and not is_forced:
+        raise TgdslError(f"{out}: this file is there already; give --force to replace it, or another name")
+    check_writable(out)

@@ -1,4 +1,4 @@
-"""The command on what is kept of earlier compilations."""
+"""`tgdsl cache`: what is kept of earlier compilations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Cache:
         from tgdsl.files import cache
 
         if self.clear:
-            removed = cache.forget(-1)
+            removed = cache.evict(-1)
             print(f"{cache.folder()}: removed {_counted([entry.size for entry in removed])}")
             return
         limit = cache.max_bytes()

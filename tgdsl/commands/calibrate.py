@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from tgdsl.commands.hand import CalibrationFile, refuse_to_replace
+from tgdsl.commands.arguments import FILE, OUT, OptionalFile, module_of, refuse_to_replace
 from tgdsl.errors import TgdslError
-from tgdsl.files.files import with_folder, write_whole
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from tgdsl.calibrate.loads import Load, Samples, TipRecord
 
 Finger = Literal["thumb", "index", "middle", "ring", "pinky"]
-File = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 Intervals = Annotated[
     tuple[tuple[float, float, float, float, float], ...],
     tyro.conf.UseAppendAction,
@@ -34,17 +32,17 @@ class Calibrate:
     """What to calibrate."""
     log: Annotated[Path, tyro.conf.arg(metavar="LOG.npz")]
     """A log of `tgdsl hand record`."""
-    loads: File = None
+    loads: OptionalFile = None
     """Known loads: a YAML file of intervals and forces."""
     finger: Finger | None = None
     """The finger that --load is about."""
     load: Intervals = ()
     """A known load instead: from when to when after the log's first reading [s], and the force on the fingertip along its
     link's axes [N]; to be repeated for each, one of them 0 0 0."""
-    simulation: File = None
+    simulation: OptionalFile = None
     """Forces over time instead: readings.npz of `tgdsl run` (then with --document and --reading), or any .npz with `time` and
     `tip_force` (step, finger, 3) [N]."""
-    document: File = None
+    document: OptionalFile = None
     """The document, or artefact, that was run."""
     reading: str = "touch"
     """Its reading whose forces (or depths) count."""
@@ -58,13 +56,13 @@ class Calibrate:
     """Keep the calibration's tare instead of fitting it; then no load of 0 0 0 is needed."""
     ignore_taxels: tuple[int, ...] = ()
     """Numbers of taxels that do not count as saturated, because they always are."""
-    calibration: CalibrationFile = None
+    calibration: OptionalFile = None
     """The calibration to start from; default: the log's."""
     others: Finger | None = None
     """Give fingers that no load was on the scale and rotation of this one."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = Path("hand.calibration.yaml")
+    out: Annotated[Path, OUT] = Path("hand.calibration.yaml")
     """The calibration file to write."""
-    plot: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("hand.calibration.png")
+    plot: Annotated[Path, FILE] = Path("hand.calibration.png")
     """The picture to write: fitted over known forces."""
     force: bool = False
     """Replace the files if they are there."""
@@ -74,6 +72,7 @@ class Calibrate:
         from tgdsl.calibrate.fit import FitError, fit_finger
         from tgdsl.calibrate.loads import TipRecord
         from tgdsl.calibrate.report import calibrated, fit_text, picture, report
+        from tgdsl.files.write import atomic_write, with_folder
         from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
         from tgdsl.runtime.xhand1.log.log import open_log
         from tgdsl.runtime.xhand1.wire.payloads import FINGERS
@@ -95,7 +94,7 @@ class Calibrate:
         notes = [f"# {name}: fitted to {self.log.name}; {fit_text(fit)}\n" for name, fit in fits.items()]
         origin = f"scale and rotation are those of {self.others}" if self.others else "as in the calibration before"
         notes += [f"# {name}: not loaded; {origin}\n" for name in FINGERS if name not in fits]
-        write_whole(with_folder(self.out), ("".join(notes) + result.text()).encode())
+        atomic_write(with_folder(self.out), ("".join(notes) + result.text()).encode())
         print(f"calibration: {self.out}")
         print(f"picture:     {picture(fits, with_folder(self.plot), f'{self.log.name}: fingertip forces')}")
 
@@ -149,7 +148,6 @@ class Calibrate:
 
     def _known_forces(self, path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         from tgdsl.calibrate.loads import known_tip_forces, simulated_tip_forces
-        from tgdsl.commands.arguments import module_of
 
         if self.document is None:
             return known_tip_forces(path)

@@ -1,4 +1,4 @@
-"""Commands that draw: `tgdsl run` and `tgdsl render`."""
+"""`tgdsl run`: a document's scene, stepped and shown."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import Document, Overrides, module_of, parsed_overrides, robot_document
+from tgdsl.commands.arguments import DocumentOrArtefact, OptionalFile, Overrides, module_of
 from tgdsl.console.progress import StatusLine
-from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
-    import mujoco
     from torch import Tensor
 
-    from tgdsl.layout.layout import Layout
     from tgdsl.module.module import TactileModule
     from tgdsl.runtime.rollout import Controls, Recorder
     from tgdsl.runtime.source import Simulator
@@ -28,14 +25,13 @@ _FILES = {"readings": "npz", "picture": "png", "overview": "png"}
 class Run:
     """Step a document's scene on the CPU, show what is felt, and write readings and a picture."""
 
-    document: Document
-    """The YAML document, or an artefact (.safetensors)."""
+    document: DocumentOrArtefact
     keyframes: tuple[str, ...] | None = None
     """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start. Default: rest and
     squeeze if the scene has them, else its initial state is held."""
     seconds: float = 1.0
     """Duration of each hold and of each move between keyframes [s]."""
-    controls: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    controls: OptionalFile = None
     """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator) or (step, env, actuator)."""
     num_envs: int = 1
     """Environments; the table and the picture show the first."""
@@ -49,17 +45,16 @@ class Run:
     """From where the pictures are seen: front (what the taxels face), back, left, right, top (from beyond the fingertips),
     bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of what is touched."""
     set: Overrides = ()
-    """Override a value of the document, as in `--set resolution=high`; may be repeated."""
 
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
-        from tgdsl.files.files import with_folder, writable
+        from tgdsl.files.write import check_writable, with_folder
         from tgdsl.runtime.rollout import Recorder
         from tgdsl.view.cameras import angles_of
 
         if self.view is not None:
             angles_of(self.view)
-        files = {name: writable(self.out / f"{name}.{ending}") for name, ending in _FILES.items()}
+        files = {name: check_writable(self.out / f"{name}.{ending}") for name, ending in _FILES.items()}
         with StatusLine() as progress:
             touch = module_of(self.document, self.set, progress)
             if self.compiled:
@@ -92,8 +87,9 @@ class Run:
         """Make all steps, and return the last readings."""
         from tqdm import tqdm
 
+        from tgdsl.console.live import LiveTable
         from tgdsl.runtime.rollout import rollout
-        from tgdsl.view.table import LiveTable, table
+        from tgdsl.view.table import table
 
         live, readings = LiveTable(), {}
         what = "compiling kernels" if self.compiled else "stepping"
@@ -109,7 +105,7 @@ class Run:
 
     def _draw(self, touch: TactileModule, sim: Simulator, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
         from tgdsl.view.overview import overview
-        from tgdsl.view.view import picture
+        from tgdsl.view.picture import picture
 
         drawn = []
         with StatusLine() as progress:
@@ -122,50 +118,3 @@ class Run:
                 path = overview(touch, sim, readings, files["overview"], title=self.document.stem, view=self.view)
                 drawn.append(f"overview: {path}")
         print("\n".join(drawn))
-
-
-@dataclass(frozen=True)
-class Render:
-    """Draw a hand and its taxels: a panel per resolution, coloured by link group. Nothing is simulated."""
-
-    hand: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="HAND")]
-    """A YAML document, an artefact (.safetensors), the name of a robot, such as `xhand1`, or a robot's file."""
-    layout: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Layout of a robot; default: its own, which lies beside it."""
-    resolutions: tuple[str, ...] = ()
-    """Resolutions to draw; default: the document's own, or all of the layout."""
-    keyframe: str | None = None
-    """Keyframe that gives the pose; default: the model's own initial state."""
-    view: str = "front"
-    """From where: front (what the taxels face), back, left, right, top, bottom, iso, or AZIMUTH,ELEVATION in degrees."""
-    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="WIDTH HEIGHT")] = None
-    """Pixels of the picture; default: 750 rows, and as many columns as the hand needs."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
-    """The picture; default: the hand's name with the ending .png, in the working folder."""
-    set: Overrides = ()
-    """Override a value of the document, as in `--set resolution=high`; may be repeated."""
-
-    def run(self) -> None:
-        """Draw, write and say how many taxels there are."""
-        from tgdsl.view.render import render
-
-        out = self.out or Path(Path(self.hand).with_suffix(".png").name)
-        model, layouts = self._layouts()
-        path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size)
-        print(", ".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
-        print(f"picture: {path}")
-
-    def _layouts(self) -> tuple[mujoco.MjModel, dict[str, Layout]]:
-        """Return the model and the layouts to draw by resolution: an artefact's own, or those that its document would have."""
-        if not self.hand.endswith(".safetensors"):
-            from tgdsl.compiler.pipeline import layouts
-
-            return layouts(robot_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions)
-        from tgdsl.module.artifact import load_plan
-        from tgdsl.scene.scene import scene_model
-
-        plan = load_plan(self.hand)
-        resolution = plan.origin.resolution
-        if self.set or self.layout or set(self.resolutions) - {resolution}:
-            raise TgdslError(f'an artefact has the layout and resolution it was compiled with, "{resolution}", and no other')
-        return scene_model(plan.scene), {resolution: plan.layout}

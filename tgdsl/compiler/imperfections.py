@@ -11,7 +11,7 @@ from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import LowerError
 from tgdsl.fields.models import Selection
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.select import select
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Lowered, SensorSpec

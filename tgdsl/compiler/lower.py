@@ -29,7 +29,7 @@ from tgdsl.plan.sensors import (
     PlannedSensor,
 )
 from tgdsl.quantities.base import Planning, Quantity, Request
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Channel, body_axis

@@ -14,7 +14,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Lowered, SensorSpec, body_axis, taxel_axis

@@ -10,7 +10,7 @@ from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, v
 from tgdsl.errors import did_you_mean
 from tgdsl.formats.model import Model
 from tgdsl.plan.scene import SceneObject
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.sensed import SensedObject
 

@@ -13,9 +13,9 @@ from tgdsl.formats.joints import RobotJoints, robot_joints
 from tgdsl.layout.layout import Layout
 from tgdsl.observations import observations
 from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
-from tgdsl.observations.proprioception import QUANTITIES, JointObservation, JointSpec
+from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
 from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
-from tgdsl.schema.load import Loaded
+from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.schema.yaml import Path
 
@@ -58,7 +58,7 @@ def observed(
     for group, i, spec in specs:
         if isinstance(spec, JointObservation):
             chosen[group, i] = _rows(loaded, ("observations", group, i), spec, own)
-            asked[QUANTITIES[spec.type].rows].update(chosen[group, i])
+            asked[PROPRIOCEPTION[spec.type].rows].update(chosen[group, i])
     joints = tuple(name for name in own.joints if name in asked["joint"])
     actuators = tuple(actuator.name for actuator in own.actuators if actuator.name in asked["actuator"])
     found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
@@ -67,7 +67,7 @@ def observed(
         if isinstance(spec, OfReading):
             terms += _of_reading(loaded, group, i, spec, found)
         elif isinstance(spec, JointObservation):
-            rows = joints if QUANTITIES[spec.type].rows == "joint" else actuators
+            rows = joints if PROPRIOCEPTION[spec.type].rows == "joint" else actuators
             terms.append(_of_joints(group, i, spec, chosen[group, i], rows))
         else:
             count = observations.HAND_ONLY.get(spec.type, 0)
@@ -122,7 +122,7 @@ def _channels(loaded: Loaded, path: Path, spec: ReadingObservation, reading: Pla
 
 def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tuple[str, ...]:
     """Return the joints, or for a `last_action` the actuators, that an observation is of, in its order."""
-    is_of_joints = QUANTITIES[spec.type].rows == "joint"
+    is_of_joints = PROPRIOCEPTION[spec.type].rows == "joint"
     wanted: dict[str, None] = {}
     if spec.joints is None:
         names = own.joints[: own.num_actuated] if is_of_joints else tuple(actuator.name for actuator in own.actuators)
@@ -159,11 +159,11 @@ def _matched(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list
 def _proprioception(
     types: Collection[str], joints: Sequence[str], actuators: Sequence[str], own: RobotJoints
 ) -> tuple[PlannedReading, ...]:
-    """Return the readings of joints and actuators that are observed, in the order of `QUANTITIES`."""
+    """Return the readings of joints and actuators that are observed, in the order of `PROPRIOCEPTION`."""
     num_rows = {"joint": len(joints), "actuator": len(actuators)}
     is_slide = [name in own.slides for name in joints]
     readings = []
-    for name, quantity in QUANTITIES.items():
+    for name, quantity in PROPRIOCEPTION.items():
         if name in types:
             hinge, slide = quantity.units
             unit = hinge if hinge == slide or not any(is_slide) else slide if all(is_slide) else f"{hinge} or {slide}"

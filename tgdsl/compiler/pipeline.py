@@ -23,7 +23,8 @@ from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
-from tgdsl.schema.load import Loaded, load
+from tgdsl.schema.load import load
+from tgdsl.schema.loaded import Loaded
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tensors.devices import device_of, dtype_of

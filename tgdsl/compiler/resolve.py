@@ -13,12 +13,12 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection, SpecModel
 from tgdsl.fields.regions import OnGeoms, RegionPart
-from tgdsl.files.files import is_file, robot_names
+from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.sample.sample import Samples, sample
-from tgdsl.schema.load import Loaded, LoadedLayout
+from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path

@@ -15,8 +15,8 @@ from tgdsl.errors import RobotError, listed
 from tgdsl.formats.model import Model
 from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
 from tgdsl.plan.scene import Asset, SceneFile
-from tgdsl.scene.compare import differing
-from tgdsl.scene.places import ENDINGS, FOLDER_ATTRIBUTES
+from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
+from tgdsl.scene.compare import differing_fields
 from tgdsl.scene.scene import compiled, muted_mujoco, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
@@ -260,9 +260,9 @@ def _compare(model: Model, inputs: Inputs, again: mujoco.MjModel) -> None:
     """Refuse a kept scene that is not the loaded one with the contact sensors that are wanted.
 
     Raises:
-        RobotError: If any field of its compiled model differs: see `compare.differing`.
+        RobotError: If any field of its compiled model differs: see `compare.differing_fields`.
     """
     with muted_mujoco():
         loaded = instrument(model.spec.copy(), inputs).compile()
-    if names := differing(loaded, again, model.is_urdf):
+    if names := differing_fields(loaded, again, model.is_urdf):
         raise RobotError(f"{model.file}: this scene cannot be kept faithfully: in MuJoCo's model {listed(names)} would differ")

@@ -11,7 +11,7 @@ from pathlib import Path
 import mujoco
 
 from tgdsl.errors import RobotError
-from tgdsl.files.files import is_file
+from tgdsl.files.find import is_file
 from tgdsl.formats.model import Model
 from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
 from tgdsl.quantities.geoms.baking import aligned

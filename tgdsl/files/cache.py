@@ -1,7 +1,7 @@
 """What takes long to compute, kept as arrays in the user's cache folder under a hash of what it was computed from.
 
-The folder has a bound: what was not used for longest goes first. Several processes may use it at once: files appear whole and
-go whole, whoever has one open reads it to its end, and all forget files in the same order.
+The folder has a bound: the least recently used files go first. Several processes may use it at once: files appear whole and go
+whole, whoever has one open reads it to its end, and all evict files in the same order.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import os
 import re
-import tempfile
 import time
 import zipfile
 import zlib
@@ -21,13 +20,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from tgdsl.errors import TgdslError
+from tgdsl.errors import FileError, TgdslError
+from tgdsl.files.write import TEMPORARY, atomic_open, with_folder
 
 T = TypeVar("T")
 MAX_BYTES = 2 * 2**30
 """Size that the folder is kept to, if `TGDSL_CACHE_BYTES` gives no other."""
 _ENTRY = re.compile(r"[0-9a-f]{64}\.npz")
-_UNFINISHED = re.compile(r"[0-9a-f]{64}\..*\.tmp")
+_TEMPORARY = re.compile(TEMPORARY.pattern + r"\.npz")
 _ABANDONED = 3600.0
 """Age at which an unfinished file is one whose process has ended [s]."""
 
@@ -62,19 +62,19 @@ class Entry:
 
 
 def entries() -> list[Entry]:
-    """Return the files of the cache, what was not used for longest first; other files in the folder are none of it."""
+    """Return the files of the cache, the least recently used first; other files in the folder are none of it."""
     found = []
     for file in folder().glob("*") if folder().is_dir() else ():
         with contextlib.suppress(OSError):  # another process has just removed it
             state = file.stat()
-            is_abandoned = _UNFINISHED.fullmatch(file.name) and time.time() - state.st_mtime > _ABANDONED
+            is_abandoned = _TEMPORARY.fullmatch(file.name) and time.time() - state.st_mtime > _ABANDONED
             if _ENTRY.fullmatch(file.name) or is_abandoned:
                 found.append(Entry(state.st_mtime, file, state.st_size))
     return sorted(found)
 
 
-def forget(limit: int) -> list[Entry]:
-    """Remove what was not used for longest until the cache is no larger than a limit [bytes]; return what was removed."""
+def evict(limit: int) -> list[Entry]:
+    """Remove the least recently used files until the cache is no larger than a limit [bytes]; return what was removed."""
     known = entries()
     size, removed = sum(entry.size for entry in known), []
     for entry in known:
@@ -124,7 +124,7 @@ def cached(
         pass  # there is none, or it is damaged
     value = make()
     _write(file, pack(value))
-    forget(limit)
+    evict(limit)
     return value
 
 
@@ -135,14 +135,6 @@ def _touch(file: Path) -> None:
 
 
 def _write(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write a cache file, whole or not at all; a folder that cannot be written is left alone."""
-    temporary = None
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, prefix=f"{file.stem}.", suffix=".tmp", delete=False) as out:
-            temporary = Path(out.name)
-            np.savez(out, allow_pickle=False, **arrays)
-        temporary.replace(file)
-    except OSError:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
+    """Write a cache file; a folder that cannot be written is left alone."""
+    with contextlib.suppress(FileError), atomic_open(with_folder(file)) as out:
+        np.savez(out, allow_pickle=False, **arrays)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 
-from tgdsl.files.files import naming
+from tgdsl.files.write import atomic_write_all
 from tgdsl.formats.model import Model
 from tgdsl.scene.scene import readable
 
@@ -62,7 +60,7 @@ def xml_files(path: Path) -> Iterator[Path]:
 def write_mjcf(text: str, out: Path) -> None:
     """Write MJCF with its inline meshes as `.obj` files in the folder `<stem>_assets` beside it.
 
-    All is written under temporary names first, then renamed, so that nothing half-written is left behind.
+    Nothing half-written is left behind.
 
     Args:
         text: MJCF, its meshes in line.
@@ -72,24 +70,17 @@ def write_mjcf(text: str, out: Path) -> None:
         FileError: If it cannot be written.
     """
     root, out = ET.fromstring(text), Path(out)
-    folder = out.with_name(f"{out.stem}_assets")
-    with naming(out), tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}_") as temporary:
-        files: list[str] = []
-        for mesh in root.iterfind("asset/mesh[@vertex]"):
-            file = _file_name(mesh.get("name", ""), files)
-            (Path(temporary) / file).write_text(
-                _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")), encoding="utf-8"
-            )
-            mesh.set("file", file)
-        if files:
-            root.findall("compiler")[0].set("meshdir", folder.name)
-        ET.indent(root)
-        draft = Path(temporary) / "model.xml"
-        draft.write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-        for file in files:
-            folder.mkdir(exist_ok=True)
-            os.replace(Path(temporary) / file, folder / file)
-        os.replace(draft, out)
+    folder, contents = out.with_name(f"{out.stem}_assets"), {}
+    names: list[str] = []
+    for mesh in root.iterfind("asset/mesh[@vertex]"):
+        name = _file_name(mesh.get("name", ""), names)
+        contents[folder / name] = _wavefront(mesh.attrib.pop("vertex"), mesh.attrib.pop("face")).encode()
+        mesh.set("file", name)
+    if names:
+        root.findall("compiler")[0].set("meshdir", folder.name)
+    ET.indent(root)
+    contents[out] = (ET.tostring(root, encoding="unicode") + "\n").encode()
+    atomic_write_all(contents)
 
 
 def _file_name(name: str, taken: list[str]) -> str:

@@ -12,12 +12,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError, TgdslError
-from tgdsl.files.files import write_whole
+from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
-from tgdsl.scene.places import check_scene
+from tgdsl.scene.asset_paths import check_scene
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of
@@ -69,7 +69,7 @@ def load(
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
     """Write a plan, as `save` does; return the bytes written."""
     content = serialized({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
-    write_whole(Path(path), content)
+    atomic_write(Path(path), content)
     return len(content)
 
 

@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tgdsl.module.example import example_state
 from tgdsl.module.memory import Memory
 from tgdsl.module.outputs import outputs_of
-from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
@@ -228,7 +228,7 @@ def _value(value: Shaped[np.ndarray, "*end row"]) -> str:
 def _observations(touch: Explained) -> list[str]:
     groups: dict[str, list[str]] = {}
     for term in touch.plan.observations:
-        of = f" of {term.reading}" if term.reading not in (None, *QUANTITIES) else ""
+        of = f" of {term.reading}" if term.reading not in (None, *PROPRIOCEPTION) else ""
         what = f"{term.type}{of} ({term.num_features})" if term.reading else term.type
         groups.setdefault(term.group, []).append(what)
     if not groups:

@@ -15,11 +15,11 @@ from tgdsl.fields.models import SpecModel
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """What is known of a robot's joints or actuators.
+class ProprioceptiveReading:
+    """A reading of a robot's joints or actuators.
 
     Attributes:
-        rows: What it is known of, one by one.
+        rows: What it has a row for each of.
         channel: Name of the reading's only channel.
         units: Unit of a hinge, and of a slide.
     """
@@ -29,11 +29,11 @@ class Quantity:
     units: tuple[str, str]
 
 
-QUANTITIES = {
-    "joint_pos": Quantity("joint", "position", ("rad", "m")),
-    "joint_vel": Quantity("joint", "velocity", ("rad/s", "m/s")),
-    "joint_effort": Quantity("joint", "effort", ("N·m", "N")),
-    "last_action": Quantity("actuator", "control", ("control", "control")),
+PROPRIOCEPTION = {
+    "joint_pos": ProprioceptiveReading("joint", "position", ("rad", "m")),
+    "joint_vel": ProprioceptiveReading("joint", "velocity", ("rad/s", "m/s")),
+    "joint_effort": ProprioceptiveReading("joint", "effort", ("N·m", "N")),
+    "last_action": ProprioceptiveReading("actuator", "control", ("control", "control")),
 }
 """By name: that of the observation type, of the field of `SceneState` and of the reading, which no sensor may have."""
 

@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
-from tgdsl.files.files import layout_file, robot_file, robot_names
+from tgdsl.files.find import layout_file, robot_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
-from tgdsl.schema.load import LoadedLayout, load_layout
+from tgdsl.schema.load import load_layout
+from tgdsl.schema.loaded import LoadedLayout
 from tgdsl.schema.select import select
 
 _HEADER = ("body", "joints", "geoms", "area [cm²]", "mass [g]", "groups")

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
-from tgdsl.files.files import whole
+from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
@@ -172,5 +172,5 @@ class Recorder:
                 arrays[f"{output.name}:body"] = np.array(output.bodies)
             elif output.rows == "taxel":
                 arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
-        with whole(path) as file:
+        with atomic_open(path) as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

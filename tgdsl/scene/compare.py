@@ -8,13 +8,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-PLACES = frozenset({"paths", "npaths", "mesh_pathadr", "hfield_pathadr", "skin_pathadr", "tex_pathadr", "nbuffer"})
+PATH_FIELDS = frozenset({"paths", "npaths", "mesh_pathadr", "hfield_pathadr", "skin_pathadr", "tex_pathadr", "nbuffer"})
 """Where files were found, and the size of the memory that holds this too: a kept scene names its files by content."""
 ROUNDED = 1e-4
 """Relative error of numbers that MuJoCo computes of an MJCF text that it wrote itself, with six digits."""
 TINY = 1e-6
 """Absolute error of those that are differences of such numbers, in SI units."""
-SEARCHED = (
+ROUNDING_SENSITIVE = (
     "bvh_",
     "body_bvh",
     "mesh_bvh",
@@ -30,7 +30,7 @@ SEARCHED = (
 """What MuJoCo finds by comparing coordinates, such as trees of boxes and faces of convex hulls: rounding may turn a tie."""
 
 
-def differing(loaded: mujoco.MjModel, kept: mujoco.MjModel, is_rounded: bool = False) -> list[str]:
+def differing_fields(loaded: mujoco.MjModel, kept: mujoco.MjModel, is_rounded: bool = False) -> list[str]:
     """Return the names of the fields that differ, dotted where they are in a structure, as in `opt.timestep`.
 
     Args:
@@ -40,7 +40,7 @@ def differing(loaded: mujoco.MjModel, kept: mujoco.MjModel, is_rounded: bool = F
     """
     found = []
     for name, one, other in _fields(loaded, kept, ""):
-        if name in PLACES or (is_rounded and name.startswith(SEARCHED)):
+        if name in PATH_FIELDS or (is_rounded and name.startswith(ROUNDING_SENSITIVE)):
             continue
         if not _same(one, other, is_rounded):
             found.append(name)

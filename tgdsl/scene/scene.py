@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import ArtifactError, RobotError, TgdslError
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
-from tgdsl.scene.places import ROBOTS, located
+from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
 
 INHERITED = (
     *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
@@ -261,7 +261,7 @@ class SceneModels:
 def _content(asset: Asset) -> bytes:
     path = asset.path
     try:
-        path = located(asset, robots_folder())
+        path = resolve_asset(asset, robots_folder())
         content = path.read_bytes()
     except OSError as error:
         place = error.filename or path

@@ -9,7 +9,7 @@ from pydantic import Field, StringConstraints, Tag, create_model
 
 from tgdsl.fields.models import TEXT_OR_OTHER, SpecModel, Text
 from tgdsl.observations.observations import ObservationSpec
-from tgdsl.schema.branches import decided
+from tgdsl.schema.conditional import conditional
 from tgdsl.schema.objects import ObjectSpec
 from tgdsl.schema.placement import LayoutSpec
 from tgdsl.sensors import KINDS, Kind
@@ -76,7 +76,7 @@ def json_schema(kinds: tuple[Kind, ...] | None = None) -> dict[str, Any]:
     document.pop("title", None)
     layout.pop("title", None)
     definitions |= {"Document": document, "Layout": layout}
-    definitions = {name: decided(definition, definitions) for name, definition in definitions.items()}
+    definitions = {name: conditional(definition, definitions) for name, definition in definitions.items()}
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "tgdsl document or layout",

@@ -3,89 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
-from tgdsl.files import files
-from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.errors import Problem, SpecError, TgdslError
+from tgdsl.files import find
 from tgdsl.schema import yaml
-from tgdsl.schema.document import Spec, document_model
-from tgdsl.schema.faults import read_as
+from tgdsl.schema.document import document_model
+from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.placement import LayoutSpec
+from tgdsl.schema.references import reference_problems
 from tgdsl.schema.unusual import warn_of_unusual
-from tgdsl.schema.yaml import Path, Source
+from tgdsl.schema.validation import validate
+from tgdsl.schema.yaml import Source
 from tgdsl.sensors import KINDS, Kind
-from tgdsl.sensors.noise import PROFILES, NoiseSpec, resolve_noise
 
 S = TypeVar("S", bound=BaseModel)
-
-
-@dataclass
-class LoadedLayout:
-    """A layout, as found and as read. The paths of its problems start at `prefix`, which is not empty if it is in line."""
-
-    spec: LayoutSpec
-    source: Source
-    prefix: Path
-    folder: FilePath
-
-    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
-        """Return a mistake at a path of the layout."""
-        return self.source.problem((*self.prefix, *path), what, hint, on_key)
-
-    def raw(self, path: Path) -> Any:
-        """Return the plain value at a path of the layout, or None."""
-        return self.source.get((*self.prefix, *path))
-
-
-@dataclass
-class Loaded:
-    """A document, as found and as read. With `problems`, faulty entries are left out of `spec`.
-
-    Attributes:
-        spec: The document.
-        source: Its text's values and places.
-        folder: Folder that file names in it are relative to.
-        layout: Its layout; None if that could not be read.
-        problems: Mistakes found so far; later stages add theirs.
-    """
-
-    spec: Spec
-    source: Source
-    folder: FilePath
-    layout: LoadedLayout | None
-    problems: list[Problem]
-
-    @property
-    def robot_file(self) -> FilePath | None:
-        """The robot's model file, if it exists."""
-        return files.robot_file(self.spec.robot.model, self.folder)
-
-    @property
-    def resolution(self) -> str | None:
-        """The resolution that is compiled: the one named, or the only one."""
-        if self.spec.resolution is not None or self.layout is None:
-            return self.spec.resolution
-        names = list(self.layout.spec.resolutions)
-        return names[0] if len(names) == 1 else None
-
-    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
-        """Return a mistake at a path of the document."""
-        return self.source.problem(path, what, hint, on_key)
-
-    def raw(self, path: Path) -> Any:
-        """Return the plain value at a path of the document, or None."""
-        return self.source.get(path)
-
-    def raise_problems(self) -> None:
-        """Raise all mistakes found so far, if any."""
-        if self.problems:
-            raise SpecError(self.problems)
 
 
 def load(
@@ -112,9 +48,9 @@ def load(
     if not isinstance(document, (str, PathLike, Mapping)):
         raise TgdslError(f"a document is a YAML file's name or a mapping, found {type(document).__name__}")
     if isinstance(document, Mapping):
-        source, folder = yaml.from_mapping(document, "<mapping>"), FilePath.cwd()
+        source, folder = yaml.from_mapping(document, "<mapping>"), Path.cwd()
     else:
-        source, folder = _read_file(FilePath(document), str(document)), FilePath(document).parent
+        source, folder = _read_file(Path(document), str(document)), Path(document).parent
     if source.value is None:
         raise SpecError(source.problems)
     for dotted, value in (overrides or {}).items():
@@ -122,19 +58,19 @@ def load(
     model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
-    spec = read_as(source, (), model, problems, required)
+    spec = validate(source, (), model, problems, required)
     if spec is None:
         raise SpecError(problems)
     loaded = Loaded(spec, source, folder, None, problems)  # type: ignore[arg-type]
     loaded.layout = _layout(loaded)
-    problems += _name_problems(loaded, kinds)
+    problems += reference_problems(loaded, kinds)
     warn_of_unusual(source, spec)
     if loaded.layout is not None and loaded.layout.source is not source:
         warn_of_unusual(loaded.layout.source, loaded.layout.spec)
     return loaded
 
 
-def load_layout(path: FilePath) -> LoadedLayout:
+def load_layout(path: Path) -> LoadedLayout:
     """Read a layout file by itself.
 
     Raises:
@@ -144,7 +80,7 @@ def load_layout(path: FilePath) -> LoadedLayout:
     return LoadedLayout(spec, source, (), path.parent)
 
 
-def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+def read_spec(path: Path, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
     """Read a file that holds one model and nothing else, and where its values stand.
 
     Args:
@@ -155,23 +91,41 @@ def read_spec(path: FilePath, model: type[S], required: tuple[str, ...]) -> tupl
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    source = _read_file(path, str(path))
+    return parse_spec(_content(path, str(path)), str(path), model, required)
+
+
+def parse_spec(content: bytes, name: str, model: type[S], required: tuple[str, ...]) -> tuple[S, Source]:
+    """Read what `read_spec` reads from a file's content, whose mistakes then go by a name.
+
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
+    source = _source(content, name)
     problems = list(source.problems)
-    spec = read_as(source, (), model, problems, required=required)
+    spec = validate(source, (), model, problems, required=required)
     if problems or not isinstance(spec, model):
         raise SpecError(problems)
     return spec, source
 
 
-def _read_file(path: FilePath, name: str) -> Source:
+def _read_file(path: Path, name: str) -> Source:
+    return _source(_content(path, name), name)
+
+
+def _content(path: Path, name: str) -> bytes:
+    """Return what is in a file, or as much of it as shows that it is too large."""
     try:
         with path.open("rb") as file:
-            content = file.read(yaml.MAX_BYTES + 1)
-        if large := yaml.too_large(content, name):
-            raise SpecError([large])
-        text = content.decode("utf-8")
+            return file.read(yaml.MAX_BYTES + 1)
     except OSError as error:
         raise SpecError([Problem(name, 0, 0, "", f"cannot read this file: {error.strerror}")]) from error
+
+
+def _source(content: bytes, name: str) -> Source:
+    if large := yaml.too_large(content, name):
+        raise SpecError([large])
+    try:
+        text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise SpecError([Problem(name, 0, 0, "", f"not UTF-8 text: byte {error.start} is {error.reason}")]) from error
     source = yaml.parse(text, name)
@@ -188,25 +142,25 @@ def _layout(loaded: Loaded) -> LoadedLayout | None:
         if path is None:
             return None
         try:
-            source, prefix, folder = _read_file(path, _shown(path, loaded, wanted)), (), path.parent
+            source, prefix, folder = _read_file(path, _display_name(path, loaded, wanted)), (), path.parent
         except SpecError as error:
             loaded.problems += error.problems
             return None
         loaded.problems += source.problems
-    spec = read_as(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
+    spec = validate(source, prefix, LayoutSpec, loaded.problems, required=("resolutions",))
     return LoadedLayout(spec, source, prefix, folder) if isinstance(spec, LayoutSpec) else None
 
 
-def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
+def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
     if wanted is not None:
         path = loaded.folder / wanted
-        if files.is_file(path):
+        if find.is_file(path):
             return path
         hint = "paths are relative to this document"
         loaded.problems.append(loaded.source.problem(("robot", "layout"), f'there is no file "{wanted}"', hint))
         return None
-    known = files.robot_names().get(loaded.spec.robot.model)
-    if known is not None and (path := files.layout_file(known)) is not None:
+    known = find.robot_names().get(loaded.spec.robot.model)
+    if known is not None and (path := find.layout_file(known)) is not None:
         return path
     loaded.problems.append(
         loaded.source.problem(
@@ -216,93 +170,6 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> FilePath | None:
     return None
 
 
-def _shown(path: FilePath, loaded: Loaded, wanted: str | None) -> str:
+def _display_name(path: Path, loaded: Loaded, wanted: str | None) -> str:
     """Return the name a layout file has in messages: as the user would type it from where the document's name counts."""
-    return str(path) if wanted is None else str(FilePath(loaded.source.file).parent / wanted)
-
-
-def _name_problems(loaded: Loaded, kinds: tuple[Kind, ...]) -> list[Problem]:
-    """Return references within the document that lead nowhere, and knobs that a kind does not have."""
-    spec, source = loaded.spec, loaded.source
-    problems: list[Problem] = []
-
-    def names(key: str) -> list[str] | None:
-        """Return the names that the document gives, also those of faulty entries; None if that cannot be told."""
-        found = source.value.get(key, {})
-        return list(found) if isinstance(found, dict) else None
-
-    objects, sensors = names("objects"), names("sensors") or []
-    by_name = {kind.name: kind for kind in kinds}
-    for name, sensor in spec.sensors.items():
-        path: Path = ("sensors", name)
-        for i, target in enumerate(sensor.objects):
-            if objects is not None and target not in objects:
-                hint = did_you_mean(target, objects, "objects")
-                problems.append(source.problem((*path, "feels", i), f'unknown object "{target}"', hint))
-            elif target in sensor.objects[:i]:
-                problems.append(source.problem((*path, "feels", i), f'object "{target}" is listed twice', "name it once"))
-        problems += _noise_problems(loaded, name, sensor.noise, by_name.get(getattr(sensor, "kind", "")))
-    for name in QUANTITIES.keys() & set(sensors):
-        what = f'"{name}" is the name of a reading that no sensor makes'
-        problems.append(source.problem(("sensors", name), what, "give the sensor another name", on_key=True))
-    for group in names("observations") or []:
-        terms = source.get(("observations", group))
-        for i, term in enumerate(terms if isinstance(terms, list) else []):
-            target = term.get("of") if isinstance(term, dict) else None
-            if isinstance(target, str) and target.split("/")[0] not in sensors:
-                hint = did_you_mean(target, sensors, "sensors")
-                if target in QUANTITIES:
-                    hint = f"no sensor makes it: {{type: {target}}} observes it"
-                problems.append(source.problem(("observations", group, i, "of"), f'unknown sensor "{target}"', hint))
-    if loaded.layout is not None:
-        resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})
-        if loaded.resolution is None and source.get(("resolution",)) is None:
-            hint = f"the layout has {', '.join(resolutions)}"
-            problems.append(source.problem((), 'missing key "resolution"', hint, on_key=True))
-        elif loaded.resolution is not None and loaded.resolution not in resolutions:
-            hint = did_you_mean(loaded.resolution, resolutions, "resolutions")
-            problems.append(source.problem(("resolution",), f'unknown resolution "{loaded.resolution}"', hint))
-    return problems
-
-
-def _noise_problems(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kind | None) -> list[Problem]:
-    """Return what is wrong with a sensor's noise: profiles that do not exist, and knobs that its kind does not have."""
-    path: Path = ("sensors", name, "noise")
-    chain, problem = _profiles(loaded, path, noise)
-    if problem is not None:
-        return [problem]
-    if chain is None or kind is None:
-        return []  # the profile itself, or all of them, have a mistake, which is reported there
-    problems = []
-    own = noise if isinstance(noise, NoiseSpec) else None
-    base, links = resolve_noise(noise, kind.name, loaded.spec.noise)
-    for pattern, knobs in [("", base), *links]:
-        for knob in (knob for knob in knobs.active() if knob not in kind.knobs):
-            what = f'"{kind.name}" has no knob "{knob}"'
-            hint = f"it has {', '.join(sorted(kind.knobs))}"
-            place = (*path, "links", pattern, knob) if pattern else (*path, knob)
-            is_own = own is not None and (pattern in own.links if pattern else knob in own.model_fields_set)
-            where = "" if is_own else f" (in the profile {' → '.join(chain)})"
-            problems.append(loaded.source.problem(place if is_own else path, what + where, hint))
-    return problems
-
-
-def _profiles(loaded: Loaded, path: Path, noise: str | NoiseSpec) -> tuple[list[str] | None, Problem | None]:
-    """Return the profiles that a sensor's noise leads to, one after the other; None if one of them has a mistake of its own."""
-    found = loaded.source.value.get("noise", {})
-    written = list(found) if isinstance(found, dict) else None
-    chain: list[str] = []
-    place, name = path, noise if isinstance(noise, str) else noise.like
-    place = path if isinstance(noise, str) else (*path, "like")
-    while True:
-        if name in chain:
-            return None, loaded.source.problem(place, "noise profiles lead in a circle", " → ".join([*chain, name]))
-        chain.append(name)
-        if name not in loaded.spec.noise:
-            if name in PROFILES and (written is None or name not in written):
-                return chain, None
-            if written is None or name in written:
-                return None, None
-            hint = did_you_mean(name, [*written, *PROFILES], "noise profiles")
-            return None, loaded.source.problem(place, f'unknown noise profile "{name}"', hint)
-        place, name = ("noise", name, "like"), loaded.spec.noise[name].like
+    return str(path) if wanted is None else str(Path(loaded.source.file).parent / wanted)

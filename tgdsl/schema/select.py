@@ -55,9 +55,9 @@ def select(
         if is_plain(name) and name not in known and name not in elsewhere:
             hint = did_you_mean(name, [*known, *elsewhere], "links")
             report(("exclude", i), f'no link matches "{name}"', hint)
-    if group is not None and (circle := _circle(group, group, candidates, groups, ())):
+    if group is not None and (cycle := _cycle(group, group, candidates, groups, ())):
         patterns = {name: (part, i) for part in ("exclude", "include") for i, name in enumerate(getattr(selection, part))}
-        report(patterns[circle[0]], f'group "{group}" contains itself', " → ".join([group, *circle]))
+        report(patterns[cycle[0]], f'group "{group}" contains itself', " → ".join([group, *cycle]))
     return sorted(_chosen(selection, candidates, groups, () if group is None else (group,)))
 
 
@@ -85,7 +85,7 @@ def _matched(pattern: str, candidates: Sequence[Sequence[str]]) -> set[int]:
     return {i for i, names in enumerate(candidates) if matching(pattern, names)}
 
 
-def _circle(
+def _cycle(
     name: str, end: str, candidates: Sequence[Sequence[str]], groups: Mapping[str, Selection], seen: tuple[str, ...]
 ) -> tuple[str, ...]:
     """Return the groups that lead from one to another through includes and excludes, the last one too; or nothing."""
@@ -95,6 +95,6 @@ def _circle(
         if pattern == end:
             return (pattern,)
         is_new = pattern in groups and pattern not in seen
-        if is_new and (rest := _circle(pattern, end, candidates, groups, (*seen, name, pattern))):
+        if is_new and (rest := _cycle(pattern, end, candidates, groups, (*seen, name, pattern))):
             return (pattern, *rest)
     return ()

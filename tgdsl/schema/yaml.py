@@ -67,7 +67,7 @@ class Source:
         while near and near not in first and near not in second:
             near = near[:-1]
         mark = first.get(near) or second.get(near) or Mark(self.file, 0, 0)
-        return Problem(*mark, path=spelled(path), what=what, hint=hint)
+        return Problem(*mark, path=path_text(path), what=what, hint=hint)
 
     def get(self, path: Path) -> Any:
         """Return the plain value at a path, or None."""
@@ -101,7 +101,7 @@ class Source:
         self.values[path] = Mark(parsed.file, 0, 0)
 
 
-def spelled(path: Path) -> str:
+def path_text(path: Path) -> str:
     """Return a path as users write it: `observations.policy[0].of`."""
     text = ""
     for part in path:
@@ -197,21 +197,21 @@ def from_mapping(value: Mapping[str, Any], file: str) -> Source:
 def _refuse(source: Source, error: _TooManyError) -> None:
     """Leave a document without a value, and only what ended its reading for a mistake."""
     source.value = None
-    source.problems = [Problem(source.file, error.line, error.column, spelled(error.path), _TOO_MANY, _HINT)]
+    source.problems = [Problem(source.file, error.line, error.column, path_text(error.path), _TOO_MANY, _HINT)]
 
 
 def _plain(value: Any, path: Path, source: Source, counter: count[int]) -> Any:
     if next(counter) >= MAX_NODES:
         raise _TooManyError(0, 0, path)
     if len(path) > MAX_DEPTH:
-        source.problems.append(Problem(source.file, 0, 0, spelled(path), _TOO_DEEP))
+        source.problems.append(Problem(source.file, 0, 0, path_text(path), _TOO_DEEP))
         return Unreadable
     if isinstance(value, Mapping):
         return {str(key): _plain(part, (*path, str(key)), source, counter) for key, part in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, (str, bytes)):
         return [_plain(part, (*path, i), source, counter) for i, part in enumerate(value)]
     if isinstance(value, str) and (wrong := _wrong_text(value)):
-        source.problems.append(Problem(source.file, 0, 0, spelled(path), wrong))
+        source.problems.append(Problem(source.file, 0, 0, path_text(path), wrong))
         return Unreadable
     return value
 
@@ -225,7 +225,7 @@ class _Reader:
         return Mark(self.source.file, node.start_mark.line + 1, node.start_mark.column + 1)
 
     def note(self, node: Node, path: Path, what: str) -> None:
-        self.source.problems.append(Problem(*self.mark(node), path=spelled(path), what=what))
+        self.source.problems.append(Problem(*self.mark(node), path=path_text(path), what=what))
 
     def read(self, node: Node, path: Path, inside: tuple[int, ...]) -> Any:
         self.source.values[path] = self.mark(node)

@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout.layout import Layout
-from tgdsl.view.discs import taxels_of
-from tgdsl.view.dots import Dots, Pose
-from tgdsl.view.shot import Camera, Solid, camera_for, is_seen, rasterise, screen_for, unit
+from tgdsl.view.markers import Markers
+from tgdsl.view.raster import Camera, Mesh, rasterise, unit, viewport_for
+from tgdsl.view.taxels import Pose, is_visible, taxels_of
 
 Array = np.ndarray
 VIEWS = {
@@ -76,7 +77,7 @@ def pose_of(model: mujoco.MjModel, keyframe: str | None) -> Pose:
     return Pose(state.xpos.copy(), state.xquat.copy())
 
 
-def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, top: int) -> Camera:
+def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose: Pose, root: int) -> Camera:
     """Return the camera of a view: it is fixed to the hand's first body, so that a hand that closes is seen from the same side.
 
     Args:
@@ -84,7 +85,7 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
         model: The robot.
         layouts: The taxels, which count in the model's initial state, each by the surface that it stands for.
         pose: Where the bodies are.
-        top: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
+        root: The hand's first body: up is an axis of its frame, the one along which the taxels lie farthest from its origin of
             those that do not point at the camera.
     """
     initial = pose_of(model, None)
@@ -92,56 +93,76 @@ def camera_of(view: str, model: mujoco.MjModel, layouts: Sequence[Layout], pose:
     weight = np.concatenate([each.size**2 for each in taxels])
     centre = weight @ np.concatenate([each.pos for each in taxels]) / weight.sum()
     normal = unit(weight @ np.concatenate([each.normal for each in taxels]), np.zeros(3))
-    axes = Rotation.from_quat(initial.quat[top], scalar_first=True).as_matrix().T
+    axes = Rotation.from_quat(initial.quat[root], scalar_first=True).as_matrix().T
     axes = np.concatenate([axes, -axes])
     across = axes[np.abs(axes @ normal) < 0.7]
-    up = across[np.argmax(across @ (centre - initial.pos[top] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
+    up = across[np.argmax(across @ (centre - initial.pos[root] + [0, 0, 1e-6]))]  # the world's z, where nothing else decides
     toward = unit(normal - (normal @ up) * up, axes[np.argmin(np.abs(axes @ up))])
     around, rise = np.radians(angles_of(view))
     level = np.cos(around) * toward + np.sin(around) * np.cross(up, toward)
     toward = np.cos(rise) * level + np.sin(rise) * up
     right = np.cross(up, level)
     frame = np.stack([right, np.cross(toward, right), toward])
-    turn = Rotation.from_quat(pose.quat[top], scalar_first=True).as_matrix() @ axes[:3]
+    turn = Rotation.from_quat(pose.quat[root], scalar_first=True).as_matrix() @ axes[:3]
     right, above, toward = frame @ turn.T
-    return Camera(right, above, toward, pose.pos[top])
+    return Camera(right, above, toward, pose.pos[root])
 
 
-def best_camera(dots: Dots, hand: Solid, model: mujoco.MjModel, layout: Layout, pose: Pose, top: int) -> Camera:
-    """Return the camera that those taxels face which read most (see `camera_for`), or the one that shows most taxels.
+def facing_camera(markers: Markers, origin: Float[Array, " 3"]) -> Camera:
+    """Return a camera that the most strongly read taxels face, a little from the side.
+
+    Args:
+        markers: The taxels; where none reads anything, all count alike.
+        origin: Where the hand begins [m]: the image's up is the world's, or else leads away from here.
+    """
+    weight = markers.value if markers.is_read.any() else np.ones(len(markers.value))
+    toward = unit(weight @ markers.normal, np.array([0.0, 0.0, 1.0]))
+    along = markers.pos.mean(axis=0) - origin
+    for up in (np.array([0.0, 0.0, 1.0]), along, np.array([0.0, 1.0, 0.0])):
+        across = up - (up @ toward) * toward
+        if np.linalg.norm(across) > 0.5 * np.linalg.norm(up) > 0:
+            break
+    up = unit(across, up)
+    toward = unit(toward - 0.38 * up + 0.28 * np.cross(up, toward), toward)
+    right = unit(np.cross(up, toward), up)
+    return Camera(right, np.cross(toward, right), toward, markers.pos.mean(axis=0))
+
+
+def best_camera(markers: Markers, hand: Mesh, model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Camera:
+    """Return the camera that those taxels face which read most (see `facing_camera`), or the one that shows most taxels.
 
     Taxels count that are touched, or all where none is. The first camera is kept if it shows half as many as any other or more.
 
     Args:
-        dots: The taxels.
+        markers: The taxels.
         hand: What hides taxels.
         model: The robot.
         layout: The taxels that views are named after, see `camera_of`.
         pose: Where the bodies are.
-        top: The hand's first body.
+        root: The hand's first body.
     """
-    first = camera_for(dots, pose.pos[top])
-    wanted = dots.is_touched if dots.is_touched.any() else dots.size > 0
-    own, _ = _shown(dots, wanted, hand, first)
+    first = facing_camera(markers, pose.pos[root])
+    wanted = markers.is_touched if markers.is_touched.any() else markers.size > 0
+    own, _ = _shown(markers, wanted, hand, first)
     if 2 * own >= wanted.sum():
         return first
-    others = [(camera, _shown(dots, wanted, hand, camera)) for camera in _candidates(model, layout, pose, top)]
+    others = [(camera, _shown(markers, wanted, hand, camera)) for camera in _candidates(model, layout, pose, root)]
     best, (most, _) = max(others, key=lambda entry: entry[1])
     return first if 2 * own >= most else best
 
 
-def _candidates(model: mujoco.MjModel, layout: Layout, pose: Pose, top: int) -> Iterator[Camera]:
+def _candidates(model: mujoco.MjModel, layout: Layout, pose: Pose, root: int) -> Iterator[Camera]:
     for view in (*VIEWS, *(f"{around},{rise}" for rise in _RISES for around in _AROUND)):
-        yield camera_of(view, model, [layout], pose, top)
+        yield camera_of(view, model, [layout], pose, root)
 
 
-def _shown(dots: Dots, wanted: Array, hand: Solid, camera: Camera) -> tuple[int, int]:
+def _shown(markers: Markers, wanted: Array, hand: Mesh, camera: Camera) -> tuple[int, int]:
     """Return how many of the taxels that are wanted a camera shows, and how many in all."""
     facing = hand.normals.mean(axis=1) @ camera.toward > 0
     corners = hand.corners[facing]
-    flat = np.concatenate([camera.project(corners).reshape(-1, 3), camera.project(dots.pos)])[:, :2]
+    flat = np.concatenate([camera.project(corners).reshape(-1, 3), camera.project(markers.pos)])[:, :2]
     margin = 1e-3  # [m] so that a single point has a size too
-    screen = screen_for(camera, np.stack([flat.min(axis=0) - margin, flat.max(axis=0) + margin]), _LOOK, _LOOK)
-    shot = rasterise(screen.project(corners), _LOOK, _LOOK)
-    seen = is_seen(dots, screen.project(dots.pos), shot, camera) & (dots.size > 0)
+    viewport = viewport_for(camera, np.stack([flat.min(axis=0) - margin, flat.max(axis=0) + margin]), _LOOK, _LOOK)
+    fragments = rasterise(viewport.project(corners), _LOOK, _LOOK)
+    seen = is_visible(markers, viewport.project(markers.pos), fragments, camera) & (markers.size > 0)
     return int((seen & wanted).sum()), int(seen.sum())

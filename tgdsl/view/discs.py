@@ -5,23 +5,15 @@ Shapes: `taxel` taxels of one layout, `corner` corners of a disc.
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from tgdsl.layout.layout import Layout
-from tgdsl.view.dots import Pose, Taxels, in_world
+from tgdsl.view.taxels import Taxels
 
 Array = np.ndarray
 _RADIUS = (0.0006, 0.0022)  # least and largest radius of a disc [m]
-
-
-def taxels_of(model: mujoco.MjModel, pose: Pose, layout: Layout) -> Taxels:
-    """Return a layout's taxels in the world."""
-    bodies = [layout.links[i].body for i in layout.link_id]
-    pos, normal = in_world(model, pose, bodies, layout.pos, layout.normal)
-    return Taxels(pos, normal, np.sqrt(layout.area) * (layout.radius > 0))
 
 
 def radii(layout: Layout, pos: Float[Array, "taxel 3"]) -> Float[Array, " taxel"]:

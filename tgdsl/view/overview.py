@@ -13,11 +13,14 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from tgdsl.files.files import whole, with_folder
+from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.source import Simulator
-from tgdsl.view.dots import Dots, dots_of, touched
-from tgdsl.view.view import DPI, FAINT, FINE, INK, Backdrop, ViewError, chosen_output, draw_dots, scene_of
+from tgdsl.view.cameras import ViewError
+from tgdsl.view.markers import Markers, markers_of, touched
+from tgdsl.view.picture import chosen_output
+from tgdsl.view.scene import RenderedScene, draw_markers, render_scene
+from tgdsl.view.style import DPI, FAINT, INK, SUPERSAMPLING
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -38,7 +41,7 @@ def overview(
     """Draw every reading of one environment, and write the picture.
 
     Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
-    every panel. Readings of bodies have one large dot per body.
+    every panel. Readings of bodies have one large marker per body.
 
     Args:
         touch: The module.
@@ -57,7 +60,7 @@ def overview(
         FileError: If the file cannot be written.
     """
     figure = drawing(touch, sim, readings, env=env, title=title, view=view)
-    with whole(with_folder(path)) as file:
+    with atomic_open(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
 
@@ -77,14 +80,14 @@ def drawing(
         raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
-    dots = [dots_of(touch, sim, output, readings[output.name], env) for output in outputs]
+    markers = [markers_of(touch, sim, output, readings[output.name], env) for output in outputs]
     columns = min(len(outputs), 4)
     rows = -(-len(outputs) // columns)
-    width, height = (FINE * round(0.94 * size * DPI) for size in (PANEL[0], 0.82 * PANEL[1]))
+    width, height = (SUPERSAMPLING * round(0.94 * size * DPI) for size in (PANEL[0], 0.82 * PANEL[1]))
     has_taxels = any(output.rows == "taxel" for output in outputs)
     lead = outputs.index(chosen_output(touch, readings)) if has_taxels else 0
-    dots[lead] = replace(dots[lead], would_read=touched(touch, sim, outputs[lead], readings, env))
-    scene = scene_of(touch, sim, dots[lead], env, width, height, view)
+    markers[lead] = replace(markers[lead], would_read=touched(touch, sim, outputs[lead], readings, env))
+    scene = render_scene(touch, sim, markers[lead], env, width, height, view)
     figure = Figure(figsize=(columns * PANEL[0], rows * PANEL[1] + 0.5), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
@@ -97,9 +100,9 @@ def drawing(
         wspace=0.06,
         hspace=0.3,
     )
-    for i, (output, own) in enumerate(zip(outputs, dots, strict=True)):
+    for i, (output, own) in enumerate(zip(outputs, markers, strict=True)):
         axes = figure.add_subplot(grid[i])
-        draw_dots(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
+        draw_markers(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
         _draw_arrows(axes, scene, own)
         axes.set_title(f"{output.name}  ·  {output.kind}", fontsize=11, color=INK, loc="left", pad=18, weight="bold")
         axes.text(0, 1.02, own.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
@@ -107,13 +110,13 @@ def drawing(
     return figure
 
 
-def _draw_arrows(axes: Axes, scene: Backdrop, dots: Dots) -> None:
+def _draw_arrows(axes: Axes, scene: RenderedScene, markers: Markers) -> None:
     """Draw vectors from where they are read."""
-    if dots.vector is None or not dots.is_read.any():
+    if markers.vector is None or not markers.is_read.any():
         return
-    camera = scene.screen.camera
-    along = dots.vector[dots.is_read] @ np.stack([camera.right, camera.up]).T
-    along *= ARROW * scene.screen.width / np.linalg.norm(dots.vector, axis=1).max()
-    at = scene.screen.project(dots.pos[dots.is_read])[:, :2]
+    camera = scene.viewport.camera
+    along = markers.vector[markers.is_read] @ np.stack([camera.right, camera.up]).T
+    along *= ARROW * scene.viewport.width / np.linalg.norm(markers.vector, axis=1).max()
+    at = scene.viewport.project(markers.pos[markers.is_read])[:, :2]
     style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.0045, "headwidth": 3.4, "headlength": 4}
     axes.quiver(*at.T, *along.T, color=INK, zorder=6, **style)

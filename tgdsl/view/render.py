@@ -22,13 +22,15 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from scipy.ndimage import gaussian_filter
 
 from tgdsl.errors import FileError
-from tgdsl.files.files import whole, with_folder, writable
+from tgdsl.files.write import atomic_open, check_writable, with_folder
 from tgdsl.layout.layout import Layout
 from tgdsl.view.cameras import ViewError, angles_of, camera_of, pose_of
-from tgdsl.view.discs import discs, group_of, legend, radii, taxels_of
-from tgdsl.view.dots import Taxels
-from tgdsl.view.shot import Screen, Shot, Solid, is_seen, lamp, rasterise, robot_bodies, screen_for, shaded, smaller, solid_of
-from tgdsl.view.view import FAINT, INK, draw_ruler
+from tgdsl.view.discs import discs, group_of, legend, radii
+from tgdsl.view.meshes import mesh_of, robot_bodies
+from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, light_direction, rasterise, shade, viewport_for
+from tgdsl.view.scene import draw_image, draw_scale_bar
+from tgdsl.view.style import FAINT, INK
+from tgdsl.view.taxels import Taxels, is_visible, taxels_of
 
 Array = np.ndarray
 COLOURS = ("#0f7fb8", "#e8871e", "#c2315b", "#3a9d5d", "#7a55b0", "#8c6d46", "#d4b106", "#4f5d75")
@@ -38,9 +40,12 @@ FEWEST = 200
 """Columns and rows that a file has at least."""
 _INCHES = 6.0  # the figure's height, whatever its pixels: text scales with it
 _HEAD, _FOOT, _GAP = 0.085, 0.085, 0.03  # parts of the figure's height
-_FINE = 3  # pixels drawn per pixel of the file, along each axis
-_LIT = np.array([0.91, 0.92, 0.94])
-_HOLLOWS = ((0.004, 12.0), (0.012, 6.0))  # width [m] of hollows that are shaded, and how much darker per metre of depth
+_SUPERSAMPLING = 3  # pixels rendered per pixel of the file, along each axis
+_SURFACE = np.array([0.91, 0.92, 0.94])
+_AMBIENT_OCCLUSION = (
+    (0.004, 12.0),
+    (0.012, 6.0),
+)  # width [m] of hollows that are shaded, and how much darker per metre of depth
 
 
 def render(
@@ -70,9 +75,9 @@ def render(
         ViewError: If there is no such keyframe or view, if there is nothing to draw, or if the file cannot be written.
     """
     try:
-        writable(out)
+        check_writable(out)
         figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
-        with whole(with_folder(out)) as file:
+        with atomic_open(with_folder(out)) as file:
             figure.savefig(file, format="png", pil_kwargs={"optimize": True})
     except FileError as error:
         raise ViewError(f"cannot write {error}") from error
@@ -93,23 +98,23 @@ def drawing(
     taxels = [taxels_of(model, pose, layout) for layout in layouts.values()]
     framed, robot = robot_bodies(model, {model.body(link.body).id for layout in layouts.values() for link in layout.links})
     camera = camera_of(view, model, list(layouts.values()), pose, min(framed))
-    hand = solid_of(model, pose, robot)
+    hand = mesh_of(model, pose, robot)
     shown = [hand.corners[np.isin(hand.body, list(framed))].reshape(-1, 3), *(each.pos for each in taxels)]
     box = _box(camera.project(np.concatenate(shown))[:, :2])
     width, height = size or _natural_size(box, len(layouts))
     rows, columns = round(height * (1 - _HEAD - _FOOT)), int((width - _GAP * height) / len(layouts) - _GAP * height)
-    screen = screen_for(camera, box, _FINE * columns, _FINE * rows)
-    shot = rasterise(screen.project(hand.corners), screen.width, screen.height)
-    image = _image(hand, shot, screen)
+    viewport = viewport_for(camera, box, _SUPERSAMPLING * columns, _SUPERSAMPLING * rows)
+    fragments = rasterise(viewport.project(hand.corners), viewport.width, viewport.height)
+    image = _image(hand, fragments, viewport)
     figure = Figure(figsize=(width / height * _INCHES, _INCHES), dpi=height / _INCHES, facecolor="white")
     FigureCanvasAgg(figure)
     for i, (name, layout) in enumerate(layouts.items()):
         left = _GAP * height + i * (columns + _GAP * height)
         axes = figure.add_axes((left / width, _FOOT, columns / width, rows / height), label=name)
-        _draw_hand(axes, image, screen)
-        _draw_taxels(axes, layout, taxels[i], screen, shot)
-        _draw_words(axes, name, layout)
-    draw_ruler(figure.axes[0], screen.scale, screen.width, 1.03 * screen.height)
+        draw_image(axes, image, viewport)
+        _draw_taxels(axes, layout, taxels[i], viewport, fragments)
+        _draw_captions(axes, name, layout)
+    draw_scale_bar(figure.axes[0], viewport.scale, viewport.width, 1.03 * viewport.height)
     return figure
 
 
@@ -137,16 +142,16 @@ def _natural_size(box: Float[Array, "2 2"], panels: int) -> tuple[int, int]:
     return round(panels * columns + (panels + 1) * _GAP * HEIGHT), HEIGHT
 
 
-def _image(hand: Solid, shot: Shot, screen: Screen) -> Float[Array, "h w 3"]:
+def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array, "h w 3"]:
     """Return the hand alone: lit, with hollows darkened by how far they lie behind what is around them."""
-    image = np.ones((screen.height, screen.width, 3))
-    colour = np.broadcast_to(_LIT, (len(hand.body), 3))
-    image = smaller(shaded(image, shot, hand, colour, screen.camera, 1.0, screen.scale), _FINE)
-    near = shot.near[_FINE // 2 :: _FINE, _FINE // 2 :: _FINE]
+    image = np.ones((viewport.height, viewport.width, 3))
+    colour = np.broadcast_to(_SURFACE, (len(hand.body), 3))
+    image = downsample(shade(image, fragments, hand, colour, viewport.camera, 1.0, viewport.scale), _SUPERSAMPLING)
+    near = fragments.nearness[_SUPERSAMPLING // 2 :: _SUPERSAMPLING, _SUPERSAMPLING // 2 :: _SUPERSAMPLING]
     is_hand = np.isfinite(near)
     near = np.where(is_hand, near, near[is_hand].min())
-    for width, amount in _HOLLOWS:
-        behind = gaussian_filter(near, width * screen.scale / _FINE) - near
+    for width, amount in _AMBIENT_OCCLUSION:
+        behind = gaussian_filter(near, width * viewport.scale / _SUPERSAMPLING) - near
         image *= np.where(is_hand, 1 - np.clip(amount * behind, 0, 0.35), 1)[..., None]
     return image
 
@@ -154,24 +159,17 @@ def _image(hand: Solid, shot: Shot, screen: Screen) -> Float[Array, "h w 3"]:
 # The panels -----------------------------------------------------------------------------------------------------------
 
 
-def _draw_hand(axes: Axes, image: Float[Array, "h w 3"], screen: Screen) -> None:
-    extent = (-0.5, screen.width - 0.5, -0.5, screen.height - 0.5)
-    axes.imshow(image, origin="lower", extent=extent, interpolation="nearest", aspect="auto")
-    axes.set_axis_off()
-    axes.autoscale(False)
-
-
-def _draw_taxels(axes: Axes, layout: Layout, taxels: Taxels, screen: Screen, shot: Shot) -> None:
+def _draw_taxels(axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport, fragments: Fragments) -> None:
     """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings."""
-    at = screen.project(taxels.pos)
-    seen, active = is_seen(taxels, at, shot, screen.camera), taxels.size > 0
+    at = viewport.project(taxels.pos)
+    seen, active = is_visible(taxels, at, fragments, viewport.camera), taxels.size > 0
     radius = radii(layout, taxels.pos)
-    rims = screen.project(discs(taxels, radius))[..., :2]
-    ends = screen.project(taxels.pos + 2.0 * radius[:, None] * taxels.normal)
+    rims = viewport.project(discs(taxels, radius))[..., :2]
+    ends = viewport.project(taxels.pos + 2.0 * radius[:, None] * taxels.normal)
     chosen = group_of(layout)
     names = list(dict.fromkeys(chosen))
     colour = np.array([to_rgb(COLOURS[names.index(group) % len(COLOURS)]) for group in chosen])[layout.link_id]
-    lit = np.minimum(colour * (0.72 + 0.33 * np.clip(taxels.normal @ lamp(screen.camera), 0, 1))[:, None], 1)
+    lit = np.minimum(colour * (0.72 + 0.33 * np.clip(taxels.normal @ light_direction(viewport.camera), 0, 1))[:, None], 1)
     order = np.argsort(at[:, 2], kind="stable")
     shown, hidden = (order[(mask & active)[order]] for mask in (seen, ~seen))
     rings = [(*rgb, 0.3) for rgb in colour[hidden]]
@@ -181,7 +179,7 @@ def _draw_taxels(axes: Axes, layout: Layout, taxels: Taxels, screen: Screen, sho
     axes.add_collection(LineCollection(ticks, colors=list(0.45 * colour[shown]), lw=0.6, zorder=5, gid="normals"))
 
 
-def _draw_words(axes: Axes, name: str, layout: Layout) -> None:
+def _draw_captions(axes: Axes, name: str, layout: Layout) -> None:
     """Write the panel's name and its number of taxels above it, and the number of each group below."""
     count, fillers = int((layout.radius > 0).sum()), int((layout.radius == 0).sum())
     told = f"{count} taxels" + (f" and {fillers} inactive" if fillers else "")
@@ -189,10 +187,10 @@ def _draw_words(axes: Axes, name: str, layout: Layout) -> None:
     line = HPacker(children=[title, TextArea(told, textprops={"size": 12, "color": FAINT})], pad=0, sep=8, align="baseline")
     place = {"bbox_to_anchor": (0.5, 1.0), "bbox_transform": axes.transAxes, "borderpad": 0.5, "pad": 0.0}
     axes.add_artist(AnchoredOffsetbox("lower center", child=line, frameon=False, **place))
-    dots = [
+    handles = [
         Line2D([], [], marker="o", linestyle="", markersize=6, color=COLOURS[i % len(COLOURS)], label=f"{label} {number}")
         for i, (label, number) in enumerate(legend(layout).items())
     ]
     style = {"frameon": False, "handletextpad": 0.1, "columnspacing": 1.1, "fontsize": 10, "labelcolor": INK}
-    columns = len(dots) if len(dots) <= 3 else -(-len(dots) // 2)
-    axes.legend(handles=dots, loc="upper center", bbox_to_anchor=(0.5, 0.005), ncols=columns, **style)
+    columns = len(handles) if len(handles) <= 3 else -(-len(handles) // 2)
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.005), ncols=columns, **style)

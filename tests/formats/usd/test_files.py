@@ -66,7 +66,7 @@ def test_nothing_half_written_is_left(tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     before = sorted(tmp_path.iterdir())
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="no space"):
         write_mjcf(text, tmp_path / "hand.xml")
     assert sorted(tmp_path.iterdir()) == before

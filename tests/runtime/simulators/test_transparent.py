@@ -8,8 +8,8 @@ from warp_cases import SCENE, module, warp
 import tgdsl
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.scene.scene import geom_name, is_absent
-from tgdsl.view.dots import Pose
-from tgdsl.view.shot import solid_of
+from tgdsl.view.meshes import mesh_of
+from tgdsl.view.taxels import Pose
 
 VARIANTS = [
     {"type": "box", "size": [0.02, 0.02, 0.02]},
@@ -58,8 +58,8 @@ def test_pictures_show_what_is_transparent_and_not_what_is_absent(tmp_path):
         for env in range(3):
             model, data = sim.env_model(env), mujoco.MjData(sim.env_model(env))
             mujoco.mj_forward(model, data)
-            solid = solid_of(model, Pose(data.xpos, data.xquat), {model.body("cube").id})
-            sizes[looks, env] = np.ptp(solid.corners.reshape(-1, 3), axis=0)
+            mesh = mesh_of(model, Pose(data.xpos, data.xquat), {model.body("cube").id})
+            sizes[looks, env] = np.ptp(mesh.corners.reshape(-1, 3), axis=0)
     for env, expected in enumerate([[0.04] * 3, [0.03] * 3, [0.04, 0.04, 0.04]]):
         for looks in LOOKS:
             np.testing.assert_allclose(sizes[looks, env], expected, rtol=0.02)

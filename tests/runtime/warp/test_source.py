@@ -11,8 +11,8 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.rollout import rollout
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.view.overview import overview
+from tgdsl.view.picture import picture
 from tgdsl.view.table import table
-from tgdsl.view.view import picture
 
 NOISE = {"white_noise": 5e-3, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "read_delay": "3 ms"}
 PRESSED = SCENE.replace('pos="0 0 .0299"', 'pos="0 0 .028"')

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from xhand1_hands import PATIENT, Stamps, WrittenBytes, drive_until, open_again, wait_until
 
-from tgdsl.files.files import robot_names
+from tgdsl.files.find import robot_names
 from tgdsl.runtime.xhand1 import reader
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator

@@ -9,8 +9,8 @@ import torch
 import tgdsl
 from tgdsl.observations.observations import ObservationSpec
 from tgdsl.runtime.rollout import rollout, scripted_controls
+from tgdsl.view.picture import picture
 from tgdsl.view.table import table
-from tgdsl.view.view import picture
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "noisy_hand.yaml"
 NUM_STEPS, NUM_ENVS = 12, 2

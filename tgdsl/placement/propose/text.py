@@ -12,7 +12,7 @@ from typing import Any
 
 from tgdsl.errors import TgdslError, listed
 from tgdsl.fields import units
-from tgdsl.files.files import with_folder, writable, write_whole
+from tgdsl.files.write import atomic_write, check_writable, with_folder
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.propose import FACTORS, LinkProposal, Proposal, escaped, propose
 
@@ -63,9 +63,9 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         warnings.warn(f"--density {density}: {'; '.join(what)}", stacklevel=2)
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
-    writable(out)
+    check_writable(out)
     proposal = propose(robot, per_area, with_groups)
-    write_whole(with_folder(out), layout_text(proposal, robot.file.name).encode())
+    atomic_write(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),

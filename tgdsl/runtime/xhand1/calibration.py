@@ -22,7 +22,7 @@ from pydantic import model_validator
 from tgdsl.fields.models import Number, Positive, SpecModel
 from tgdsl.runtime.xhand1.driver import Tare
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS
-from tgdsl.schema.load import read_spec
+from tgdsl.schema.load import parse_spec, read_spec
 
 Sign = Literal[-1, 1]
 Row = tuple[Number, Number, Number]
@@ -99,6 +99,9 @@ class CalibrationSpec(SpecModel):
         return self
 
 
+_REQUIRED = ("tgdsl", "fingers")
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """What one hand's counts mean.
@@ -168,7 +171,19 @@ def load_calibration(path: Path) -> Calibration:
     Raises:
         SpecError: All its mistakes, each at its place.
     """
-    spec, _ = read_spec(path, CalibrationSpec, ("tgdsl", "fingers"))
+    return _calibration(read_spec(path, CalibrationSpec, _REQUIRED)[0])
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """Read the text of a calibration file, whose mistakes then go by a name.
+
+    Raises:
+        SpecError: All its mistakes, each at its place.
+    """
+    return _calibration(parse_spec(text.encode(), name, CalibrationSpec, _REQUIRED)[0])
+
+
+def _calibration(spec: CalibrationSpec) -> Calibration:
     fingers = [getattr(spec.fingers, name) for name in FINGERS]
     return Calibration(
         spec.units,

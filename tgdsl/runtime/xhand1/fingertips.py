@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from tgdsl.errors import ObservationError
 from tgdsl.observations.observations import HAND_ONLY
-from tgdsl.observations.proprioception import QUANTITIES
+from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedObservation, PlannedSensor
 from tgdsl.runtime.xhand1.controls import JointControls
@@ -65,7 +65,7 @@ def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False
     found, problems = [], []
     for planned in plan.observations:
         try:
-            is_joint = planned.type in QUANTITIES
+            is_joint = planned.type in PROPRIOCEPTION
             found.append(_joint_term(plan, planned, is_log) if is_joint else _hand_term(plan, planned, contact_threshold))
         except ObservationError as error:
             problems.append(f"  {_label(planned)}: {error}")
@@ -76,7 +76,7 @@ def hand_terms(plan: Plan, contact_threshold: float | None, is_log: bool = False
 
 def warn_of_noise(plan: Plan) -> None:
     """Warn that the noise of sensors that are observed is not added to what a real hand says."""
-    observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading not in (None, *QUANTITIES)]
+    observed = [plan.sensor_of(term.reading) for term in plan.observations if term.reading not in (None, *PROPRIOCEPTION)]
     noisy = sorted({sensor.sensor for sensor in observed if sensor.noise is not None})
     if noisy:
         what = f"the noise of {', '.join(noisy)} is that of a simulated sensor"
@@ -89,7 +89,7 @@ def finger_of(body: str) -> int | None:
 
 
 def _label(planned: PlannedObservation) -> str:
-    of = f" of {planned.reading}" if planned.reading not in (None, *QUANTITIES) else ""
+    of = f" of {planned.reading}" if planned.reading not in (None, *PROPRIOCEPTION) else ""
     return f"{planned.group}[{planned.index}] {planned.type}{of}"
 
 

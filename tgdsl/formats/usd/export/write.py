@@ -22,7 +22,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import FileError, RobotError, listed
-from tgdsl.files.files import whole_file
+from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
@@ -203,7 +203,7 @@ def _unsupported_elements(writer: StageWriter) -> list[str]:
 def _write(writer: StageWriter, out: Path) -> None:
     """Write the stage to a file that is whole whenever it is there."""
     try:
-        with whole_file(out) as temporary:
+        with atomic_path(out) as temporary:
             if not writer.stage.GetRootLayer().Export(str(temporary)):
                 raise OSError(0, "USD did not say why")
     except FileError as error:

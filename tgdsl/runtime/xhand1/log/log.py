@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import struct
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -29,7 +28,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from tgdsl.errors import TgdslError
-from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
+from tgdsl.runtime.xhand1.calibration import Calibration, parse_calibration
 from tgdsl.runtime.xhand1.identity import HandIdentity
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire import errors
@@ -270,12 +269,11 @@ IDENTITY_BYTES = ("version", "side", "serial_number", "name")
 
 
 def _calibration(about: dict[str, Any]) -> Calibration | None:
-    if about["calibration"] is None:
+    if (text := about["calibration"]) is None:
         return None
-    with tempfile.TemporaryDirectory(prefix="tgdsl-") as folder:
-        file = Path(folder) / "calibration.yaml"
-        file.write_text(about["calibration"], encoding="utf-8")
-        return load_calibration(file)
+    if not isinstance(text, str):
+        raise TypeError(f"calibration is of type {type(text).__name__}, expected str")
+    return parse_calibration(text, "calibration")
 
 
 def _damaged(path: Path, error: BaseException) -> LogError:

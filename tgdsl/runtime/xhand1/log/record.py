@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from tgdsl.files.files import naming, whole
+from tgdsl.files.write import as_file_error, atomic_open
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.identity import HandIdentity
@@ -109,7 +109,7 @@ class LogWriter:
             event.sequence > last.sequence and event.requested_at >= last.requested_at and event.received_at >= last.received_at
         ):
             raise LogError(f"{self._path}: reading {event.sequence} is not newer than reading {last.sequence}")
-        with naming(self._path):
+        with as_file_error(self._path):
             self._spool.write(_record(event).tobytes())
         self._newest = event
         self.num_readings += 1
@@ -128,7 +128,7 @@ class LogWriter:
             self.num_readings = spool.seek(0, os.SEEK_END) // RECORD.itemsize  # Ctrl-C may have struck within `add`
             if not self.num_readings:
                 raise LogError(f"{self._path}: not one reading came, so nothing was written")
-            with whole(self._path) as file:
+            with atomic_open(self._path) as file:
                 self._write(file, spool)
                 file.flush()
                 os.fsync(file.fileno())

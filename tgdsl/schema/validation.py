@@ -1,4 +1,4 @@
-"""Plain values to models: pydantic's faults in the words of the document, and the rest of it still read."""
+"""Plain values to models: pydantic's errors in the words of the document, and the rest of it still read."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from tgdsl.errors import Problem, did_you_mean
 from tgdsl.schema import yaml
@@ -19,7 +20,7 @@ DISCRIMINATORS = ("kind", "method", "type")
 """Keys whose value says as what a mapping is read: pydantic's error locations hold that value as if it were a key."""
 
 
-def read_as(
+def validate(
     source: Source, prefix: Path, model: type[BaseModel], problems: list[Problem], required: tuple[str, ...]
 ) -> BaseModel | None:
     """Read a mapping as a model; note every mistake, leave faulty entries out, and read what is left."""
@@ -27,14 +28,14 @@ def read_as(
     known: dict[int, type[BaseModel]] = {}
     try:
         return model.model_validate(value, context=known)
-    except ValidationError as error:
-        faults = error.errors()
+    except ValidationError as found:
+        errors = found.errors()
     entries: set[Path] = set()
-    for fault in faults:
-        path = _raw_path(value, fault, known)
-        if not _is_follow_up(fault):
-            problems.append(_translated(source, prefix, value, path, fault, known))
-        entries.add(path if fault["type"] == "extra_forbidden" else _entry(path))
+    for error in errors:
+        path = _raw_path(value, error, known)
+        if not _is_follow_up(error):
+            problems.append(_problem(source, prefix, value, path, error, known))
+        entries.add(path if error["type"] == "extra_forbidden" else _entry(path))
     return _rest(value, model, entries, required) if isinstance(value, dict) else None
 
 
@@ -48,24 +49,24 @@ def _rest(value: dict, model: type[BaseModel], entries: set[Path], required: tup
     known: dict[int, type[BaseModel]] = {}
     try:
         return model.model_validate(rest, context=known)
-    except ValidationError as error:
-        more = {_entry(_raw_path(rest, fault, known)) for fault in error.errors()}
+    except ValidationError as found:
+        more = {_entry(_raw_path(rest, error, known)) for error in found.errors()}
         return _rest(rest, model, more, required) if more and () not in more and rest != value else None
 
 
-def _is_follow_up(fault: Any) -> bool:
-    """Return whether a fault only repeats another: of a value that is no YAML, or of items that have faults themselves."""
-    found, context = fault["input"], fault.get("ctx", {})
-    return found is yaml.Unreadable or (fault["type"] == "too_short" and len(found) >= context["min_length"])
+def _is_follow_up(error: ErrorDetails) -> bool:
+    """Return whether an error only repeats another: of a value that is no YAML, or of items that have errors themselves."""
+    found, context = error["input"], error.get("ctx", {})
+    return found is yaml.Unreadable or (error["type"] == "too_short" and len(found) >= context["min_length"])
 
 
-def _raw_path(value: Any, fault: Any, known: Mapping[int, type[BaseModel]]) -> Path:
-    """Return the path through the plain value to where pydantic found a fault: without the tags of unions, no keys."""
+def _raw_path(value: Any, error: ErrorDetails, known: Mapping[int, type[BaseModel]]) -> Path:
+    """Return the path through the plain value to where pydantic found an error: without the tags of unions, no keys."""
     path: list[str | int] = []
-    location = fault["loc"]
+    location: tuple[Any, ...] = error["loc"]
     is_tagged = False
     for i, part in enumerate(location):
-        if i == len(location) - 1 and fault["type"] in ("missing", "extra_forbidden"):
+        if i == len(location) - 1 and error["type"] in ("missing", "extra_forbidden"):
             return (*path, part)
         if isinstance(value, dict):
             model = known.get(id(value))
@@ -103,11 +104,11 @@ def _remove(value: Any, path: Path) -> None:
         del parent[key]
 
 
-def _translated(
-    source: Source, prefix: Path, value: Any, path: Path, fault: Any, known: Mapping[int, type[BaseModel]]
+def _problem(
+    source: Source, prefix: Path, value: Any, path: Path, error: ErrorDetails, known: Mapping[int, type[BaseModel]]
 ) -> Problem:
     """Return one of pydantic's errors in the words of the document."""
-    kind, context, found = fault["type"], fault.get("ctx", {}), fault["input"]
+    kind, context, found = error["type"], error.get("ctx", {}), error["input"]
     full = (*prefix, *path)
     if kind == "extra_forbidden":
         parent = value
@@ -115,7 +116,7 @@ def _translated(
             parent = parent[part]
         fields = known[id(parent)].model_fields if id(parent) in known else {}
         return source.problem(full, f'unknown key "{path[-1]}"', did_you_mean(str(path[-1]), fields, "keys"), on_key=True)
-    if fault["loc"][-1:] == ("[key]",):
+    if error["loc"][-1:] == ("[key]",):
         what = f'"{path[-1]}" is not a name, expected letters, digits, "_" and "-", first a letter or "_"'
         return source.problem(full, what, on_key=True)
     if kind == "missing" and isinstance(path[-1], int):
@@ -133,14 +134,14 @@ def _translated(
     if kind == "value_error":
         return source.problem(full, str(context["error"]))
     if kind == "region":
-        return source.problem(full, fault["msg"])
+        return source.problem(full, error["msg"])
     if kind == "too_short":
         return source.problem(full, f"found {_brief(found)}, expected at least {context['min_length']} entry")
     if kind == "too_long":
         return source.problem(full, f"found {_brief(found)}, expected {context['max_length']} entries")
     if _wanted(kind):
         return source.problem(full, f"found {_brief(found)}, expected {_wanted(kind)}")
-    message = fault["msg"][0].lower() + fault["msg"][1:]
+    message = error["msg"][0].lower() + error["msg"][1:]
     return source.problem(full, f"found {_brief(found)}: {message}")
 
 

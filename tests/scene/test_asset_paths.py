@@ -15,7 +15,7 @@ import tgdsl
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.compiler.scene import scene_file
 from tgdsl.errors import ArtifactError, RobotError
-from tgdsl.files.files import robots_folder
+from tgdsl.files.find import robots_folder
 from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.plan.inputs import Inputs

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from hand_logs import random_readings, write_log
 
-from tgdsl.files.files import whole_file, write_whole
+from tgdsl.errors import FileError
+from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all
 
 REPOSITORY = Path(__file__).parents[2]
 SCRIPT = """
@@ -34,7 +35,7 @@ WRITTEN = ("a.safetensors", "a.npz", "log.npz", "a.usda")
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
 def test_permissions_are_those_of_a_new_file(tmp_path, umask):
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    command = [sys.executable, "-W", "ignore", "-c", SCRIPT, str(tmp_path), str(REPOSITORY / "tests")]
+    command = [sys.executable, "-W", "ignore", "-c", SCRIPT, str(tmp_path), str(REPOSITORY / "tests" / "helpers")]
     run = subprocess.run(command, env=environment, umask=umask, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     expected = (tmp_path / "plain").stat().st_mode & 0o777
@@ -49,7 +50,7 @@ def test_the_process_keeps_its_umask(tmp_path, monkeypatch):
         raise AssertionError("the umask was changed")
 
     monkeypatch.setattr(os, "umask", refuse)
-    write_whole(tmp_path / "a.txt", b"text")
+    atomic_write(tmp_path / "a.txt", b"text")
     write_log(tmp_path / "a.npz", random_readings(np.arange(3.0)))
     assert (tmp_path / "a.txt").read_bytes() == b"text"
 
@@ -59,7 +60,7 @@ def test_a_file_takes_the_place_of_another_or_leaves_it(tmp_path):
     target.write_text("old")
 
     def fail_half_way():
-        with whole_file(target) as temporary:
+        with atomic_path(target) as temporary:
             temporary.write_text("half")
             raise ZeroDivisionError
 
@@ -67,8 +68,28 @@ def test_a_file_takes_the_place_of_another_or_leaves_it(tmp_path):
         fail_half_way()
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert target.read_text() == "old"
-    with whole_file(target) as temporary:
+    with atomic_path(target) as temporary:
         assert (temporary.parent, temporary.suffix) == (tmp_path, ".txt")
         temporary.write_text("new")
     assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
     assert target.read_text() == "new"
+
+
+def test_files_that_belong_together_appear_together(tmp_path):
+    model, mesh = tmp_path / "a.xml", tmp_path / "assets" / "a.obj"
+    model.write_text("old")
+    (tmp_path / "assets" / "folder.obj").mkdir(parents=True)
+    with pytest.raises(FileError, match=r"folder\.obj: this is a folder, expected a file's name$"):
+        atomic_write_all({mesh: b"mesh", tmp_path / "assets" / "folder.obj": b"", model: b"new"})
+    assert model.read_text() == "old"
+    assert [path.name for path in (tmp_path / "assets").iterdir()] == ["folder.obj"]
+    atomic_write_all({mesh: b"mesh", model: b"new"})
+    assert (model.read_bytes(), mesh.read_bytes()) == (b"new", b"mesh")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.obj", "a.xml", "assets", "folder.obj"]
+
+
+def test_a_folder_made_for_files_that_failed_goes_again(tmp_path):
+    (tmp_path / "a.xml").mkdir()
+    with pytest.raises(FileError, match=r"a\.xml: this is a folder"):
+        atomic_write_all({tmp_path / "a.xml": b"", tmp_path / "assets" / "a.obj": b"mesh"})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.xml"]

@@ -1,19 +1,16 @@
-"""Taxels as dots: where they are in the world, and how much they read.
+"""Readings as markers at their taxels: where these are in the world, and how much they read.
 
 Shapes: `taxel` taxels of one sensor or layout, `body` bodies of the model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tgdsl.module.history import last_step
@@ -21,34 +18,13 @@ from tgdsl.module.memory import Memory
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator
+from tgdsl.view.taxels import Pose, Taxels, in_world
 
 Array = np.ndarray
 
 
-class Pose(NamedTuple):
-    """Bodies in the world at one instant: origins [m], and orientations as quaternions w, x, y, z."""
-
-    pos: Float[Array, "body 3"]
-    quat: Float[Array, "body 4"]
-
-
 @dataclass(frozen=True, eq=False)
-class Taxels:
-    """Taxels in the world.
-
-    Attributes:
-        pos: Position in the world [m].
-        normal: Outward unit normal in the world.
-        size: Width of the patch that the taxel stands for [m]; 0 marks an inactive filler.
-    """
-
-    pos: Float[Array, "taxel 3"]
-    normal: Float[Array, "taxel 3"]
-    size: Float[Array, " taxel"]
-
-
-@dataclass(frozen=True, eq=False)
-class Dots(Taxels):
+class Markers(Taxels):
     """The rows of one reading in one environment: taxels, or bodies, and what they read.
 
     Attributes:
@@ -107,10 +83,10 @@ class Dots(Taxels):
         return named if named != summary else f"{self.quantity} {summary}"
 
 
-def dots_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Dots:
+def markers_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor, env: int) -> Markers:
     """Return where the taxels of a reading are in one environment, and what they read.
 
-    A reading of bodies has one dot for each, amid its taxels.
+    A reading of bodies has one marker for each, amid its taxels.
 
     Args:
         touch: The module.
@@ -136,7 +112,7 @@ def dots_of(touch: TactileModule, sim: Simulator, output: Output, values: Tensor
     unit, scale = "" if output.units[0] == "1" else output.units[0], 1.0
     if unit and 0 < value.max() < 0.1:
         scale, unit = (1e3, f"m{unit}") if value.max() >= 1e-4 else (1e6, f"µ{unit}")
-    return Dots(
+    return Markers(
         pos=pos,
         normal=normal,
         size=size,
@@ -171,12 +147,3 @@ def touched(
     with torch.no_grad():
         signal = touch.core(tensors, memory)[0][f"{sensor.name}/signal"]
     return np.array(signal[env].cpu().numpy().any(axis=0))
-
-
-def in_world(
-    model: mujoco.MjModel, pose: Pose, bodies: Iterable[str], pos: Float[Array, "taxel 3"], normal: Float[Array, "taxel 3"]
-) -> tuple[Float[Array, "taxel 3"], Float[Array, "taxel 3"]]:
-    """Return positions and normals in the world of taxels given in the frames of their bodies, which go by name."""
-    body = np.array([model.body(name).id for name in bodies], dtype=np.int64)
-    rotation = Rotation.from_quat(pose.quat[body], scalar_first=True)
-    return pose.pos[body] + rotation.apply(np.array(pos)), rotation.apply(np.array(normal))  # SciPy wants writable arrays

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgdsl.console.live import LiveTable
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.log.log import Fault
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, JOINTS
-from tgdsl.view.table import LiveTable
 
 BAR = 32
 """Width of a full bar [characters]."""
@@ -22,7 +22,7 @@ _RATE_OVER_S = 1.0
 
 
 @dataclass(frozen=True)
-class Pulse:
+class StreamStats:
     """How the readings come.
 
     Attributes:
@@ -36,7 +36,7 @@ class Pulse:
     fault: Fault | None
 
 
-class PulseCounter:
+class StreamCounter:
     """Counts readings and failures as they come."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class PulseCounter:
         self._num_faults = 0
         self._fault: Fault | None = None
 
-    def add(self, event: Reading | Fault) -> Pulse:
+    def add(self, event: Reading | Fault) -> StreamStats:
         """Take a reading or a failure and return how they come."""
         if isinstance(event, Fault):
             self._fault, self._num_faults = event, self._num_faults + 1
@@ -56,7 +56,7 @@ class PulseCounter:
         while self._times and self._times[0] < now - _RATE_OVER_S:
             self._times.popleft()
         elapsed = self._times[-1] - self._times[0] if self._times else 0.0
-        return Pulse((len(self._times) - 1) / elapsed if elapsed > 0 else math.nan, self._num_faults, self._fault)
+        return StreamStats((len(self._times) - 1) / elapsed if elapsed > 0 else math.nan, self._num_faults, self._fault)
 
 
 class HandView:
@@ -71,7 +71,7 @@ class HandView:
         """
         self._calibration = calibration or Calibration.none()
         self._title = title
-        self._table, self._pulses = LiveTable(), PulseCounter()
+        self._table, self._counter = LiveTable(), StreamCounter()
         self._lines = [title, "not one reading came"]
         self._reading: Reading | None = None
 
@@ -82,12 +82,12 @@ class HandView:
             event: What came.
             now: The time on its clock [s]; default: that of this moment.
         """
-        pulse = self._pulses.add(event)
+        stats = self._counter.add(event)
         if not isinstance(event, Fault):
             self._reading = event
         if self._reading is not None:
             age_s = self._reading.age_s(time.monotonic() if now is None else now)
-            self._lines = [self._title, *hand_lines(self._reading, self._calibration, pulse, age_s)]
+            self._lines = [self._title, *hand_lines(self._reading, self._calibration, stats, age_s)]
         self._table.show(self._lines)
 
     def end(self) -> None:
@@ -101,7 +101,7 @@ def bar(part: float, width: int = BAR) -> str:
     return "█" * (eighths // 8) + (_PARTS[eighths % 8] if eighths % 8 else "")
 
 
-def hand_lines(reading: Reading, calibration: Calibration, pulse: Pulse, age_s: float) -> list[str]:
+def hand_lines(reading: Reading, calibration: Calibration, stats: StreamStats, age_s: float) -> list[str]:
     """Return a hand's state as lines of text.
 
     Bars are full at what 255 counts along the sensor's z mean.
@@ -109,11 +109,11 @@ def hand_lines(reading: Reading, calibration: Calibration, pulse: Pulse, age_s: 
     Args:
         reading: The newest reading.
         calibration: What its counts mean.
-        pulse: How the readings come.
+        stats: How the readings come.
         age_s: How old the reading is [s].
     """
-    status = f"reading {reading.sequence}   age {1e3 * age_s:.0f} ms   {pulse.rate:.0f}/s   {pulse.num_faults} failures"
-    trouble = f"NO NEW READING: {pulse.fault.kind}: {pulse.fault.message}" if pulse.fault is not None else ""
+    status = f"reading {reading.sequence}   age {1e3 * age_s:.0f} ms   {stats.rate:.0f}/s   {stats.num_faults} failures"
+    trouble = f"NO NEW READING: {stats.fault.kind}: {stats.fault.message}" if stats.fault is not None else ""
     return [status, trouble, *_tip_lines(reading, calibration), "", *_joint_lines(reading)]
 
 

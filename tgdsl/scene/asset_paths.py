@@ -34,7 +34,7 @@ def check_scene(scene: SceneFile) -> None:
     """
     for asset in scene.assets:
         _check_key(asset.key, ENDINGS)
-        if wrong := _wrong_place(asset.path):
+        if wrong := _wrong_path(asset.path):
             raise ArtifactError(f'asset "{asset.path}" {wrong}')
     for key in scene.parts:
         _check_key(key, (".xml",))
@@ -49,7 +49,7 @@ def check_scene(scene: SceneFile) -> None:
                 )
 
 
-def located(asset: Asset, robots: Path) -> Path:
+def resolve_asset(asset: Asset, robots: Path) -> Path:
     """Return where an asset is, a file that is in its place itself and not by a link.
 
     Args:
@@ -79,7 +79,7 @@ def _check_key(key: str, endings: tuple[str, ...]) -> None:
         raise ArtifactError(f'the scene has a file by the name "{key}", expected a hash with the ending {listed(endings)}')
 
 
-def _wrong_place(path: str) -> str:
+def _wrong_path(path: str) -> str:
     """Return why a path cannot be that of an asset, or nothing."""
     inside = path.removeprefix(ROBOTS)
     is_own = inside != path

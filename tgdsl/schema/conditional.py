@@ -1,4 +1,4 @@
-"""JSON Schema whose alternatives are decided by what is found, so that an editor shows a mistake where it is.
+"""JSON Schema with `if`, `then` and `else` in the place of `anyOf`, so that an editor shows a mistake where it is.
 
 Of `anyOf` all that a validator can say is that no branch fits, at the whole value: a misspelt key somewhere in a sensor then
 underlines the sensor. Of `if` and `then` it says what is wrong in the one branch that is meant.
@@ -12,19 +12,21 @@ from typing import Any
 Schema = dict[str, Any]
 
 
-def decided(schema: Any, definitions: Mapping[str, Schema]) -> Any:
-    """Return a schema that accepts the same values, its alternatives decided by JSON type, by a key's value or by a key.
+def conditional(schema: Any, definitions: Mapping[str, Schema]) -> Any:
+    """Return a schema that accepts the same values, its alternatives told apart by JSON type, by a key's value or by a key.
 
     Args:
         schema: The schema, or a part of one.
         definitions: What its references lead to.
     """
     if isinstance(schema, list):
-        return [decided(part, definitions) for part in schema]
+        return [conditional(part, definitions) for part in schema]
     if not isinstance(schema, dict):
         return schema
     branches = _branches(schema)
-    found = {key: decided(value, definitions) for key, value in schema.items() if not branches or key not in ("anyOf", "oneOf")}
+    found = {
+        key: conditional(value, definitions) for key, value in schema.items() if not branches or key not in ("anyOf", "oneOf")
+    }
     if not branches:
         return found
     by_type: dict[str, list[Schema]] = {"object": [], "array": [], "": []}
@@ -32,11 +34,11 @@ def decided(schema: Any, definitions: Mapping[str, Schema]) -> Any:
         kind = str(_target(branch, definitions).get("type"))
         by_type[kind if kind in by_type else ""].append(branch)
     if len(by_type["array"]) > 1 or not (by_type["object"] or by_type["array"]):
-        return found | {"anyOf": [decided(branch, definitions) for branch in branches]}
+        return found | {"anyOf": [conditional(branch, definitions) for branch in branches]}
     objects = _of_objects(by_type["object"], definitions, _discriminator(schema))
-    chain: Schema = {"anyOf": [decided(leaf, definitions) for leaf in by_type[""]]} if by_type[""] else {}
+    chain: Schema = {"anyOf": [conditional(leaf, definitions) for leaf in by_type[""]]} if by_type[""] else {}
     if by_type["array"]:
-        chain = _if({"type": "array"}, decided(by_type["array"][0], definitions), chain or {"type": "object"})
+        chain = _if({"type": "array"}, conditional(by_type["array"][0], definitions), chain or {"type": "object"})
     return found | (_if({"type": "object"}, objects, chain) if chain and by_type["object"] else objects or chain)
 
 
@@ -60,7 +62,7 @@ def _target(schema: Schema, definitions: Mapping[str, Schema]) -> Schema:
 def _of_objects(branches: Sequence[Schema], definitions: Mapping[str, Schema], discriminator: Mapping[str, Any]) -> Schema:
     """Return one schema of several of mappings, told apart by the value of a key, or by a key that only one of them needs."""
     if len(branches) < 2:
-        return decided(branches[0], definitions) if branches else {}
+        return conditional(branches[0], definitions) if branches else {}
     chain: Schema = {}
     if key := discriminator.get("propertyName"):
         mapping: Mapping[str, str] = discriminator["mapping"]
@@ -71,9 +73,9 @@ def _of_objects(branches: Sequence[Schema], definitions: Mapping[str, Schema], d
     for i, branch in reversed(list(enumerate(branches))):
         only = sorted(needed[i].difference(*needed[:i], *needed[i + 1 :]))
         if not only:
-            return {"anyOf": [decided(part, definitions) for part in branches]}
+            return {"anyOf": [conditional(part, definitions) for part in branches]}
         named = {"anyOf": [{"required": [key]} for key in only]} if len(only) > 1 else {"required": only}
-        chain = _if(named, decided(branch, definitions), chain or {"anyOf": list(branches)})
+        chain = _if(named, conditional(branch, definitions), chain or {"anyOf": list(branches)})
     return {"type": "object"} | chain
 
 

@@ -12,9 +12,12 @@ import tgdsl
 from tgdsl.errors import TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.view.dots import Dots, Pose, dots_of
-from tgdsl.view.shot import Camera, camera_for, is_seen, rasterise, solid_of
-from tgdsl.view.view import picture, short_names
+from tgdsl.view.cameras import facing_camera
+from tgdsl.view.markers import Markers, markers_of
+from tgdsl.view.meshes import mesh_of
+from tgdsl.view.picture import picture, short_names
+from tgdsl.view.raster import Camera, rasterise
+from tgdsl.view.taxels import Pose, is_visible
 
 TOLERANCE = 1e-9  # metres and pixels: centimetres in float64, a rotation and a sum
 
@@ -70,14 +73,14 @@ def readings(touch: TactileModule, sim: BatchSimulation) -> dict[str, torch.Tens
     return touch(sim.state())
 
 
-def dots(touch: TactileModule, sim: BatchSimulation, readings: dict[str, torch.Tensor], name: str, env: int = 0) -> Dots:
+def markers(touch: TactileModule, sim: BatchSimulation, readings: dict[str, torch.Tensor], name: str, env: int = 0) -> Markers:
     output = next(output for output in touch.outputs if output.name == name)
-    return dots_of(touch, sim, output, readings[name], env)
+    return markers_of(touch, sim, output, readings[name], env)
 
 
-def some_dots(pos: list[list[float]], normal: list[list[float]], value: list[float]) -> Dots:
+def some_markers(pos: list[list[float]], normal: list[list[float]], value: list[float]) -> Markers:
     columns = (np.array(column, dtype=float) for column in (pos, normal, [0.001] * len(pos), value))
-    return Dots(*columns, "depth", "mm")
+    return Markers(*columns, "depth", "mm")
 
 
 # What is coloured ----------------------------------------------------------------------------------------------------
@@ -87,37 +90,37 @@ def some_dots(pos: list[list[float]], normal: list[list[float]], value: list[flo
 def test_colours_exactly_the_taxels_that_read(touch, sim, readings, env: int) -> None:
     for name, reading in readings.items():
         expected = (reading[env, :, :3] != 0).any(dim=-1).numpy()
-        np.testing.assert_array_equal(dots(touch, sim, readings, name, env).is_read, expected)
-    assert dots(touch, sim, readings, "depth", 0).is_read.any()
-    assert not dots(touch, sim, readings, "depth", 1).is_read.any()
+        np.testing.assert_array_equal(markers(touch, sim, readings, name, env).is_read, expected)
+    assert markers(touch, sim, readings, "depth", 0).is_read.any()
+    assert not markers(touch, sim, readings, "depth", 1).is_read.any()
 
 
 def test_magnitude_is_the_norm_over_channels_of_one_unit(touch, sim, readings) -> None:
-    shown = dots(touch, sim, readings, "touch")
+    shown = markers(touch, sim, readings, "touch")
     assert shown.label == "|force| [N]"
     np.testing.assert_allclose(shown.value, readings["touch"][0, :, :3].norm(dim=-1), rtol=1e-6)
 
 
 def test_small_values_get_a_prefix(touch, sim, readings) -> None:
-    shown = dots(touch, sim, readings, "depth")
+    shown = markers(touch, sim, readings, "depth")
     assert shown.label == "depth [mm]"
     np.testing.assert_allclose(shown.value, 1e3 * readings["depth"][0, :, 0].double(), rtol=1e-6)
 
 
 def test_dots_are_where_the_taxels_are(touch, sim, readings) -> None:
-    shown, table = dots(touch, sim, readings, "touch"), touch.taxels["touch"]
+    shown, table = markers(touch, sim, readings, "touch"), touch.taxels["touch"]
     origin = np.where((table["body"] == "pad")[:, None], [0, 0, 0.05], [0.1, 0, 0.05])
     np.testing.assert_allclose(shown.pos, table["pos"] + origin, atol=TOLERANCE)
     np.testing.assert_array_equal(shown.size == 0, table["radius"] == 0)
 
 
 def test_summary_adds_forces_but_not_depths() -> None:
-    depth = some_dots([[0, 0, 0]] * 3, [[0, 0, 1]] * 3, [1.0, 2.0, 0.0])
+    depth = some_markers([[0, 0, 0]] * 3, [[0, 0, 1]] * 3, [1.0, 2.0, 0.0])
     assert depth.summary() == "max 2 mm"
     assert depth.summary(np.array([2])) == "0 mm"
-    force = Dots(depth.pos, depth.normal, depth.size, depth.value, "|force|", "N")
+    force = Markers(depth.pos, depth.normal, depth.size, depth.value, "|force|", "N")
     assert force.summary() == "Σ 3 N · max 2 N"
-    contact = Dots(depth.pos, depth.normal, depth.size, np.sign(depth.value), "contact", "")
+    contact = Markers(depth.pos, depth.normal, depth.size, np.sign(depth.value), "contact", "")
     assert contact.summary() == "Σ 2"
 
 
@@ -133,7 +136,7 @@ def test_projection_by_hand() -> None:
 @pytest.mark.parametrize("normal", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, 0.8], [0, -1, 0]])
 def test_read_taxels_face_the_camera(normal: list[float]) -> None:
     away = [-part for part in normal]
-    camera = camera_for(some_dots([[0, 0, 0.1], [0, 0.1, 0]], [normal, away], [3.0, 1.0]), np.zeros(3))
+    camera = facing_camera(some_markers([[0, 0, 0.1], [0, 0.1, 0]], [normal, away], [3.0, 1.0]), np.zeros(3))
     axes = np.stack([camera.right, camera.up, camera.toward])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=TOLERANCE)
     assert np.linalg.det(axes) == pytest.approx(1)
@@ -143,26 +146,26 @@ def test_read_taxels_face_the_camera(normal: list[float]) -> None:
 def test_the_nearer_triangle_wins() -> None:
     """A square of 4 × 4 pixels at nearness 1 behind a triangle at nearness 2 that covers its lower left half."""
     square = [[[0, 0, 1], [3, 0, 1], [3, 3, 1]], [[0, 0, 1], [3, 3, 1], [0, 3, 1]]]
-    shot = rasterise(np.array([*square, [[0, 0, 2], [3, 0, 2], [0, 3, 2]]], dtype=float), 6, 5)
+    fragments = rasterise(np.array([*square, [[0, 0, 2], [3, 0, 2], [0, 3, 2]]], dtype=float), 6, 5)
     column, row = np.meshgrid(np.arange(6), np.arange(5))
     expected = np.where((column < 4) & (row < 4), np.where(column + row <= 3, 2.0, 1.0), -np.inf)
-    np.testing.assert_allclose(shot.near, expected, atol=TOLERANCE)
-    np.testing.assert_array_equal(shot.face == 2, expected == 2)
+    np.testing.assert_allclose(fragments.nearness, expected, atol=TOLERANCE)
+    np.testing.assert_array_equal(fragments.face == 2, expected == 2)
 
 
 def test_nearness_is_interpolated() -> None:
     corners = np.array([[[-2.0, -2, 0], [20, -2, 22], [-2, 20, 44]]])
-    shot = rasterise(corners, 5, 4)
+    fragments = rasterise(corners, 5, 4)
     column, row = np.meshgrid(np.arange(5), np.arange(4))
-    np.testing.assert_allclose(shot.near, (column + 2) + 2 * (row + 2), atol=TOLERANCE)
+    np.testing.assert_allclose(fragments.nearness, (column + 2) + 2 * (row + 2), atol=TOLERANCE)
 
 
 def test_hidden_taxels_are_not_seen() -> None:
-    shot = rasterise(np.array([[[0.0, 0, 0.01], [9, 0, 0.01], [0, 9, 0.01]]]), 10, 10)
+    fragments = rasterise(np.array([[[0.0, 0, 0.01], [9, 0, 0.01], [0, 9, 0.01]]]), 10, 10)
     camera = Camera(*np.eye(3), np.zeros(3))
-    shown = some_dots([[0, 0, 0]] * 4, [[0, 0, 1]] * 3 + [[0, 0, -1]], [1.0] * 4)
+    shown = some_markers([[0, 0, 0]] * 4, [[0, 0, 1]] * 3 + [[0, 0, -1]], [1.0] * 4)
     at = np.array([[2, 2, 0.01], [2, 2, 0.0], [8, 8, 0.0], [2, 2, 0.01]])  # on it, behind it, beside it, turned away
-    np.testing.assert_array_equal(is_seen(shown, at, shot, camera), [True, False, True, False])
+    np.testing.assert_array_equal(is_visible(shown, at, fragments, camera), [True, False, True, False])
 
 
 @pytest.mark.parametrize(
@@ -181,14 +184,14 @@ def test_shapes_are_where_mujoco_has_them(touch, shape: str, size: str, half: li
     spec = tgdsl.instrument(mujoco.MjSpec.from_string(scene), touch.inputs)
     sim = BatchSimulation(touch, 1, model=spec.compile())
     pose = Pose(sim.batch.xpos[0], sim.batch.xquat[0])
-    solid = solid_of(sim.batch.get_model(0), pose, {sim.model.body("it").id})
-    points = solid.corners.reshape(-1, 3)
+    mesh = mesh_of(sim.batch.get_model(0), pose, {sim.model.body("it").id})
+    points = mesh.corners.reshape(-1, 3)
     expected = np.array([half[1], half[2], half[0]])  # x of the body is y of the world
     centre = np.array([0, 0.1, 1])
     np.testing.assert_allclose(points.min(axis=0), centre - expected, atol=1e-4)
     np.testing.assert_allclose(points.max(axis=0), centre + expected, atol=1e-4)
-    outward = solid.corners.mean(axis=1) - centre
-    assert ((solid.normals.mean(axis=1) * outward).sum(axis=1) > 0).all()
+    outward = mesh.corners.mean(axis=1) - centre
+    assert ((mesh.normals.mean(axis=1) * outward).sum(axis=1) > 0).all()
 
 
 def test_short_names_drop_what_all_share() -> None:

@@ -1,0 +1,38 @@
+"""An emulated hand that no command may have moved, and serial ports that this computer seems to have."""
+
+import pytest
+from resting_hands import resting
+
+from tgdsl.runtime.xhand1.emulator.emulator import Emulator
+from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
+from tgdsl.runtime.xhand1.wire import ports
+from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
+from tgdsl.runtime.xhand1.wire.protocol import Command, Register
+from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
+
+ALLOWED = {Command.VERSION, Command.READ_REGISTER, Command.EXCHANGE}
+
+
+@pytest.fixture
+def emulator():
+    """A hand at rest; at the end, no request may have held a set-point that moves a joint."""
+    registers = {Register.SERIAL_NUMBER: b"X1-0042" + bytes(25), Register.NAME: b"\xff\x00", Register.SIDE: b"\x01"}
+    with Emulator(EmulatedHand(forces=resting, registers=registers)) as emulator:
+        yield emulator
+        assert {frame.command for _, frame in emulator.requests} <= ALLOWED
+        assert {frame.payload for _, frame in emulator.requests if frame.command == Command.EXCHANGE} <= {
+            encode_command(PASSIVE)
+        }
+        assert emulator.hand.is_passive
+        assert not emulator.hand.position.any()
+
+
+@pytest.fixture
+def plugged(monkeypatch):
+    """Say which serial ports this computer has."""
+
+    def plug(*devices: str) -> None:
+        found = tuple(PortInfo(device, "an adapter" if i == 0 else "", "") for i, device in enumerate(devices))
+        monkeypatch.setattr(ports, "list_ports", lambda: found)
+
+    return plug

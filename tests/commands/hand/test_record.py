@@ -1,0 +1,101 @@
+"""`tgdsl hand record` and `replay` against an emulated hand; and Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from resting_hands import TARE
+
+from tgdsl.runtime.xhand1.driver import XHand1
+from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
+from tgdsl.runtime.xhand1.log import record
+from tgdsl.runtime.xhand1.log.log import open_log
+from tgdsl.runtime.xhand1.wire.protocol import Command
+
+REPOSITORY = Path(__file__).parents[3]
+
+
+def test_record_and_replay(emulator, plugged, here, tmp_path):
+    plugged(emulator.device)
+    assert here(tmp_path, "hand", "tare", "-o", "hand.yaml")[0] == 0
+    code, said, error = here(tmp_path, "hand", "record", "logs/a.npz", "--seconds", "0.5", "--calibration", "hand.yaml")
+    assert code == 0, error
+    log = open_log(tmp_path / "logs" / "a.npz")
+    size = log.path.stat().st_size
+    assert said.splitlines()[-1] == f"logs/a.npz: {log.num_readings} readings, {len(log.faults)} failures, {size} bytes"
+    assert log.num_readings >= 1
+    assert log.identity is not None and log.identity.serial_number == b"X1-0042" + bytes(25)
+    assert log.calibration is not None and (log.calibration.tare == TARE).all()
+    code, said, error = here(tmp_path, "hand", "replay", "logs/a.npz", "--speed", "inf")
+    assert (code, error) == (0, "")
+    lines = said.splitlines()
+    assert lines[0].startswith(f"{emulator.device}: hand 0, version") and lines[0].endswith("(logs/a.npz)")
+    assert lines[4].split()[:5] == ["thumb", "0.00", "0.00", "0.00", "0.00"]
+    assert lines[-1] == f"{log.num_readings} readings, {len(log.faults)} failures in {log.seconds:.2f} s"
+    code, _, error = here(tmp_path, "hand", "record", "logs/a.npz", "--seconds", "0.1")
+    assert (code, "there already" in error) == (2, True)
+    code, _, error = here(tmp_path, "hand", "record", "b.npz", "--seconds", "0")
+    assert (code, error) == (2, "tgdsl: --seconds 0: expected more than 0\n")
+    assert not (tmp_path / "b.npz").exists()
+
+
+def test_replay_of_what_is_no_log(here, tmp_path):
+    (tmp_path / "a.npz").write_text("text")
+    code, _, error = here(tmp_path, "hand", "replay", "a.npz")
+    assert (code, error) == (2, "tgdsl: a.npz: this log is damaged, cut, or no .npz file: File is not a zip file\n")
+
+
+def test_a_recording_through_failures_shows_and_keeps_them(emulator, here, tmp_path, monkeypatch):
+    """The line is cut after ten readings, and a recording ends with the failures that follow."""
+    plain = record.events
+
+    def cut(hand, seconds):
+        num_faults = 0
+        for i, event in enumerate(plain(hand, seconds)):
+            if i == 10:
+                emulator.set_faults(Faults(silence=1.0))
+            yield event
+            num_faults += hasattr(event, "kind")
+            if num_faults == 3:
+                return
+
+    monkeypatch.setattr(record, "events", cut)
+    code, said, error = here(tmp_path, "hand", "record", "a.npz", "--port", emulator.device, "--hand-id", "0")
+    assert code == 0, error
+    assert "NO NEW READING: " in said
+    log = open_log(tmp_path / "a.npz")
+    assert len(log.faults) == 3
+    code, said, _ = here(tmp_path, "hand", "replay", "a.npz", "--speed", "1000")
+    assert code == 0
+    assert f"NO NEW READING: {log.faults[-1].kind}: {log.faults[-1].message}" in said
+
+
+@pytest.mark.parametrize("action", ["monitor", "record"])
+def test_ctrl_c_closes_the_port_and_keeps_the_log(emulator, tmp_path, action):
+    environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1"}
+    arguments = ["monitor"] if action == "monitor" else ["record", "a.npz"]
+    # What a shell starts in the background ignores SIGINT, and so do its children, tests among them.
+    heeding = "import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); runpy.run_module('tgdsl', run_name='__main__')"
+    command = [sys.executable, "-c", heeding, "hand", *arguments, "--port", emulator.device, "--hand-id", "0"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            while sum(frame.command == Command.EXCHANGE for _, frame in list(emulator.requests)) < 100:
+                assert process.poll() is None, process.communicate()
+                time.sleep(0.01)
+            process.send_signal(signal.SIGINT)
+            said, error = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert (process.returncode, error) == (0, "")
+    assert said.splitlines()[0].startswith(f"{emulator.device}: hand 0")
+    if action == "record":
+        assert open_log(tmp_path / "a.npz").num_readings >= 1
+        assert [file.name for file in tmp_path.iterdir()] == ["a.npz"]
+    with XHand1.open(emulator.device) as hand:  # the port is free again
+        hand.read(20.0)

@@ -1,0 +1,1 @@
+"""`tgdsl hand`, one file per command."""

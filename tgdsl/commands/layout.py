@@ -1,0 +1,35 @@
+"""`tgdsl layout new`: a proposal of where taxels sit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from tgdsl.commands.arguments import OUT, Replace, Robot
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Propose a layout for a robot: link groups, and taxels at three resolutions; every guess is marked in the file."""
+
+    action: Annotated[tyro.conf.Positional[Literal["new"]], tyro.conf.arg(metavar="new")]
+    """What to do: `new` proposes one."""
+    robot: Robot
+    density: str = "4/cm2"
+    """Taxels per area at the resolution `med`, such as 4/cm2 or 1e4/m2; `low` has a quarter of it, `high` four times it."""
+    groups: Literal["auto", "none"] = "auto"
+    """Whether to guess the link groups tips, palm, fingers and hand."""
+    out: Annotated[Path, OUT] = Path("layout.yaml")
+    """The file to write."""
+    force: Replace = False
+
+    def run(self) -> None:
+        """Write the layout and say what it holds."""
+        from tgdsl.placement.links import open_robot
+        from tgdsl.placement.propose.text import new_layout
+
+        for line in new_layout(open_robot(self.robot), self.density, self.groups == "auto", self.out, self.force):
+            print(line)

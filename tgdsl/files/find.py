@@ -1,0 +1,47 @@
+"""Where files are: those that a document names, and the robots that come with tgdsl."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import tgdsl
+
+_PACKAGE = Path(tgdsl.__file__).parent
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is such a file; unlike `Path.is_file`, also of names that no file can have."""
+    return os.path.isfile(path)
+
+
+def robots_folder() -> Path:
+    """Return the folder of the robots that come with tgdsl: in the installed package, or at the top of a checkout."""
+    installed = _PACKAGE / "_robots"
+    return installed if installed.is_dir() else _PACKAGE.parent / "robots"
+
+
+def robot_names() -> dict[str, Path]:
+    """Return the model file of each robot known by name; a folder's own name means its right hand."""
+    names: dict[str, Path] = {}
+    for folder in sorted(path for path in robots_folder().iterdir() if path.is_dir()):
+        for model in sorted(folder.glob("*.xml")):
+            names[model.stem] = model
+        if (folder / f"{folder.name}_right.xml").is_file():
+            names.setdefault(folder.name, folder / f"{folder.name}_right.xml")
+    return names
+
+
+def robot_file(model: str, folder: Path) -> Path | None:
+    """Return the file of a robot given by name or by a path relative to the document's folder; None if there is none."""
+    if model in (known := robot_names()):
+        return known[model]
+    path = folder / model
+    return path if is_file(path) else None
+
+
+def layout_file(model: Path) -> Path | None:
+    """Return the layout beside a model file: of `hand_left.xml` in `hand/` it is `layout_left.yaml`, or else `layout.yaml`."""
+    side = model.stem.removeprefix(f"{model.parent.name}_")
+    names = (f"layout_{side}.yaml", "layout.yaml")
+    return next((model.parent / name for name in names if (model.parent / name).is_file()), None)

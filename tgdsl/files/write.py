@@ -1,0 +1,138 @@
+"""Atomic writes: a file appears whole, or not at all, with the permissions of any new file; its folder; and what goes wrong.
+
+What is written goes to a temporary file beside the target, which then takes the target's place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO
+
+from tgdsl.errors import FileError
+
+TEMPORARY = re.compile(r"\.[0-9a-f]{16}")
+"""Stems of temporary files; one that is old was left by a process that was killed."""
+
+
+def check_writable(target: Path) -> Path:
+    """See that a file can be written, before the work that leads to it; nothing is made, its folder neither.
+
+    Returns:
+        The file.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    there = next(part for part in target.absolute().parents if part.exists())
+    if not there.is_dir():
+        raise FileError(target, f"{there} is a file, expected a folder")
+    with as_file_error(target):
+        _refuse_folder(target)
+        with tempfile.TemporaryFile(dir=there):
+            return target
+
+
+def with_folder(target: Path) -> Path:
+    """Make the folder of a file that is written next; return the file.
+
+    Raises:
+        FileError: If it cannot be made.
+    """
+    with as_file_error(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+    return target
+
+
+@contextmanager
+def atomic_path(target: Path) -> Iterator[Path]:
+    """Yield an empty temporary file of the target's suffix, for a library that writes to a path; then it replaces the target.
+
+    If anything is raised meanwhile it is removed, and the target stays as it was.
+
+    Raises:
+        FileError: If it cannot be written; the error names the target.
+    """
+    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+    with as_file_error(target):
+        _refuse_folder(target)
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))  # less what the process's umask takes away
+        try:
+            yield temporary
+            os.replace(temporary, target)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def atomic_open(target: Path) -> Iterator[IO[bytes]]:
+    """Open a file for writing bytes; when it is closed it replaces the target.
+
+    Raises:
+        FileError: If it cannot be written; the error names the target.
+    """
+    with atomic_path(target) as temporary, temporary.open("wb") as file:
+        yield file
+
+
+def atomic_write(target: Path, content: bytes) -> None:
+    """Write a file; one that is there is replaced.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    with atomic_open(target) as file:
+        file.write(content)
+
+
+def atomic_write_all(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together, and their folders: none takes its place before all are written, the last one last.
+
+    Raises:
+        FileError: If one cannot be written; then no folder is left that was not there.
+    """
+    with ExitStack() as stack:
+        for target, content in reversed(list(contents.items())):  # what was opened last is closed first
+            stack.enter_context(_new_folder(target))
+            stack.enter_context(atomic_path(target)).write_bytes(content)
+
+
+@contextmanager
+def as_file_error(target: Path) -> Iterator[None]:
+    """Have errors of the system name the file that the user asked for, whatever it is called meanwhile.
+
+    Raises:
+        FileError: Instead of any OSError.
+    """
+    try:
+        yield
+    except FileError:
+        raise
+    except OSError as error:
+        raise FileError(target, error.strerror or str(error)) from error
+
+
+@contextmanager
+def _new_folder(target: Path) -> Iterator[None]:
+    """Make the folder of a file, and remove it if anything is raised meanwhile and it was not there before."""
+    is_new = not target.parent.exists()
+    with_folder(target)
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with contextlib.suppress(OSError):  # another process has put something there
+                target.parent.rmdir()
+        raise
+
+
+def _refuse_folder(target: Path) -> None:
+    if target.is_dir():
+        raise FileError(target, "this is a folder, expected a file's name")

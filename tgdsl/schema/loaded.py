@@ -1,0 +1,76 @@
+"""A document and its layout: as found, as read, and what is wrong with them so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+from tgdsl.errors import Problem, SpecError
+from tgdsl.files import find
+from tgdsl.schema.document import Spec
+from tgdsl.schema.placement import LayoutSpec
+from tgdsl.schema.yaml import Path, Source
+
+
+@dataclass
+class LoadedLayout:
+    """A layout, as found and as read. The paths of its problems start at `prefix`, which is not empty if it is in line."""
+
+    spec: LayoutSpec
+    source: Source
+    prefix: Path
+    folder: FilePath
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path of the layout."""
+        return self.source.problem((*self.prefix, *path), what, hint, on_key)
+
+    def raw(self, path: Path) -> Any:
+        """Return the plain value at a path of the layout, or None."""
+        return self.source.get((*self.prefix, *path))
+
+
+@dataclass
+class Loaded:
+    """A document, as found and as read. With `problems`, faulty entries are left out of `spec`.
+
+    Attributes:
+        spec: The document.
+        source: Its text's values and places.
+        folder: Folder that file names in it are relative to.
+        layout: Its layout; None if that could not be read.
+        problems: Mistakes found so far; later stages add theirs.
+    """
+
+    spec: Spec
+    source: Source
+    folder: FilePath
+    layout: LoadedLayout | None
+    problems: list[Problem]
+
+    @property
+    def robot_file(self) -> FilePath | None:
+        """The robot's model file, if it exists."""
+        return find.robot_file(self.spec.robot.model, self.folder)
+
+    @property
+    def resolution(self) -> str | None:
+        """The resolution that is compiled: the one named, or the only one."""
+        if self.spec.resolution is not None or self.layout is None:
+            return self.spec.resolution
+        names = list(self.layout.spec.resolutions)
+        return names[0] if len(names) == 1 else None
+
+    def problem(self, path: Path, what: str, hint: str = "", on_key: bool = False) -> Problem:
+        """Return a mistake at a path of the document."""
+        return self.source.problem(path, what, hint, on_key)
+
+    def raw(self, path: Path) -> Any:
+        """Return the plain value at a path of the document, or None."""
+        return self.source.get(path)
+
+    def raise_problems(self) -> None:
+        """Raise all mistakes found so far, if any."""
+        if self.problems:
+            raise SpecError(self.problems)

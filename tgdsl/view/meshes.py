@@ -1,0 +1,70 @@
+"""The triangles of a model's bodies, and which bodies are the robot's.
+
+Shapes: `face` triangles.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from tgdsl.scene.scene import is_absent
+from tgdsl.view.raster import Mesh
+from tgdsl.view.taxels import Pose
+
+Array = np.ndarray
+GeomType = mujoco.mjtGeom
+_PRIMITIVES = {
+    GeomType.mjGEOM_BOX: lambda size: trimesh.creation.box(2 * size),
+    GeomType.mjGEOM_SPHERE: lambda size: trimesh.creation.icosphere(subdivisions=3, radius=size[0]),
+    GeomType.mjGEOM_ELLIPSOID: lambda size: trimesh.creation.icosphere(subdivisions=3).apply_scale(size),
+    GeomType.mjGEOM_CYLINDER: lambda size: trimesh.creation.cylinder(size[0], 2 * size[1], sections=64),
+    GeomType.mjGEOM_CAPSULE: lambda size: trimesh.creation.capsule(2 * size[1], size[0], count=[32, 32]),
+}
+
+
+def robot_bodies(model: mujoco.MjModel, carriers: set[int]) -> tuple[set[int], set[int]]:
+    """Return the bodies to fit in the view (the smallest subtree that holds all carriers of taxels), and all of the robot's."""
+    above = [[0]]
+    for body in range(1, model.nbody):
+        above.append([*above[model.body_parentid[body]], body])
+    roots = {int(model.body_rootid[body]) for body in carriers}
+    robot = {body for body in range(model.nbody) if model.body_rootid[body] in roots}
+    root = max(set.intersection(*(set(above[body]) for body in carriers)))
+    return {body for body in robot if root in above[body]}, robot
+
+
+def mesh_of(model: mujoco.MjModel, pose: Pose, bodies: set[int]) -> Mesh:
+    """Return the triangles of some bodies: of their geoms that collide, or else of all; planes not."""
+    parts = [Mesh(np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0, dtype=np.int64))]
+    for body in sorted(bodies):
+        own = [i for i in range(model.ngeom) if model.geom_bodyid[i] == body and not is_absent(model, i)]
+        for geom in [i for i in own if model.geom_contype[i] or model.geom_conaffinity[i]] or own:
+            corners, normals = _triangles(model, geom)
+            in_body = Rotation.from_quat(model.geom_quat[geom], scalar_first=True)
+            in_world = Rotation.from_quat(pose.quat[body], scalar_first=True)
+            centre = pose.pos[body] + in_world.apply(model.geom_pos[geom])
+            matrix = (in_world * in_body).as_matrix().T
+            parts.append(Mesh(corners @ matrix + centre, normals @ matrix, np.full(len(corners), body)))
+    return Mesh(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def _triangles(model: mujoco.MjModel, geom: int) -> tuple[Float[Array, "face 3 3"], Float[Array, "face 3 3"]]:
+    """Return corners and normals of a geom in its own frame; none of one without a bounded surface."""
+    kind, mesh = GeomType(int(model.geom_type[geom])), int(model.geom_dataid[geom])
+    if kind in (GeomType.mjGEOM_MESH, GeomType.mjGEOM_SDF) and mesh >= 0:
+        first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        vertices = model.mesh_face[first : first + count] + model.mesh_vertadr[mesh]
+        normals = model.mesh_facenormal[first : first + count] + model.mesh_normaladr[mesh]
+        return model.mesh_vert[vertices].astype(np.float64), model.mesh_normal[normals].astype(np.float64)
+    if kind not in _PRIMITIVES:
+        return np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+    shape = _PRIMITIVES[kind](model.geom_size[geom])
+    shape.apply_translation(-shape.bounds.mean(axis=0))  # trimesh puts capsules elsewhere in some versions
+    flat = kind in (GeomType.mjGEOM_BOX, GeomType.mjGEOM_CYLINDER)
+    return np.array(shape.triangles), shape.face_normals[:, None].repeat(3, axis=1) if flat else shape.vertex_normals[
+        shape.faces
+    ]

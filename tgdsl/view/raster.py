@@ -1,0 +1,150 @@
+"""A rasteriser: an orthographic camera, a z-buffer and diffuse shading, in NumPy; no GL, no display.
+
+Shapes: `face` triangles, `h` and `w` rows and columns of pixels, row 0 at the bottom.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Array = np.ndarray
+
+
+class Camera(NamedTuple):
+    """An orthographic camera: world unit vectors to the right and top of its image and to the viewer; the point it looks at."""
+
+    right: Float[Array, " 3"]
+    up: Float[Array, " 3"]
+    toward: Float[Array, " 3"]
+    centre: Float[Array, " 3"]
+
+    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """Return image x, image y and nearness to the camera [m], from the centre."""
+        return (points - self.centre) @ np.stack([self.right, self.up, self.toward]).T
+
+
+class Viewport(NamedTuple):
+    """The pixels that a part of a camera's image fills.
+
+    Attributes:
+        camera: The camera.
+        corner: The lower left pixel on the camera's image [m].
+        scale: Pixels per metre.
+        width: Number of columns.
+        height: Number of rows.
+    """
+
+    camera: Camera
+    corner: Float[Array, " 2"]
+    scale: float
+    width: int
+    height: int
+
+    def project(self, points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+        """Return column [pixel], row [pixel] and nearness to the camera [m]."""
+        placed = self.camera.project(points)
+        placed[..., :2] = (placed[..., :2] - self.corner) * self.scale
+        return placed
+
+
+class Mesh(NamedTuple):
+    """Triangles in the world: corners [m], unit normals at the corners, and the body of each."""
+
+    corners: Float[Array, "face 3 3"]
+    normals: Float[Array, "face 3 3"]
+    body: Int[Array, " face"]
+
+
+class Fragments(NamedTuple):
+    """What each pixel shows: nearness to the camera [m] (−inf: nothing), the face, and its barycentric weights there."""
+
+    nearness: Float[Array, "h w"]
+    face: Int[Array, "h w"]
+    weights: Float[Array, "h w 3"]
+
+
+def viewport_for(camera: Camera, box: Float[Array, "2 2"], width: int, height: int) -> Viewport:
+    """Return the viewport that shows a part of the camera's image, lower and upper corner [m], as large as it can."""
+    scale = min(width / (box[1, 0] - box[0, 0]), height / (box[1, 1] - box[0, 1]))
+    return Viewport(camera, box.mean(axis=0) - np.array([width, height]) / 2 / scale, scale, width, height)
+
+
+def rasterise(corners: Float[Array, "face 3 3"], width: int, height: int) -> Fragments:
+    """Return what each pixel shows: the nearest triangle, by z-buffer.
+
+    Args:
+        corners: Corners as (column [pixel], row [pixel], nearness [m]).
+        width: Number of columns.
+        height: Number of rows.
+    """
+    face, row, left, right = _scanlines(corners, width, height)
+    count = np.maximum(right - left + 1, 0)
+    inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    face, row, column = np.repeat(face, count), np.repeat(row, count), np.repeat(left, count) + inside
+    edges = corners[:, 1:, :2] - corners[:, :1, :2]
+    inverse = np.linalg.pinv(edges) if len(edges) else edges
+    relative = np.stack([column, row], axis=-1) - corners[face, 0, :2]
+    second = np.einsum("pi,pij->pj", relative, inverse[face])
+    weights = np.clip(np.column_stack([1 - second.sum(axis=1), second]), 0, 1)
+    nearness = (weights * corners[face, :, 2]).sum(axis=1)
+    pixel = row * width + column
+    nearest = np.full(height * width, -np.inf)
+    np.maximum.at(nearest, pixel, nearness)
+    won = nearness == nearest[pixel]
+    fragments = Fragments(nearest, np.full(height * width, -1), np.zeros((height * width, 3)))
+    fragments.face[pixel[won]] = face[won]
+    fragments.weights[pixel[won]] = weights[won]
+    return Fragments(*(part.reshape(height, width, *part.shape[1:]) for part in fragments))
+
+
+def _scanlines(corners: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
+    """Return face, row, first and last column of each run of pixels that a triangle covers in a row."""
+    low = np.clip(np.ceil(corners[:, :, 1].min(axis=1)), 0, height).astype(int)
+    high = np.clip(np.floor(corners[:, :, 1].max(axis=1)), -1, height - 1).astype(int)
+    count = np.maximum(high - low + 1, 0)
+    face = np.repeat(np.arange(len(corners)), count)
+    row = np.repeat(low, count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    left, right = np.full(len(face), np.inf), np.full(len(face), -np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        (x, y), (x_end, y_end) = corners[face, first, :2].T, corners[face, second, :2].T
+        rise = np.where(y_end == y, np.nan, y_end - y)
+        part = (row - y) / rise
+        crossing = np.where((part >= 0) & (part <= 1), x + part * (x_end - x), np.nan)
+        left, right = np.fmin(left, crossing), np.fmax(right, crossing)
+    left, right = np.where(left > right, 1, left), np.where(left > right, 0, right)
+    first = np.clip(np.ceil(left - 1e-9), 0, width).astype(int)
+    return face, row, first, np.clip(np.floor(right + 1e-9), -1, width - 1).astype(int)
+
+
+def shade(image: Array, fragments: Fragments, mesh: Mesh, colour: Array, camera: Camera, opacity: float, scale: float) -> Array:
+    """Return the image with a mesh drawn over it: lit from the upper right, edges in depth drawn dark."""
+    drawn = fragments.face >= 0
+    face, weights = fragments.face[drawn], fragments.weights[drawn]
+    normal = np.einsum("pi,pij->pj", weights, mesh.normals[face])
+    normal *= np.where(normal @ camera.toward < 0, -1, 1)[:, None]
+    lit = 0.55 + 0.5 * np.clip(normal @ light_direction(camera), 0, 1)
+    image[drawn] += opacity * (np.minimum(colour[face] * lit[:, None], 1) - image[drawn])
+    near = np.where(drawn, fragments.nearness, -1.0)
+    jump = np.maximum(*(np.abs(np.diff(near, axis=axis, append=near.take([-1], axis))) for axis in (0, 1)))
+    image[jump > np.maximum(6 / scale, 0.002)] *= 0.62
+    return image
+
+
+def light_direction(camera: Camera) -> Float[Array, " 3"]:
+    """Return the direction to the light: behind the camera, to the upper right."""
+    return unit(0.85 * camera.toward + 0.4 * camera.up + 0.35 * camera.right, camera.toward)
+
+
+def downsample(image: Float[Array, "h w 3"], factor: int) -> Array:
+    """Return an image with `factor` times fewer rows and columns, each pixel the mean of those that it replaces."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    return image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
+
+
+def unit(vector: Array, otherwise: Array) -> Array:
+    """Return a vector at unit length, or another one where it vanishes."""
+    length = np.linalg.norm(vector)
+    return vector / length if length > 1e-9 else otherwise

@@ -1,0 +1,115 @@
+"""The robot and the felt objects as pixels, and markers on top.
+
+Shapes: `h` and `w` rows and columns of pixels.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.source import Simulator
+from tgdsl.view.cameras import best_camera, camera_of
+from tgdsl.view.markers import Markers
+from tgdsl.view.meshes import mesh_of, robot_bodies
+from tgdsl.view.raster import Fragments, Viewport, downsample, rasterise, shade, viewport_for
+from tgdsl.view.style import DPI, HEAT, INK, SUPERSAMPLING
+from tgdsl.view.taxels import Pose, is_visible
+
+Array = np.ndarray
+_SENSING, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
+
+
+class RenderedScene(NamedTuple):
+    """The robot and the felt objects as pixels, row 0 at the bottom, and how they were drawn."""
+
+    image: Float[Array, "h w 3"]
+    fragments: Fragments
+    viewport: Viewport
+
+
+def render_scene(
+    touch: TactileModule, sim: Simulator, markers: Markers, env: int, width: int, height: int, view: str | None = None
+) -> RenderedScene:
+    """Draw robot and felt objects, seen from where some taxels are in view.
+
+    Args:
+        touch: The module.
+        sim: The scene.
+        markers: The taxels.
+        env: Which environment.
+        width: Columns, before `SUPERSAMPLING` of them become one pixel.
+        height: Rows, likewise.
+        view: From where; default: see `cameras.best_camera`.
+    """
+    model, pose = sim.model, Pose(*sim.body_poses(env))
+    carriers = {model.body(link.body).id for link in touch.plan.layout.links}
+    framed, robot = robot_bodies(model, carriers)
+    felt = {model.body(target.body).id for target in touch.plan.objects}
+    hand, objects = (mesh_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
+    frame = np.isin(hand.body, list(framed))
+    layout, root = touch.plan.layout, min(framed)
+    camera = (
+        best_camera(markers, hand, model, layout, pose, root) if view is None else camera_of(view, model, [layout], pose, root)
+    )
+    box = _bounds(camera.project(hand.corners[frame] if frame.any() else markers.pos[:, None]), camera.project(objects.corners))
+    viewport = viewport_for(camera, box, width, height)
+    fragments = rasterise(viewport.project(hand.corners), width, height)
+    colour = np.where(np.isin(hand.body, list(carriers))[:, None], _SENSING, _OTHER)
+    image = shade(np.ones((height, width, 3)), fragments, hand, colour, camera, 1.0, viewport.scale)
+    over = rasterise(viewport.project(objects.corners), width, height)
+    over.face[over.nearness < fragments.nearness] = -1
+    image = shade(image, over, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, viewport.scale)
+    return RenderedScene(downsample(image, SUPERSAMPLING), fragments, viewport)
+
+
+def draw_markers(axes: Axes, scene: RenderedScene, markers: Markers, norm: Normalize) -> None:
+    """Draw taxels on their scene; those behind a surface of the robot as rings if they read, else not at all."""
+    viewport = scene.viewport
+    draw_image(axes, scene.image, viewport)
+    at = viewport.project(markers.pos)
+    seen = is_visible(markers, at, scene.fragments, viewport.camera)
+    size = np.minimum(markers.size, np.median(markers.size))
+    area = (np.clip(0.62 * viewport.scale / SUPERSAMPLING * size, 3.5, 20.0) * 72 / DPI) ** 2
+    shown, hidden, rest = seen & markers.is_read, ~seen & markers.is_read, seen & ~markers.is_read & (markers.size > 0)
+    axes.scatter(*at[rest, :2].T, s=0.3 * area[rest], c="#8d949e", linewidths=0, zorder=3)
+    ring = HEAT(norm(markers.value[hidden]))
+    axes.scatter(*at[hidden, :2].T, s=0.6 * area[hidden], facecolors="none", edgecolors=list(ring), linewidths=1.0, zorder=4)
+    order = np.argsort(markers.value[shown], kind="stable")
+    place, value, size = at[shown, :2][order], markers.value[shown][order], area[shown][order]
+    axes.scatter(*place.T, s=size, c=value, cmap=HEAT, norm=norm, edgecolors=INK, linewidths=0.5, zorder=5)
+    draw_scale_bar(axes, viewport.scale, viewport.width, -44.0)
+
+
+def draw_image(axes: Axes, image: Float[Array, "h w 3"], viewport: Viewport) -> None:
+    """Fill axes with an image, so that their coordinates are those of the viewport [pixel]."""
+    extent = (-0.5, viewport.width - 0.5, -0.5, viewport.height - 0.5)
+    axes.imshow(image, origin="lower", extent=extent, interpolation="nearest", aspect="auto")
+    axes.set_axis_off()
+    axes.autoscale(False)
+
+
+def draw_scale_bar(axes: Axes, scale: float, width: int, row: float) -> None:
+    """Draw a round number of millimetres at the left of a row [pixel], for a view of `scale` pixels per metre."""
+    steps = np.array([1, 2, 5, 10, 20, 50, 100, 200, 500, 1000])
+    length = steps[np.abs(steps * scale / 1000 / width - 0.12).argmin()]
+    end = 8 + length * scale / 1000
+    axes.plot([8, end], [row, row], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False)
+    axes.text(end + 16, row - 1, f"{length} mm", fontsize=9.5, color=INK, va="center")
+
+
+def _bounds(hand: Array, objects: Array) -> Array:
+    """Return the lower and upper corner of what is to be seen: the hand, and objects unless they are far off."""
+    low, high = hand[..., :2].min(axis=(0, 1)), hand[..., :2].max(axis=(0, 1))
+    room = 0.3 * (high - low).max()
+    if len(objects):
+        near = objects[..., :2].reshape(-1, 2)
+        near = near[((near > low - room) & (near < high + room)).all(axis=1)]
+        low, high = np.vstack([near, [low]]).min(axis=0), np.vstack([near, [high]]).max(axis=0)
+    margin = 0.03 * (high - low).max()
+    return np.stack([low - margin, high + margin])
