@@ -70,7 +70,9 @@ def room_of(name: str) -> str:
 
 def own(file: Path) -> list[str]:
     """Return the modules of tgdsl that a file imports, as names below tgdsl; `import tgdsl` itself is ''."""
-    names = [name.removeprefix("tgdsl").lstrip(".") for name, _ in imports(file) if name == "tgdsl" or name.startswith("tgdsl.")]
+    names = [
+        name.removeprefix("tgdsl").lstrip(".") for name, _ in imports(file) if name == "tgdsl" or name.startswith("tgdsl.")
+    ]
     return [name if name in MODULES or not name else name.rpartition(".")[0] for name in names]
 
 

@@ -5,8 +5,10 @@ import subprocess
 import sys
 
 import pytest
+import torch.library
 
-from tgdsl.tensors.fusion import HAS_TRITON
+from tgdsl.tensors import operations
+from tgdsl.tensors.operations import HAS_TRITON
 
 needs_triton = pytest.mark.skipif(not HAS_TRITON, reason="Triton is not installed")
 
@@ -20,3 +22,9 @@ def interpreted(path: str, *arguments: str) -> str:
     run = subprocess.run([sys.executable, path, *arguments], env=os.environ | chosen, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-4000:]
     return run.stdout
+
+
+def use_kernels() -> None:
+    """Have operations of this process, which interprets kernels, launch them for float32 on the CPU as they do on a GPU."""
+    torch.library.wrap_triton = lambda kernel: kernel  # torch.compile alone wants it, and older torch no interpreted one
+    operations.are_kernel_inputs = lambda *tensors: all(tensor.dtype == torch.float32 for tensor in tensors)

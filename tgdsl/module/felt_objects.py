@@ -13,7 +13,8 @@ from tgdsl.geometry.grid import METHODS, Grid
 from tgdsl.geometry.planes import split, vec
 from tgdsl.plan.plan import Inputs, Plan, PlannedObject, PlannedPoints
 from tgdsl.quantities.contact_depth.query import FeltObject, RaycastSurface
-from tgdsl.quantities.contact_depth.search import geom_tables, is_searchable
+from tgdsl.quantities.contact_depth.search import is_searchable
+from tgdsl.quantities.contact_depth.search_tables import geom_tables
 from tgdsl.quantities.points.points import PointSource, point_tiles
 from tgdsl.tensors.buffers import Constants
 
@@ -37,7 +38,7 @@ class FeltObjects:
         return tuple(f"{part}/" for part in self._raycast)
 
     def searched(self) -> dict[str, np.ndarray]:
-        """Return by path what searches are given that is the same at all calls: see `contact_depth.search.Tables`."""
+        """Return by path what searches are given that is the same at all calls: see `contact_depth.search_tables.Tables`."""
         plan, found = self._plan, {}
         primitives = {name: value for name, value in plan.arrays.items() if name.startswith("objects/") and value.ndim == 3}
         constants = Constants(primitives, torch.float64)

@@ -15,7 +15,8 @@ from tgdsl.geometry import planes
 from tgdsl.module.felt_objects import FeltObjects
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.contact_depth.query import Felt, FeltObject, Near, Pairs, Probes, feel, measure, relate
-from tgdsl.quantities.contact_depth.search import Tables, search
+from tgdsl.quantities.contact_depth.search import search
+from tgdsl.quantities.contact_depth.search_tables import Tables
 from tgdsl.quantities.contacts.contacts import contacts
 from tgdsl.quantities.moments.nearby import with_moments
 from tgdsl.quantities.moments.sources import moment_sources

@@ -23,8 +23,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-from tgdsl.tensors.link_products import LARGEST
-
 MIN_BLOCK, BLOCK, LINES = 16, 64, 64
 """Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block.
 
@@ -61,7 +59,6 @@ def launch(
     num_planes = matrices[0].shape[1]
     found = lines.new_empty((num_planes, num_lines, num_rows))
     largest = max(len(matrix) for matrix in matrices)
-    assert largest <= LARGEST
     block, is_held = _block([len(matrix) for matrix in matrices]), largest <= 2 * BLOCK
     rest = _padded(largest - block) if is_held and largest > block else 0
     flat, tiles = _joined(matrices, block)

@@ -17,7 +17,8 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.contact_depth.query import Felt, FeltObject, Pairs, body_distance, united
-from tgdsl.tensors.fusion import stored, takes_kernel
+from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.operations import Operation
 
 SMALLEST_TILE, LARGEST_TILE = 32, 128
 """Numbers of taxels of a tile."""
@@ -73,18 +74,9 @@ class Meeting(NamedTuple):
     source: PointSource
 
 
-def are_for_kernel(meeting: Meeting) -> bool:
-    """Return whether a kernel can take all of it: the links' geoms are grids, on a GPU."""
-    (rotation, offset, _, _), source = meeting.pairs, meeting.source
-    are_grids = all(isinstance(surface, Grid) for surface in source.links.surfaces)
-    return are_grids and takes_kernel(*rotation, *offset, *source.points, source.links.pos, source.links.rotation)
-
-
 def met_points(meeting: Meeting) -> MetPoints:
     """Return where the points are, and how deep in the links' surfaces."""
     pairs, source = meeting
-    if are_for_kernel(meeting):
-        return _met_by_kernel(pairs, source)
     rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
     offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
     pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
@@ -121,10 +113,24 @@ def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
     return min(max(1 << (most - 1).bit_length(), SMALLEST_TILE), LARGEST_TILE)
 
 
-def _met_by_kernel(pairs: Pairs, source: PointSource) -> MetPoints:
-    """Return the points of one object where all geoms of the links are grids, one geom after the other."""
+def _by_kernel(meeting: Meeting) -> MetPoints:
+    """One geom of the links after the other."""
     from tgdsl.quantities.points.skin_kernel import meet
 
+    pairs, source = meeting
     found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
     distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
     return MetPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)
+
+
+def _inputs(meeting: Meeting) -> list[Tensor]:
+    (rotation, offset, _, _), source = meeting
+    return [*rotation, *offset, *source.points, source.links.pos, source.links.rotation]
+
+
+def are_grids(meeting: Meeting) -> bool:
+    """Return whether all geoms of the links are grids."""
+    return all(isinstance(surface, Grid) for surface in meeting.source.links.surfaces)
+
+
+MET_POINTS = Operation("meet", met_points, _by_kernel, _inputs, are_grids)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.tensors.fusion import wants_derivatives
+from tgdsl.tensors.operations import needs_autograd
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
 LARGEST_BLOCK = 16
@@ -35,7 +35,7 @@ EXPECTED = (1000, 100)
 
 def are_compacted(pos: Vec, strength: Vec) -> bool:
     """Return whether `active_points` can take these and saves time: on a CPU, for several environments, without derivatives."""
-    return pos[0].device.type == "cpu" and pos[0].shape[0] != 1 and not wants_derivatives(*pos, *strength)
+    return pos[0].device.type == "cpu" and pos[0].shape[0] != 1 and not needs_autograd(*pos, *strength)
 
 
 def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:

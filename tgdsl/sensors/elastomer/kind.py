@@ -109,7 +109,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     if "enter" in constants:
         law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
         if "shear_falloff" in constants:
-            pulls, after = point_anchors.gripped(list(felt.points.values()), law, state)
+            pulls, after = point_anchors.GRIP(list(felt.points.values()), law, state)
         else:
             shear, after = anchors.advance(felt, probes.pos, normal, law, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian

@@ -145,7 +145,7 @@ def forward(felt: Felt, probes: Probes, constants: Constants, state: State) -> t
     contacts = felt.contacts
     assert contacts is not None
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
-    shared = footprint.shared_forces(
+    shared = footprint.SHARED_FORCES(
         bodies,
         felt.depth,
         contacts.pos,

@@ -13,7 +13,7 @@ from torch import Tensor
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.instant import Now, Signal
 from tgdsl.tensors.fusion import stored
-from tgdsl.tensors.link_products import products
+from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
@@ -44,7 +44,7 @@ def crosstalk(signal: Signal, values: Mapping[str, Tensor]) -> Signal:
 def _product(signal: Signal, kernels: Sequence[Tensor]) -> Signal:
     """Return the signal with each link's rows multiplied by its kernel, (from, to)."""
     lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
-    return products(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
+    return LINK_PRODUCTS(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
 
 
 def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now) -> Signal:
