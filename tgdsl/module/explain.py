@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Shaped
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.module.memory import Memory
 from tgdsl.module.module import TactileModule
 from tgdsl.observations.proprioception import QUANTITIES
 from tgdsl.plan.plan import PlannedObject, PlannedPoints, PlannedSensor
 from tgdsl.sensors.noise.lower import quantity
+from tgdsl.tensors.torch_internals import TorchDispatchMode
 
 
 class _OperationCounter(TorchDispatchMode):

@@ -6,12 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tgdsl.tensors.devices import check_dtype
+from tgdsl.tensors.torch_internals import HookedModule, buffers_of
 
 
-class Constants(nn.Module):
+class Constants(HookedModule):
     """The Plan's arrays as buffers. A change of dtype starts from the Plan's float64, so that nothing is rounded twice."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], dtype: torch.dtype):
@@ -31,20 +32,20 @@ class Constants(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the floats."""
-        return next((b.dtype for b in self._buffers.values() if b is not None and b.is_floating_point()), torch.float32)
+        return next((b.dtype for b in buffers_of(self).values() if b is not None and b.is_floating_point()), torch.float32)
 
     @property
     def device(self) -> torch.device:
         """Device of all arrays."""
-        return next(b.device for b in self._buffers.values() if b is not None)
+        return next(b.device for b in buffers_of(self).values() if b is not None)
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the array of a path."""
-        return self._buffers[name]  # type: ignore[return-value]
+        return buffers_of(self)[name]  # type: ignore[return-value]
 
     def __contains__(self, name: str) -> bool:
         """Return whether there is an array of a path."""
-        return name in self._buffers
+        return name in buffers_of(self)
 
     def counts(self, name: str) -> tuple[int, int, int]:
         """Return the first row of a table of node counts, `<path>/num`, as numbers that become part of compiled code."""
@@ -54,13 +55,14 @@ class Constants(nn.Module):
         """Return some of the arrays below a path, by their own names."""
         return {name: self[f"{prefix}/{name}"] for name in names}
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Constants:
-        before = dict(self._buffers)
-        super()._apply(fn, recurse)
+    def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
+        """Move or cast all buffers, from the Plan's float64 where nobody has changed them."""
+        held = buffers_of(self)
+        before = dict(held)
+        move()
         for name, exact in self._exact.items():
-            old, new = before[name], self._buffers[name]
+            old, new = before[name], held[name]
             assert old is not None and new is not None
             is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
             if is_untouched:
-                self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
-        return self
+                held[name] = exact.to(device=new.device, dtype=new.dtype)

@@ -23,6 +23,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
+from tgdsl.tensors.torch_internals import add_each
+
 MIN_BLOCK, BLOCK, LINES = 16, 64, 64
 """Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block.
 
@@ -107,7 +109,7 @@ def _joined(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
     """
     numbers = _tiles([len(matrix) for matrix in matrices], matrices[0].shape[1], tile)
     tiles = matrices[0].new_zeros(len(numbers), dtype=torch.int32)
-    torch.ops.aten._foreach_add_.ScalarList(list(tiles.unbind()), numbers)
+    add_each(tiles.unbind(), numbers)
     return torch.cat([matrix.flatten() for matrix in matrices]), tiles
 
 
