@@ -11,9 +11,11 @@ from jaxtyping import Float, Int
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from tgdsl.geometry.planes import tie
+
 Array = np.ndarray
-TIE = 1e-7
-"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins; see `planes.tie`."""
+TIE = tie()
+"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,11 +22,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
+from tgdsl.geometry.planes_kernel import LOG2_E
+
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
 """Tiles of a program that is told how many points pull: at most of them none does."""
-LOG2_E = tl.constexpr(1.4426950408889634)
 
 
 @triton_op("tgdsl::point_sum", mutates_args={})
