@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.errors import StateError, listed
 from tgdsl.module.clock import Clock
 from tgdsl.plan.plan import PlannedMemory, PlannedSensor
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, num_writes
 
 WINDOW, KEPT = "history/", "kept/"
@@ -203,7 +203,7 @@ def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mas
 
 def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
     """Return the places of this call's entries in a ring: environment, and which of its calls."""
-    place = stored(memory["clock/step"] % memory[name].shape[1])
+    place = materialised(memory["clock/step"] % memory[name].shape[1])
     return torch.arange(len(place), device=place.device), place
 
 

@@ -1,1 +1,1 @@
-"""What torch is told: dtypes, devices, buffers, where kernels stand in for operations, CUDA graphs, environments by index."""
+"""Below all sensors: buffers, dtypes, devices, environment indices, CUDA graphs, operations with Triton kernels."""

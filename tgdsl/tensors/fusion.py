@@ -1,17 +1,17 @@
-"""Hints for Inductor: where to materialise an intermediate."""
+"""Hints for Inductor."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 
-def stored(tensor: Tensor) -> Tensor:
-    """Return a tensor unchanged, as a view of its memory: so a compiler makes memory for it.
+def materialised(tensor: Tensor) -> Tensor:
+    """Materialise an intermediate: return it unchanged, as a view by strides, which Inductor does not fuse into what reads it.
 
-    What there is once per environment would else be formed anew for each taxel that uses it.
+    A number that there is once per environment is else computed anew for each taxel that uses it.
 
     Args:
-        tensor: What an operation has just made, and no view of that: a compiler may pad the rows of what it stores, and then
-            a view's strides would be wrong.
+        tensor: The result of an operation, and no view of one: Inductor may pad the rows of what it materialises, and then the
+            view's strides would be wrong.
     """
     return tensor.as_strided(tensor.shape, tensor.stride())

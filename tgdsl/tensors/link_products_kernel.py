@@ -1,4 +1,4 @@
-"""The products of `link_products`, of all links in one Triton kernel, for a GPU in float32 without derivatives.
+"""`link_products` as one Triton kernel for all links.
 
 A program takes one tile, some taxels of one link and one plane, and several blocks of lines. It holds the tile's part of the
 link's matrix, unless a link is too large for that, and reads lines while the block before is multiplied. Tiles of the same

@@ -17,7 +17,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.contact_depth.query import Felt, FeltObject, Pairs, body_distance, united
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
 SMALLEST_TILE, LARGEST_TILE = 32, 128
@@ -83,7 +83,7 @@ def met_points(meeting: Meeting) -> MetPoints:
     distance, gradient = body_distance(pos, source.links)
     if pairs.gate is not None:
         distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
-    return MetPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
+    return MetPoints(source.taxels, source.tiles, planes.vec(map(materialised, pos)), distance, gradient, source.area)
 
 
 def with_points(felt: Felt, pairs: Pairs, sources: Sequence[PointSource]) -> Felt:

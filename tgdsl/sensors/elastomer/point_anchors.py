@@ -29,7 +29,7 @@ from tgdsl.quantities.points.points import MET_POINTS, Meeting, MetPoints, are_g
 from tgdsl.quantities.reference import ReferencePoints
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import Law, capped
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
@@ -133,7 +133,7 @@ def advance(met: Sequence[MetPoints], law: Law, state: Mapping[str, Tensor]) -> 
         is_taken = ~is_held & (law.reach - distance > law.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
         shape = points.distance.shape[1:]
-        strength = planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))
+        strength = planes.vec(materialised(part).unflatten(1, shape) for part in planes.scale(depth, moved))
         pulls.append(Pull(points.taxels, points.tiles, points.area, points.pos, strength))
         for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
             after[name].append(plane)
@@ -206,7 +206,8 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
     scale = torch.sqrt(falloff / math.log(2.0))
     z, own = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
     offset_u, offset_v = (
-        stored(planes.dot(tangent, marker))[:, None] - _along(planes.vec(stored(part)[:, None] for part in tangent), z)
+        materialised(planes.dot(tangent, marker))[:, None]
+        - _along(planes.vec(materialised(part)[:, None] for part in tangent), z)
         for tangent in (planes.scale(scale, tangent) for tangent in _tangents(normal))
     )
     fall = torch.exp2(-offset_u * offset_u - offset_v * offset_v)
@@ -216,7 +217,7 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 def _along(tangent: Vec, point: Vec) -> Tensor:
     """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed anew for each marker."""
     found = planes.dot(tangent, point)
-    return stored(found) if tangent[0].shape[0] == 1 else found
+    return materialised(found) if tangent[0].shape[0] == 1 else found
 
 
 def _tangents(normal: Vec) -> tuple[Vec, Vec]:

@@ -43,7 +43,7 @@ LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
 NO_FORCE = tl.constexpr(1e-12)
 DAMPING = tl.constexpr(0.1)
-"""As in `footprint`, of which a kernel can see constants of its own file alone."""
+"""As in `footprint`."""
 
 
 @triton_op("tgdsl::shared_forces", mutates_args={})

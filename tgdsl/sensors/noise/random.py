@@ -31,7 +31,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 """What numbers are for: the first three are drawn at each step, the others at each reset."""
@@ -80,7 +80,7 @@ def streams(
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
     purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
     purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
-    found = stored(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
+    found = materialised(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
     halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
     return [{p: Stream(a[:, p, None], b[:, p, None]) for p in range(a.shape[1])} for a, b in halves]
 
