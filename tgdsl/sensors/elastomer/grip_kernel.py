@@ -1,9 +1,9 @@
 """The state update of anchored points as one Triton kernel, where the links are grids: `point_anchors.advance` on a GPU.
 
 A program takes one link of an environment. It first selects the active points: those that are anchored, or may be in contact
-by the value of the grid's nearest node; most are neither. It compacts them, then takes one warp of points at a time, one thread
-per point: its depth (`skin_kernel`), and its new anchor, in place. The points with a strength are compacted too, in their order,
-and counted.
+by the value of the grid's nearest node; most are neither. It compacts them, then takes one warp of points at a time, a thread
+per point: its depth (`skin_kernel`), and its new anchor, in place. The points with a strength are compacted too, in their
+order, and counted.
 
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
 """
