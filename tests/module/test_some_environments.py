@@ -7,7 +7,7 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from test_noise import CONTACT_NOISE, EVERY_KNOB, RANGES, document, felt_state
+from noisy_modules import CONTACT_NOISE, EVERY_KNOB, RANGES, document, felt_state
 
 import tgdsl
 from tgdsl.errors import StateError

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from at_rest import NUM_STEPS, jittered
 from brute import brute_force
-from test_hard_cases import NUM_STEPS, jittered
 
 import tgdsl
 from tgdsl.module.state import SceneState

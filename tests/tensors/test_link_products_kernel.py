@@ -4,9 +4,9 @@ import json
 
 import pytest
 import torch
-from kernels import interpreted, needs_triton
+from kernels import interpreted, needs_triton, use_kernels
 
-from tgdsl.tensors.link_products import products
+from tgdsl.tensors.link_products import LINK_PRODUCTS, products
 
 pytestmark = needs_triton
 EPS = torch.finfo(torch.float32).eps
@@ -48,12 +48,11 @@ def exact(lines: torch.Tensor, matrices: list[torch.Tensor]) -> torch.Tensor:
 
 def main() -> None:
     """Print the results of all cases, as a process that interprets kernels."""
-    from tgdsl.tensors.link_products_kernel import launch, link_products_kernel
-
+    use_kernels()
     found = {}
     for name, case in CASES.items():
         lines, matrices = given(*case)
-        error = (launch(link_products_kernel, lines, matrices) - exact(lines, matrices)).abs()
+        error = (LINK_PRODUCTS(lines, matrices) - exact(lines, matrices)).abs()
         # Each of n products and n sums rounds, by half of eps of what was added up.
         bound = max(case[1]) * EPS * exact(lines.abs(), [matrix.abs() for matrix in matrices])
         found[name] = float((error / bound.clamp(min=1e-30)).max())
@@ -62,9 +61,9 @@ def main() -> None:
     for last in (65, 140):
         lines, matrices = given(70, [20, 33, 1, last], 2)
         lines[3, 30], lines[66, 53], lines[69, -1] = torch.nan, torch.nan, torch.nan
-        stays.append(torch.equal(launch(link_products_kernel, lines, matrices).isnan(), products(lines, matrices).isnan()))
+        stays.append(torch.equal(LINK_PRODUCTS(lines, matrices).isnan(), products(lines, matrices).isnan()))
     found["not a number"] = stays
-    found["no line"] = list(launch(link_products_kernel, *given(0, [20, 99], 2)).shape)
+    found["no line"] = list(LINK_PRODUCTS(*given(0, [20, 99], 2)).shape)
     print(json.dumps(found))
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 Vec = tuple[Tensor, Tensor, Tensor]
 Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
-# Functions, not a module's floats: a compiler for dynamic shapes hands those over anew at each call.
+# Functions, not floats of the module: under dynamic shapes torch.compile makes those inputs of the graph.
 
 
 def tie() -> float:

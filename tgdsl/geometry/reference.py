@@ -6,9 +6,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import brentq
 
+from tgdsl.geometry.planes import tie
+
 Array = np.ndarray
-TIE = 1e-7
-"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins; see `planes.tie`."""
+TIE = tie()
+"""Lengths [m] that differ by no more than this count as equal, and the first among equals wins."""
 
 
 def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:

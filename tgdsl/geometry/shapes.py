@@ -120,3 +120,5 @@ SHAPES: Mapping[str, Shape] = MappingProxyType(
     }
 )
 """Signed distance by MuJoCo's name of the geom type."""
+KINDS = ("", "plane", "capsule", "cylinder", "box")
+"""Numbers by which kernels know the shapes; a sphere is a capsule without a length."""

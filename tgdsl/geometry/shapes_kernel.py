@@ -11,9 +11,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-CAPSULE, CYLINDER, BOX = tl.constexpr(2.0), tl.constexpr(3.0), tl.constexpr(4.0)
-TIE = tl.constexpr(1e-7)
-"""As `planes.tie()`, of which a kernel can see constants alone."""
+from tgdsl.geometry.planes import tie
+from tgdsl.geometry.shapes import KINDS
+
+CAPSULE, CYLINDER, BOX = (tl.constexpr(float(KINDS.index(shape))) for shape in ("capsule", "cylinder", "box"))
+TIE = tl.constexpr(tie())
 
 
 @triton.jit

@@ -11,7 +11,7 @@ import torch
 
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
-from tgdsl.tensors.fusion import of_its_own
+from tgdsl.tensors import torch_internals
 from tgdsl.tensors.graphed import Graphed
 
 Step = Callable[..., Any]
@@ -46,7 +46,7 @@ class Calls:
         name = step.__name__
         if self._wanted is not None and name not in self.compiled:
             graph, options = self._wanted
-            self.compiled[name] = torch.compile(of_its_own(step), **options)
+            self.compiled[name] = torch.compile(torch_internals.with_own_code(step), **options)
             if graph:
                 self.graphed[name] = Graphed(self.compiled[name])
         if name in self.graphed and not torch.is_grad_enabled() and not torch.cuda.is_current_stream_capturing():
@@ -76,7 +76,7 @@ def inductor_options(plan: Plan, quantities: Sequence[Quantity]) -> dict[str, bo
         and not any(sensor.noise for sensor in plan.sensors)
         and all(target.num_pairs == 1 for target in plan.objects)
     )
-    return {"assert_indirect_indexing": "variant" in plan.inputs.fields, "triton.prefer_nd_tiling": is_slight}
+    return torch_internals.inductor_options("variant" in plan.inputs.fields, is_slight)
 
 
 def has_cpp_compiler() -> bool:

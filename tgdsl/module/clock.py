@@ -5,24 +5,25 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tgdsl.errors import TgdslError
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.base import UNTIMED, Context
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
+from tgdsl.tensors.torch_internals import HookedModule
 
 _INT64 = 2**63
 """First number beyond an int64."""
 
 
-class Clock(nn.Module):
+class Clock(HookedModule):
     """Counts calls and episodes, of each environment alone. It holds nothing until `start`, nor if no sensor asks for it.
 
     Buffers, all int64: `seed`, `first_env` (number of the first environment among those of all processes); per environment,
@@ -51,7 +52,7 @@ class Clock(nn.Module):
     @property
     def num_envs(self) -> int | None:
         """Number of environments; None before the start."""
-        return len(self._buffers["age"]) if "age" in self._buffers else None  # type: ignore[arg-type]
+        return len(self.get_buffer("age")) if hasattr(self, "age") else None
 
     def start(self, num_envs: int, calls: int, like: Tensor) -> None:
         """Begin to count.
@@ -101,12 +102,12 @@ class Clock(nn.Module):
     def reset(self, chosen: Tensor) -> None:
         """Begin a new episode in the environments of a mask."""
         if self.num_envs is not None:
-            self._buffers["episode"] += chosen  # type: ignore[operator]
-            self._buffers["age"].masked_fill_(chosen, 0)  # type: ignore[union-attr]
+            self.get_buffer("episode").add_(chosen)
+            self.get_buffer("age").masked_fill_(chosen, 0)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what `nows` and `after` want, by name."""
-        return {f"clock/{name}": buffer for name, buffer in self._buffers.items() if buffer is not None}
+        return {f"clock/{name}": buffer for name, buffer in self.named_buffers(recurse=False)}
 
     def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
         """Return when each sensor that wants to know is read, by its name.
@@ -180,16 +181,16 @@ class Clock(nn.Module):
             keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._drawing]
             self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+    def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
         """Make room for the counts that are loaded, and go on with their seed; do nothing if `Memory` has found errors."""
-        if args[-1]:
+        if errors:
             return
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
             ages = state_dict.get(f"{prefix}ages")
             with torch.inference_mode(False):
                 self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
-        super()._load_from_state_dict(state_dict, prefix, *args)
+        load()
         if self.num_envs is not None:
             self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
             self._set_keys()

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Shaped
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tgdsl.module.example import example_state
 from tgdsl.module.memory import Memory
@@ -20,6 +19,7 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
 from tgdsl.sensors.noise.lower import quantity
 from tgdsl.tensors.buffers import Constants
+from tgdsl.tensors.torch_internals import TorchDispatchMode
 
 Core = Callable[[dict[str, torch.Tensor], dict[str, torch.Tensor]], Any]
 """Computes readings and the new state: `TactileModule.core`."""

@@ -11,18 +11,19 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.clock import Clock
 from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.torch_internals import HookedModule, num_writes
 
 WINDOW, KEPT = "history/", "kept/"
 """Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>`, the last one."""
 
 
-class Memory(nn.Module):
+class Memory(HookedModule):
     """Buffers `sensor:name`, (env, …) or (env, call, …), and `history/<reading>`; none before the first call.
 
     Attributes:
@@ -91,7 +92,7 @@ class Memory(nn.Module):
         if self.num_kept:
             self._last = {}
         else:
-            self._last = {name: (reading.detach(), _version(reading)) for name, reading in readings.items()}
+            self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in readings.items()}
 
     def keep_last(self, num_envs: int, stacks: Collection[str]) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.
@@ -106,7 +107,7 @@ class Memory(nn.Module):
         if self.num_kept is None:
             if not self._last:
                 raise StateError("nothing was handed out yet for the environments left out: read all of them first")
-            if changed := [name for name, (reading, version) in self._last.items() if _version(reading) != version]:
+            if changed := [name for name, (reading, version) in self._last.items() if num_writes(reading) != version]:
                 what = f"the readings {listed(changed)} that were handed out last have been written into since"
                 raise StateError(f"{what}, and the environments left out are to have them: write into clones")
             with torch.inference_mode(False), torch.no_grad():
@@ -141,28 +142,18 @@ class Memory(nn.Module):
                 buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
         self.clock.reset(chosen)
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Memory:
+    def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all buffers; what was handed out last lies elsewhere."""
         self._last = {}
-        super()._apply(fn, recurse)
-        return self
+        move()
 
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        local_metadata: dict[str, Any],
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
+    def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
         """Make room for the state that is loaded, in the module's own dtype; part of a state is no state."""
         found = {path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)}
         has_clock = f"{prefix}clock.age" in state_dict
         if found or has_clock:
-            error_msgs.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
-        if error_msgs:
+            errors.extend(self._misfits(found, state_dict.get(f"{prefix}clock.age"), prefix))
+        if errors:
             return  # nothing is loaded, nor by the clock
         with torch.inference_mode(False):
             for path, value in found.items():
@@ -170,8 +161,7 @@ class Memory(nn.Module):
                 self.register_buffer(path, room)
         self._last = {}
         self._forget_kept()  # what is replaced has handed them out
-        own = local_metadata, strict, missing_keys, unexpected_keys, error_msgs
-        super()._load_from_state_dict(state_dict, prefix, *own)
+        load()
 
     def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:
         """Return what is wrong with state that is to be loaded: parts that lack, or are not of the planned shape."""
@@ -188,11 +178,6 @@ class Memory(nn.Module):
                     f'"{prefix}{path}" has shape {tuple(value.shape)}, expected (env, …, {", ".join(map(str, expected))})'
                 )
         return wrong
-
-
-def _version(tensor: Tensor) -> int:
-    """Return how often a tensor was written into, as autograd counts it; inference tensors do not count."""
-    return -1 if tensor.is_inference() else tensor._version
 
 
 def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
@@ -218,7 +203,7 @@ def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mas
 
 def _entry_of(memory: Mapping[str, Tensor], name: str) -> tuple[Tensor, Tensor]:
     """Return the places of this call's entries in a ring: environment, and which of its calls."""
-    place = stored(memory["clock/step"] % memory[name].shape[1])
+    place = materialised(memory["clock/step"] % memory[name].shape[1])
     return torch.arange(len(place), device=place.device), place
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
 from tgdsl.errors import StateError, TgdslError, did_you_mean
@@ -37,9 +37,10 @@ from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
 from tgdsl.tensors.env_ids import EnvIds, env_mask
+from tgdsl.tensors.torch_internals import HookedModule
 
 
-class TactileModule(nn.Module):
+class TactileModule(HookedModule):
     """All sensors of a document, for any number of environments at once.
 
     Calling it with a `SceneState` returns the readings by sensor name, each (env, taxel, channel), or (env, step, taxel,
@@ -392,22 +393,21 @@ class TactileModule(nn.Module):
         views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
         return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TactileModule:
+    def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all tensors; a captured graph has read the old ones.
 
         Raises:
             TgdslError: If they are to be neither float32 nor float64.
         """
         check_dtype(fn(torch.empty(0, dtype=self.dtype, device=self.device)).dtype)
-        super()._apply(fn, recurse)
+        move()
         self.calls.forget_graphs()
-        return self
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+    def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
         """Have state that is loaded before the first call where the module is."""
         home = torch.empty(0, dtype=self.dtype, device=self.device)
         self.memory.home = self.memory.clock.home = home
-        super()._load_from_state_dict(*args, **kwargs)
+        load()
 
 
 def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.base import UNTIMED, Constants, Context
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 
 Tensors = dict[str, Tensor]
 
@@ -38,7 +38,7 @@ def joined_signal(
     if names := tuple(constants[0]):
         counts = [end - first for first, end in (sensor.rows for sensor in sensors)]
         rows = [torch.cat([own[name].expand(n) for own, n in zip(constants, counts, strict=True)]) for name in names]
-        of_taxels = dict(zip(names, stored(torch.stack(rows)).unbind(), strict=True))
+        of_taxels = dict(zip(names, materialised(torch.stack(rows)).unbind(), strict=True))
     found, _ = kind.forward(gathered, UNTIMED, of_taxels, {})
     return _stacked(found, "signal", sensors[0].signal)
 

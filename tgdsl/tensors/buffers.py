@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from tgdsl.tensors.devices import check_dtype
+from tgdsl.tensors.torch_internals import HookedModule, buffers_of
 
 
-class Constants(nn.Module):
+class Constants(HookedModule):
     """Arrays as buffers, by name. A change of dtype starts from the arrays' own float64, so that nothing is rounded twice.
 
     Attributes:
@@ -42,38 +43,40 @@ class Constants(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the floats."""
-        return next((b.dtype for b in self._buffers.values() if b is not None and b.is_floating_point()), torch.float32)
+        return next((b.dtype for b in buffers_of(self).values() if b is not None and b.is_floating_point()), torch.float32)
 
     @property
     def device(self) -> torch.device:
         """Device of all arrays."""
-        return next(b.device for b in self._buffers.values() if b is not None)
+        return next(b.device for b in buffers_of(self).values() if b is not None)
 
     def __getitem__(self, name: str) -> Tensor:
         """Return the array of a path."""
-        return self._buffers[name]  # type: ignore[return-value]
+        return buffers_of(self)[name]  # type: ignore[return-value]
 
     def __contains__(self, name: str) -> bool:
         """Return whether there is an array of a path."""
-        return name in self._buffers
+        return name in buffers_of(self)
 
     def refresh(self) -> None:
         """Bind again if some buffer is another tensor than before, as under `torch.func.functional_call`."""
-        if any(self._buffers[name] is not tensor for name, tensor in self._bound.items()):
+        held = buffers_of(self)
+        if any(held[name] is not tensor for name, tensor in self._bound.items()):
             self._rebind()
 
     def _rebind(self) -> None:
-        self._bound = dict(self._buffers)
+        self._bound = dict(buffers_of(self))
         self.tree = self._bind(self.__getitem__)
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Constants:
-        before = dict(self._buffers)
-        super()._apply(fn, recurse)
+    def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
+        """Move or cast all buffers, from the Plan's float64 where nobody has changed them."""
+        held = buffers_of(self)
+        before = dict(held)
+        move()
         for name, exact in self._exact.items():
-            old, new = before[name], self._buffers[name]
+            old, new = before[name], held[name]
             assert old is not None and new is not None
             is_untouched = new.dtype != old.dtype and torch.equal(old.detach().cpu(), exact.to(old.dtype))
             if is_untouched:
-                self._buffers[name] = exact.to(device=new.device, dtype=new.dtype)
+                held[name] = exact.to(device=new.device, dtype=new.dtype)
         self._rebind()
-        return self

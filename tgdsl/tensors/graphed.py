@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tgdsl.tensors.torch_internals import copy_each
+
 Tensors = dict[str, Tensor]
 Function = Callable[[Tensors, Tensors], Tensors]
 Replay = Callable[[], Any]
@@ -56,7 +58,7 @@ class Graphed:
             self._start(tensors, memory)
             self._key = key
         for own, names in self._groups:
-            torch._foreach_copy_(own, [tensors[name] for name in names])  # pyright: ignore[reportPrivateImportUsage]
+            copy_each(own, [tensors[name] for name in names])
         self._replay()
         return dict(self._made)
 

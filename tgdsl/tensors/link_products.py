@@ -1,4 +1,4 @@
-"""What all taxels of a link do to each of them, by a matrix for each link: crosstalk, and the markers of a skin.
+"""A matrix for each link that maps its taxels' values to each of its taxels: crosstalk, and the markers of a skin.
 
 Shapes: `line` environments, or environments and channels, `row` the taxels of all links, one link after the other, `from` and
 `to` those of one link, `plane` numbers that come out for each taxel.
@@ -12,30 +12,37 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.tensors.fusion import takes_kernel
+from tgdsl.tensors.operations import Operation
 
 LARGEST = 256
-"""Most taxels of a link that the kernel takes; a library multiplies larger matrices faster."""
+"""Most taxels of a link for which the kernel is used: a library multiplies larger matrices faster."""
+Matrices = Sequence[Float[Tensor, "_from plane _to"]]
 
 
-def are_for_kernel(lines: Float[Tensor, "*line row"], matrices: Sequence[Float[Tensor, "_from plane _to"]]) -> bool:
-    """Return whether one kernel can multiply all links."""
-    return takes_kernel(lines, *matrices) and max(len(matrix) for matrix in matrices) <= LARGEST
-
-
-def products(
-    lines: Float[Tensor, "line row"], matrices: Sequence[Float[Tensor, "_from plane _to"]]
-) -> Float[Tensor, "plane line row"]:
+def products(lines: Float[Tensor, "line row"], matrices: Matrices) -> Float[Tensor, "plane line row"]:
     """Return Σ_from line[from] matrix[from] of each link.
 
     Args:
-        lines: What there is before.
+        lines: The values that are multiplied.
         matrices: Of each link, in the order of their rows, which together are all.
     """
-    if are_for_kernel(lines, matrices):
-        from tgdsl.tensors.link_products_kernel import link_products
-
-        return link_products(lines.contiguous(), matrices)
     parts = lines.split([len(matrix) for matrix in matrices], dim=1)
     found = [(own @ matrix.flatten(1)).unflatten(1, matrix.shape[1:]) for own, matrix in zip(parts, matrices, strict=True)]
     return torch.cat(found, dim=-1).transpose(0, 1)
+
+
+def _by_kernel(lines: Float[Tensor, "line row"], matrices: Matrices) -> Float[Tensor, "plane line row"]:
+    from tgdsl.tensors.link_products_kernel import link_products
+
+    return link_products(lines.contiguous(), matrices)
+
+
+def _inputs(lines: Float[Tensor, "*line row"], matrices: Matrices) -> tuple[Tensor, ...]:
+    return lines, *matrices
+
+
+def _are_small(lines: Float[Tensor, "*line row"], matrices: Matrices) -> bool:
+    return max(len(matrix) for matrix in matrices) <= LARGEST
+
+
+LINK_PRODUCTS = Operation("link_products", products, _by_kernel, _inputs, _are_small)

@@ -1,4 +1,4 @@
-"""The products of `link_products`, of all links in one Triton kernel, for a GPU in float32 without derivatives.
+"""`link_products` as one Triton kernel for all links.
 
 A program takes one tile, some taxels of one link and one plane, and several blocks of lines. It holds the tile's part of the
 link's matrix, unless a link is too large for that, and reads lines while the block before is multiplied. Tiles of the same
@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-from tgdsl.tensors.link_products import LARGEST
+from tgdsl.tensors.torch_internals import add_each
 
 MIN_BLOCK, BLOCK, LINES = 16, 64, 64
 """Fewest numbers along each side of a product of blocks, most outputs of a tile, and lines of a block.
@@ -61,7 +61,6 @@ def launch(
     num_planes = matrices[0].shape[1]
     found = lines.new_empty((num_planes, num_lines, num_rows))
     largest = max(len(matrix) for matrix in matrices)
-    assert largest <= LARGEST
     block, is_held = _block([len(matrix) for matrix in matrices]), largest <= 2 * BLOCK
     rest = _padded(largest - block) if is_held and largest > block else 0
     flat, tiles = _joined(matrices, block)
@@ -110,7 +109,7 @@ def _joined(matrices: Sequence[Tensor], tile: int) -> tuple[Tensor, Tensor]:
     """
     numbers = _tiles([len(matrix) for matrix in matrices], matrices[0].shape[1], tile)
     tiles = matrices[0].new_zeros(len(numbers), dtype=torch.int32)
-    torch.ops.aten._foreach_add_.ScalarList(list(tiles.unbind()), numbers)
+    add_each(tiles.unbind(), numbers)
     return torch.cat([matrix.flatten() for matrix in matrices]), tiles
 
 

@@ -1,49 +1,41 @@
 """That `search` makes of a kernel's answer what `feel` makes of distances; the kernel itself is tested beside it."""
 
-import sys
-from types import ModuleType
-from typing import NamedTuple
+from dataclasses import replace
 
 import pytest
 import torch
+from tgdsl.quantities.contacts.contacts import Contacts
 
 from tgdsl.quantities.contact_depth import search as searching
 from tgdsl.quantities.contact_depth.query import FeltObject, Probes, feel, measure, relate
-from tgdsl.quantities.contact_depth.search import geom_tables, is_searchable, search
-from tgdsl.quantities.contacts.contacts import Contacts
+from tgdsl.quantities.contact_depth.search import DEEPEST, deepest, is_searchable, search
+from tgdsl.quantities.contact_depth.search_tables import Deepest, geom_tables
+from tgdsl.tensors import operations
 
 NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
 WHICH = (0, 1, 2, 4, 5)
 """The objects that are felt."""
 
 
-class Deepest(NamedTuple):
-    """What the kernel returns."""
-
-    depth: torch.Tensor
-    normal: tuple
-    pair: torch.Tensor
-
-
-def brute_force(pairs, pos, tables, reach):
-    """Return what the kernel does of centred boxes, from the distances."""
-    ends = tables.spheres[0, :, 1].cumsum(0).long()
-    boxes = [box(tables.geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
-    near = measure(pairs, Probes(pos, tables.pair), boxes)
-    felt = feel(pairs, Probes(pos, tables.pair), near, reach, ("normal",))
+def brute_force(pairs, probes, objects, known, reach):
+    """Return what the kernel does of centred boxes, from the tables and the distances."""
+    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(objects)
+    ends = spheres[0, :, 1].cumsum(0).long()
+    boxes = [box(geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
+    every = Probes(probes.pos, known["pair"])
+    near = measure(pairs, every, boxes)
+    felt = feel(pairs, every, near, reach, ("normal",))
     depths = torch.stack([r + pairs.gate[:, own.pair] - own.distance for r, own in zip(reach, near, strict=True)])
     deepest = depths.max(dim=0)
-    pair = tables.pair.gather(0, deepest.indices)
+    pair = known["pair"].gather(0, deepest.indices)
     return Deepest(felt.depth, felt.normal, torch.where(deepest.values > 0, pair, -1))
 
 
 @pytest.fixture
 def kernel(monkeypatch):
     """A kernel that runs everywhere, in float64."""
-    stub = ModuleType("deepest_kernel")
-    stub.deepest = brute_force
-    monkeypatch.setitem(sys.modules, "tgdsl.quantities.contact_depth.deepest_kernel", stub)
-    monkeypatch.setattr(searching, "takes_kernel", lambda *_: True)
+    monkeypatch.setattr(searching, "DEEPEST", replace(DEEPEST, kernel=brute_force))
+    monkeypatch.setattr(operations, "are_kernel_inputs", lambda *_: True)
 
 
 def box(size, first_pair, num_pairs):
@@ -96,6 +88,15 @@ def test_motion_is_that_of_the_object_found(scene, kernel, is_known):
     ):
         torch.testing.assert_close(part, other)
     assert found.contacts is contacts
+
+
+def test_the_definition_is_the_deepest_of_all_distances(scene):
+    pairs, probes, boxes, pair, reach = scene
+    arguments = pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach
+    found, expected = deepest(*arguments), brute_force(*arguments)
+    assert torch.equal(found.pair, expected.pair) and (found.pair >= 0).any() and (found.pair < 0).any()
+    for part, other in zip((found.depth, *found.normal), (expected.depth, *expected.normal), strict=True):
+        torch.testing.assert_close(part, other)
 
 
 def test_a_cpu_has_no_kernel_for_it(scene):

@@ -1,14 +1,12 @@
 """The Triton kernel that has points meet links, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
-from functools import partial
-
 import torch
-from kernels import interpreted, needs_triton
+from kernels import interpreted, needs_triton, use_kernels
 from meetings import CASES, made, nums_of
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.points.points import _met_by_kernel, met_points
+from tgdsl.quantities.points.points import MET_POINTS, Meeting, met_points
 
 TOLERANCE = 3e-7
 """Of places within a decimetre in float32 [m]."""
@@ -17,7 +15,7 @@ TURN = 1e-3
 
 
 def by_kernel(pairs, source):
-    found = _met_by_kernel(pairs, source)
+    found = MET_POINTS.kernel(Meeting(pairs, source))
     return found.pos, found.distance, found.gradient
 
 
@@ -72,9 +70,7 @@ def check_strange_poses():
 
 def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
-    from tgdsl.quantities.points import skin_kernel
-
-    skin_kernel._meet = partial(skin_kernel.launch, skin_kernel.skin_kernel)
+    use_kernels()
     for case in CASES:
         check(case)
     check_strange_poses()

@@ -59,7 +59,7 @@ def printed(pull: Pull, markers: Markers) -> np.ndarray:
 
 
 def summed(pull: Pull, markers: Markers) -> torch.Tensor:
-    return torch.stack(point_anchors._summed(pull, markers))
+    return torch.stack(point_anchors.point_sum(pull, markers))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 1e-6)])

@@ -1,12 +1,11 @@
 """The Triton kernel by which points take hold of links, run on the CPU by Triton's interpreter, against the torch code."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from kernels import interpreted, needs_triton
+from kernels import interpreted, needs_triton, use_kernels
 from meetings import NUM_ENVS, made
 
 import tgdsl
@@ -15,7 +14,7 @@ from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.points.points import met_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import Law
-from tgdsl.sensors.elastomer.point_anchors import PLANES, advance, gripped
+from tgdsl.sensors.elastomer.point_anchors import GRIP, PLANES, advance, gripped
 
 PALM = Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml"
 STICKS, SLIDES = Law(1e-3, 1e-5, 1e-3, None), Law(1e-3, 1e-5, 1e-3, 0.4)
@@ -123,10 +122,6 @@ def check_strange_poses():
 
 def check_sums():
     """A module's own way by both kernels moves the markers as the torch code does."""
-    from tgdsl.sensors.elastomer import grip_kernel, point_sum_kernel
-
-    grip_kernel.grip = partial(grip_kernel.launch, grip_kernel.grip_kernel)
-    point_sum_kernel.point_sum = partial(point_sum_kernel.launch, point_sum_kernel.point_sum_kernel)
     meeting, exact = made("cubes", torch.float32), made("cubes", torch.float64)
     state = {name: plane[:, BEFORE:].contiguous() for name, plane in nothing_held(meeting).items()}
     places = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]], dtype=torch.float64)
@@ -136,19 +131,16 @@ def check_sums():
         pulls, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
         expected = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
-        point_anchors.takes_kernel = lambda *_: True
-        point_anchors.are_for_kernel = lambda _: True
-        pulls, after = gripped([moved(meeting, step)], of(SLIDES, torch.float32), state)
+        pulls, after = GRIP([moved(meeting, step)], of(SLIDES, torch.float32), state)
         markers = point_anchors.Markers(vec(0.003 * places.T.float()), vec(places.T.float()), *numbers.float())
         found = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
-        point_anchors.takes_kernel = lambda *_: False
-        point_anchors.are_for_kernel = lambda _: False
         assert after == {} and (step != 1 or expected.abs().max() > 1e-9)
         torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
 
 def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
+    use_kernels()
     for law in LAWS.values():
         seen = torch.stack([check(case, law) for case in CASES]).sum(dim=0)
         assert (seen[[0, 1, 3]] > 10).all() and (seen[2] > 10) == (law.slip is not None), seen

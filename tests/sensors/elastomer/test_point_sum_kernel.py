@@ -4,47 +4,15 @@ import json
 
 import pytest
 import torch
-from kernels import interpreted, needs_triton
+from kernels import interpreted, needs_triton, use_kernels
+from pulling_points import CASES, given
 
-from tgdsl.geometry.planes import Vec, vec
-from tgdsl.quantities.points.points import point_tiles, tile_size
-from tgdsl.sensors.elastomer.point_anchors import Markers, Pull, _summed
+from tgdsl.geometry.planes import vec
+from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, Markers, Pull
 
 pytestmark = needs_triton
 TOLERANCE = 1e-5
 """Of the largest sum: what float32 leaves of positions of some centimetres and of a few hundred terms."""
-FALLOFF = 2000.0
-CASES = {
-    "one": (1, 1, 1, 1.0),
-    "few": (3, 7, 5, 0.5),
-    "a group that is not full": (2, 41, 33, 0.3),
-    "two chunks, a block that is not full": (2, 300, 100, 0.2),
-    "two blocks": (2, 70, 150, 1.0),
-    "nothing pulls": (2, 50, 40, 0.0),
-}
-"""Environments, points, markers, and which part of the points pulls."""
-
-
-def given(num_envs: int, num_points: int, num_markers: int, share: float) -> tuple[Pull, Markers]:
-    """Return points in float32 that pull in runs, and markers with normals all around, both signs of z among them.
-
-    There are three links: one has most of the markers, one the last, the third none; the first marker is of no link.
-    """
-    random = torch.Generator().manual_seed(num_points)
-
-    def drawn(scale: float, *shape: int) -> Vec:
-        return vec(scale * torch.randn(shape, generator=random) for _ in range(3))
-
-    start = torch.randint(num_points, (num_envs, 3, 1), generator=random)
-    pulls = (torch.arange(num_points) - start) % num_points < share * num_points
-    strength = vec(part * pulls for part in drawn(1e-7, num_envs, 3, num_points))
-    normal = torch.nn.functional.normalize(torch.stack(drawn(1.0, num_markers)), dim=0)
-    normal[:, 0] = torch.tensor([0.0, 0.0, -1.0])
-    markers = Markers(drawn(0.03, num_markers), vec(normal.unbind()), torch.tensor(FALLOFF), None)
-    last = num_markers - 1
-    taxels = ((last, num_markers), (min(1, last), last), (0, 0))
-    tiles = torch.tensor(point_tiles(taxels, num_markers), dtype=torch.int32)
-    return Pull(taxels, tiles, torch.ones(1, 1), drawn(0.03, num_envs, 3, num_points), strength), markers
 
 
 def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
@@ -52,10 +20,10 @@ def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
         vec(part.double() for part in planes) for planes in (pull.pos, pull.strength, markers.pos, markers.normal)
     )
     exact = Markers(marker, normal, markers.falloff.double(), None)
-    return torch.stack(_summed(pull._replace(pos=pos, strength=strength), exact))
+    return torch.stack(POINT_SUM(pull._replace(pos=pos, strength=strength), exact))
 
 
-def told(pull: Pull) -> Pull:
+def counted(pull: Pull) -> Pull:
     """Return points, those that pull first, and how many they are; the others' numbers are none at all."""
     pulls = torch.stack(pull.strength).ne(0).any(dim=0)
     order = torch.argsort(pulls.int(), dim=-1, descending=True, stable=True)
@@ -69,18 +37,17 @@ def told(pull: Pull) -> Pull:
 
 def main() -> None:
     """Print the results of all cases, as a process that interprets kernels."""
-    from tgdsl.sensors.elastomer.point_sum_kernel import launch, point_sum_kernel
+    use_kernels()
 
     def run(pull: Pull, markers: Markers) -> torch.Tensor:
-        how = (pull.count, pull.tiles, tile_size(pull.taxels))
-        return launch(point_sum_kernel, pull.pos, pull.strength, *how, markers.pos, markers.normal, markers.falloff)
+        return torch.stack(POINT_SUM(pull, markers))
 
     found = {}
     for name, case in CASES.items():
         pull, markers = given(*case)
         expected = in_double(pull, markers)
         scale = expected.abs().max().clamp(min=1e-12)
-        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (pull, told(pull))]
+        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (pull, counted(pull))]
 
     pull, markers = given(3, 20, 10, 0.5)
     wide = pull._replace(

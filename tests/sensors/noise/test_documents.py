@@ -1,62 +1,11 @@
-"""What a document says of noise, and what the plan then holds: profiles, knobs by kind, links, quantities, ranges."""
+"""What a document says of noise, and what the plan then holds: profiles, knobs by kind, links, quantities."""
 
 import numpy as np
 import pytest
-import torch
+from noise_documents import document, mistakes, planned
 
-import tgdsl
 from tgdsl.compiler.pipeline import compile_plan
-from tgdsl.errors import SpecError
 from tgdsl.sensors import KINDS
-
-SCENE = """
-<mujoco><worldbody>
-  <body name="a_tip"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
-  <body name="b_tip"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
-  <body name="palm"><freejoint/><geom type="box" size=".02 .02 .01"/></body>
-  <body name="item"><freejoint/><geom type="sphere" size=".03"/></body>
-</worldbody></mujoco>
-"""
-LINKS = ("a_tip", "b_tip", "palm")
-DEFAULTS = {"proximity": {"backend": "points", "points": 100}}
-"""What keeps compiling fast."""
-
-
-def document(folder, kind: str, noise, profiles=None, observations=(), **sensor) -> dict:
-    """A document with one sensor, `s`, on two taxels of each of three links."""
-    (folder / "scene.xml").write_text(SCENE)
-    points = [{"pos": [0.005 * i, 0, 0.01], "normal": [0, 0, 1]} for i in range(2)]
-    layout = {name: {"method": "points", "points": points, "radius": "4 mm"} for name in LINKS}
-    own = {"kind": kind, "links": "*", "feels": ["item"], "noise": noise, **DEFAULTS.get(kind, {}), **sensor}
-    return {
-        "tgdsl": 1,
-        "robot": {
-            "model": str(folder / "scene.xml"),
-            "layout": {"groups": {"tips": ["*_tip"]}, "resolutions": {"r": layout}},
-        },
-        "objects": {"item": {"body": "item"}},
-        "sensors": {"s": own},
-        "noise": profiles or {},
-        "observations": {name: [{"type": name, "of": "s"}] for name in observations},
-    }
-
-
-def planned(folder, *arguments, **keys):
-    """Return the stages in the plan, and the values of their knobs."""
-    plan = compile_plan(document(folder, *arguments, **keys))
-    (sensor,) = plan.sensors
-    if sensor.noise is None:
-        return (), {}
-    return sensor.noise.terms, {name: plan.arrays[f"sensors/s/noise/{name}"] for name in sensor.noise.constants}
-
-
-def mistakes(folder, *arguments, **keys) -> list[str]:
-    with pytest.raises(SpecError) as caught:
-        compile_plan(document(folder, *arguments, **keys))
-    return [f"{problem.path}: {problem.what}" for problem in caught.value.problems]
-
-
-# the paper's tables
 
 TISSUE = {"gain_low": 0.85, "gain_high": 1.15, "hysteresis_strength": 0.5, "hysteresis_time": 0.05}
 DEAD = {"dead_probability": 0.05, "dead_low": 0.0}
@@ -309,94 +258,3 @@ def test_a_profile_upon_noisy_is_of_each_kind(tmp_path):
 def test_a_document_may_have_its_own_noisy(tmp_path):
     assert planned(tmp_path, "contact_depth", "noisy", {"noisy": {"bias": 1}})[1] == {"bias": np.array([[1.0]])}
     assert planned(tmp_path, "contact_depth", {"like": "noisy", "drift": 2}, {"noisy": {"bias": 1}})[0] == ("bias", "drift")
-
-
-# ranges
-
-
-RANGES = {
-    "radius_noise": ([1e-4, 2e-4], {"radius_noise": (1e-4, 2e-4)}),
-    "gain": ([[0.5, 0.6], [1.5, 1.7]], {"gain_low": (0.5, 0.6), "gain_high": (1.5, 1.7)}),
-    "hysteresis": (
-        {"strength": [0.2, 0.4], "time_constant": [0.02, 0.08]},
-        {"hysteresis_strength": (0.2, 0.4), "hysteresis_time": (0.02, 0.08)},
-    ),
-    "crosstalk": (
-        {"strength": [0.1, 0.2], "sigma": [0.003, 0.006]},
-        {"crosstalk_strength": (0.1, 0.2), "crosstalk_mixture": (0, 1)},
-    ),
-    "read_delay": ([0.01, 0.03], {"delay": (0.01, 0.03)}),
-    "jitter": ([0.0, 0.02], {"jitter": (0, 0.02), "delay": None}),
-    "bias": ([-1, 2], {"bias": (-1, 2)}),
-    "white_noise": ([1, 3], {"white_noise": (1, 3)}),
-    "drift": ([1, 3], {"drift": (1, 3)}),
-    "quantization": ([1, 3], {"quantization": (1, 3)}),
-    "dead_probability": ([0.1, 0.4], {"dead_probability": (0.1, 0.4), "dead_low": None}),
-    "dead_range": ([[-4, -3], [5, 7]], {"dead_low": (-4, -3), "dead_high": (5, 7), "dead_probability": None}),
-}
-"""A range of each knob, and the ends of what is drawn; None: a plain number that comes with it."""
-
-
-@pytest.mark.parametrize("knob", RANGES)
-def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
-    """What stages are given is inside the range, differs between environments, stays, and changes at reset where it should."""
-    value, expected = RANGES[knob]
-    noise = {knob: value, **({"dead_probability": 0.5} if knob == "dead_range" else {})}
-    touch = tgdsl.compile(document(tmp_path, "kinematic_taxel", noise), dtype=torch.float64)
-    num_envs = 200
-
-    def drawn() -> dict[str, torch.Tensor]:
-        state = touch.example_state(num_envs)
-        memory = touch.memory.tensors(num_envs, state.dt, touch.dtype, touch.device)
-        dt = {} if state.dt is None else {"dt": torch.tensor(state.dt, dtype=torch.float64)}
-        values = touch._circumstances(dt, memory)[1]["s"]
-        touch(state)
-        return {name: values[name][:, 0, 0] for name in expected}
-
-    first, second = drawn(), drawn()
-    touch.reset([3, 7])
-    third = drawn()
-    others = [env for env in range(num_envs) if env not in (3, 7)]
-    for name, ends in expected.items():
-        assert torch.equal(first[name], second[name])
-        if ends is None:
-            assert len(first[name]) == 1
-            continue
-        low, high = ends
-        assert len(first[name].unique()) == num_envs
-        assert low <= first[name].min() < low + 0.1 * (high - low)  # P(no one of 200 there) = 7e-10
-        assert high >= first[name].max() > high - 0.1 * (high - low)
-        assert torch.equal(third[name][others], first[name][others])
-        assert (third[name][[3, 7]] != first[name][[3, 7]]).all()
-
-
-def test_a_range_of_the_release_threshold(tmp_path):
-    """Bits that are on go off below the environment's own threshold, somewhere in the range."""
-    noise = {"release_threshold": [1e-3, 3e-3]}
-    made = document(tmp_path, "contact", noise, threshold=3.5e-3, gate="geometric")
-    touch = tgdsl.compile(made, dtype=torch.float64)
-    state = touch.example_state(200)
-    state.body_pos, state.body_quat = torch.zeros(200, 4, 3, dtype=torch.float64), torch.zeros(200, 4, 4, dtype=torch.float64)
-    state.body_quat[..., 0] = 1
-    released = torch.zeros(200, dtype=torch.float64)
-    item, depths = touch.inputs.bodies.index("item"), np.linspace(3.75e-3, 0.5e-3, 66)
-    for depth in depths:  # of the taxel in the middle: 10 mm up, of radius 4 mm, under a ball of 30 mm
-        state.body_pos[:, item, 2] = 0.01 + 0.004 + 0.03 - depth
-        is_off = touch(state)["s"][:, 0, 0] == 0
-        released = torch.where(is_off & (released == 0), torch.tensor(depth, dtype=torch.float64), released)
-    step = depths[0] - depths[1]
-    assert 1e-3 - step <= released.min() < 1.2e-3 and 2.8e-3 < released.max() <= 3e-3
-    assert len(released.unique()) > 20
-
-
-def test_a_release_threshold_above_the_threshold(tmp_path):
-    (what,) = mistakes(tmp_path, "contact", {"release_threshold": [1e-4, 6e-4]}, threshold=5e-4)
-    assert what == "sensors.s.noise: release_threshold 0.0006 m is above the sensor's threshold 0.0005 m"
-
-
-def test_dead_readings_of_ranged_ends_lie_between_an_environments_own(tmp_path):
-    """z_j ~ U[low, high] with low and high drawn per environment: taxels of one environment differ, also for equal ranges."""
-    noise = {"dead_probability": 1, "dead_range": [[-1, 1], [-1, 1]]}
-    touch = tgdsl.compile(document(tmp_path, "contact_depth", noise), dtype=torch.float64)
-    stuck = touch(touch.example_state(50))["s"][..., 0]
-    assert all(len(row.unique()) == 6 for row in stuck)

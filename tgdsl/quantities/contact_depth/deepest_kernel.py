@@ -13,7 +13,7 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects,
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 import triton
@@ -25,30 +25,17 @@ from torch.library import triton_op, wrap_triton
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.geometry.shapes_kernel import TIE, chosen, distance_to, dot, gradient_of, is_any, length, loaded, rotate, rotate_back
-from tgdsl.quantities.contact_depth.search import Tables
+from tgdsl.quantities.contact_depth import search_tables
+from tgdsl.quantities.contact_depth.search_tables import Deepest, Tables
 from tgdsl.quantities.pairs import Pairs
 
 BLOCK = 64
 """Probes of a program, which is one warp: two for each of its lanes."""
-POS, ROTATION, BOUND, KIND, ROW = tl.constexpr(3), tl.constexpr(6), tl.constexpr(15), tl.constexpr(16), tl.constexpr(17)
-"""Columns of the geoms' table, see `search.Tables`, which begins with the size, and their number."""
+POS, ROTATION, BOUND = (tl.constexpr(column) for column in (search_tables.POS, search_tables.ROTATION, search_tables.BOUND))
+KIND, ROW = tl.constexpr(search_tables.KIND), tl.constexpr(search_tables.ROW)
 
 
-class Deepest(NamedTuple):
-    """What each probe is deepest in, the first among equals.
-
-    Attributes:
-        depth: Penetration depth max(0, radius − distance) [m]; not-a-number where a pose is.
-        normal: Unit normal out of the object, in the link's frame, planes (env, taxel); zero where nothing is reached.
-        pair: Index of the winner's pair among all pairs; −1 where nothing is reached.
-    """
-
-    depth: Float[Tensor, "env taxel"]
-    normal: Vec
-    pair: Int[Tensor, "env taxel"]
-
-
-def deepest(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *env taxel"]) -> Deepest:
+def find(pairs: Pairs, pos: Vec, tables: Tables, reach: Float[Tensor, "object *env taxel"]) -> Deepest:
     """Return what the probes are deepest in.
 
     Args:

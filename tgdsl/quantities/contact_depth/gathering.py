@@ -41,8 +41,8 @@ def _searched(use: DepthUse[Tensor], probes: Probes, targets: list[Target], scen
     if use.search is None:
         return None
     tables = {name: value for name in ("pair", "spheres", "geoms") if (value := getattr(use.search, name)) is not None}
-    geoms = [targets[o].geoms for o in use.objects]
-    return search(scene.pairs_for(use.is_gated), probes, geoms, tables, _reach(use, scene), use.wants)
+    own = [targets[o] for o in use.objects]
+    return search(scene.pairs_for(use.is_gated), probes, own, tables, _reach(use, scene), use.wants)
 
 
 def _reach(use: DepthUse[Tensor], scene: Scene) -> Tensor:

@@ -11,7 +11,8 @@ from tgdsl.errors import BakeError
 from tgdsl.quantities.base import Planning, Use
 from tgdsl.quantities.contact_depth.part import ContactDepthPart, DepthUse, ProbeQuery, SearchPart
 from tgdsl.quantities.contact_depth.request import ContactDepth
-from tgdsl.quantities.contact_depth.search import geom_tables, is_searchable
+from tgdsl.quantities.contact_depth.search import is_searchable
+from tgdsl.quantities.contact_depth.search_tables import geom_tables
 from tgdsl.quantities.geoms.baking import geom_distance, geom_table
 from tgdsl.quantities.geoms.distance import Geoms
 from tgdsl.quantities.geoms.tables import GeomTable

@@ -17,7 +17,7 @@ from tgdsl.geometry.planes import Rot, Vec
 from tgdsl.quantities.moments.moments import MomentField, Moments, PointCloud, cloud_moments, field_moments, plane_moments
 from tgdsl.quantities.moments.request import SurfaceMoments
 from tgdsl.quantities.pairs import Motion, PairedObject, Pairs, gathered
-from tgdsl.tensors.fusion import takes_kernel
+from tgdsl.tensors.operations import Operation
 
 
 class Plane(NamedTuple):
@@ -62,7 +62,7 @@ def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> 
     motions: dict[str, Motion] = {}
     for source in sources:
         name, own = source.target.name, source.target.pairs
-        found[name] = _felt_moments(pairs, own, pos, source)
+        found[name] = FELT_MOMENTS(pairs, own, pos, source)
         if pairs.motion is not None:
             linear, angular, turn = (gathered(part, own, source.pair) for part in pairs.motion)
             motions[name] = Motion(linear, angular, turn)
@@ -70,14 +70,8 @@ def surface_moments(pairs: Pairs, pos: Vec, sources: Sequence[MomentSource]) -> 
     return SurfaceMoments(pos, none, found, motions, {source.target.name: source.area for source in sources})
 
 
-def _felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+def felt_moments(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
     """Return the moments of an object at the probes, in their links' frames."""
-    tensors = [source.radius, *pos, *pairs.rotation, *pairs.offset, *([] if source.shift is None else [source.shift])]
-    field = source.surface
-    if isinstance(field, MomentField) and not field.is_smooth and not source.planes and takes_kernel(*tensors):
-        from tgdsl.quantities.moments.nearby_kernel import felt_moments
-
-        return felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, field)
     rotation = planes.rot(part[:, own][:, source.pair] for part in pairs.rotation)
     point = planes.add(planes.rotate(rotation, pos), gathered(pairs.offset, own, source.pair))
     moments = _moments(point, source)
@@ -105,3 +99,22 @@ def _moments(point: Vec, source: MomentSource) -> Moments:
     for part in parts[1:]:
         mass, first = mass + part.mass, planes.add(first, part.first)
     return Moments(mass, first)
+
+
+def _by_kernel(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> Moments:
+    from tgdsl.quantities.moments import nearby_kernel
+
+    assert isinstance(source.surface, MomentField)
+    return nearby_kernel.felt_moments(pairs, own, pos, source.pair, source.radius, source.shift, source.surface)
+
+
+def _inputs(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> list[Tensor]:
+    shift = [] if source.shift is None else [source.shift]
+    return [source.radius, *pos, *pairs.rotation, *pairs.offset, *shift]
+
+
+def _is_one_field(pairs: Pairs, own: slice, pos: Vec, source: MomentSource) -> bool:
+    return isinstance(source.surface, MomentField) and not source.surface.is_smooth and not source.planes
+
+
+FELT_MOMENTS = Operation("felt_moments", felt_moments, _by_kernel, _inputs, _is_one_field)

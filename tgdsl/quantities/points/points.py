@@ -18,7 +18,8 @@ from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.geoms.distance import Geoms, body_distance, united
 from tgdsl.quantities.pairs import Pairs
-from tgdsl.tensors.fusion import stored, takes_kernel
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.operations import Operation
 
 SMALLEST_TILE, LARGEST_TILE = 32, 128
 """Numbers of taxels of a tile."""
@@ -74,25 +75,16 @@ class ObjectPoints(NamedTuple):
     source: PointSource
 
 
-def are_for_kernel(own: ObjectPoints) -> bool:
-    """Return whether a kernel can take all of it: the links' geoms are grids, on a GPU."""
-    (rotation, offset, _, _), source = own.pairs, own.source
-    are_grids = all(isinstance(surface, Grid) for surface in source.links.surfaces)
-    return are_grids and takes_kernel(*rotation, *offset, *source.points, source.links.pos, source.links.rotation)
-
-
 def link_points(own: ObjectPoints) -> LinkPoints:
     """Return where the points are, and how deep in the links' surfaces."""
     pairs, source = own
-    if are_for_kernel(own):
-        return _met_by_kernel(pairs, source)
     rotation = planes.rot(part[:, source.pair, None] for part in pairs.rotation)
     offset = planes.vec(part[:, source.pair, None] for part in pairs.offset)
     pos = planes.rotate_back(rotation, planes.sub(source.points, offset))
     distance, gradient = body_distance(pos, source.links)
     if pairs.gate is not None:
         distance = torch.where(pairs.gate[:, source.pair, None] < 0, torch.inf, distance)
-    return LinkPoints(source.taxels, source.tiles, planes.vec(map(stored, pos)), distance, gradient, source.area)
+    return LinkPoints(source.taxels, source.tiles, planes.vec(map(materialised, pos)), distance, gradient, source.area)
 
 
 def point_tiles(taxels: Sequence[tuple[int, int]], num_taxels: int) -> list[tuple[int, int, int]]:
@@ -117,10 +109,24 @@ def tile_size(taxels: Sequence[tuple[int, int]]) -> int:
     return min(max(1 << (most - 1).bit_length(), SMALLEST_TILE), LARGEST_TILE)
 
 
-def _met_by_kernel(pairs: Pairs, source: PointSource) -> LinkPoints:
-    """Return the points of one object where all geoms of the links are grids, one geom after the other."""
+def _by_kernel(own: ObjectPoints) -> LinkPoints:
+    """One geom of the links after the other."""
     from tgdsl.quantities.points.skin_kernel import meet
 
+    pairs, source = own
     found = [meet(pairs, source.pair, source.points, source.links, g) for g in range(len(source.links.shapes))]
     distance, gradient = united([geom[1:] for geom in found], source.links.is_absent)
     return LinkPoints(source.taxels, source.tiles, found[0][0], distance, gradient, source.area)
+
+
+def _inputs(own: ObjectPoints) -> list[Tensor]:
+    (rotation, offset, _, _), source = own
+    return [*rotation, *offset, *source.points, source.links.pos, source.links.rotation]
+
+
+def are_grids(own: ObjectPoints) -> bool:
+    """Return whether all geoms of the links are grids."""
+    return all(isinstance(surface, Grid) for surface in own.source.links.surfaces)
+
+
+LINK_POINTS = Operation("meet", link_points, _by_kernel, _inputs, are_grids)

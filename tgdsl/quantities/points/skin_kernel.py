@@ -54,7 +54,7 @@ def meet(
 
 
 def grid_tables(links: Geoms, g: int) -> tuple[Float[Tensor, "link 16"], Int[Tensor, "link 4"], Float[Tensor, " node"]]:
-    """Return what kernels are told of a geom of the links: `frames`, `counts` and `values`, see `launch`."""
+    """Return the tables of one geom of the links, `frames`, `counts` and `values`, see `launch`."""
     grid = links.surfaces[g]
     assert isinstance(grid, Grid)
     frames = torch.cat([links.pos[:, g], links.rotation[:, g], torch.stack([*grid.origin, grid.cell], dim=-1)[:, 0]], dim=1)

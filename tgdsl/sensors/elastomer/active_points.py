@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.geometry.planes import Vec
-from tgdsl.tensors.fusion import wants_derivatives
+from tgdsl.tensors.operations import needs_autograd
+from tgdsl.tensors.torch_internals import expect_size
 
 Row = tuple[Float[Tensor, "6 row slot"], Int[Tensor, " row"]]
 LARGEST_BLOCK = 16
@@ -35,7 +36,7 @@ EXPECTED = (1000, 100)
 
 def are_compacted(pos: Vec, strength: Vec) -> bool:
     """Return whether `active_points` can take these and saves time: on a CPU, for several environments, without derivatives."""
-    return pos[0].device.type == "cpu" and pos[0].shape[0] != 1 and not wants_derivatives(*pos, *strength)
+    return pos[0].device.type == "cpu" and pos[0].shape[0] != 1 and not needs_autograd(*pos, *strength)
 
 
 def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:
@@ -91,18 +92,10 @@ def compacted(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[T
 @compacted.register_fake
 def _(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     context = torch.library.get_ctx()
-    slots = _expected(context.new_dynamic_size(min=1), EXPECTED[1])
-    nums = [_expected(context.new_dynamic_size(min=FEWEST), EXPECTED[0]) for _ in range(pulls.shape[1])]
+    slots = expect_size(context.new_dynamic_size(min=1), EXPECTED[1])
+    nums = [expect_size(context.new_dynamic_size(min=FEWEST), EXPECTED[0]) for _ in range(pulls.shape[1])]
     rows = [planes[0].new_empty((6, num, slots)) for num in nums]
     return rows, [planes[0].new_empty((num,), dtype=torch.int64) for num in nums]
-
-
-def _expected(size: torch.SymInt, value: int) -> torch.SymInt:
-    """Return a size unchanged, and tell Inductor what to expect of it where this torch can be told."""
-    hints = getattr(size.node.shape_env, "var_to_hint_override", None)
-    if hints is not None:
-        hints[size.node.expr] = value
-    return size
 
 
 def _row_length(count: Int[Tensor, "link env"], num_blocks: int, size: int) -> int | None:

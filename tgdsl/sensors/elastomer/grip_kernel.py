@@ -1,9 +1,9 @@
-"""Points that take hold of links and let go, as one Triton kernel where the links are grids: `point_anchors.advance` on a GPU.
+"""The state update of anchored points as one Triton kernel, where the links are grids: `point_anchors.advance` on a GPU.
 
-A program takes one link of an environment and looks at many points at once, which of them hold on, or may be in the skin as far
-as the next node of the link's grid tells: most do neither. Those that do are written down side by side, and taken a word after
-the other, each lane a point: how deep they are (`skin_kernel`), and new anchors in the place of the old ones. What pulls is
-written side by side too, in the order of the points, and how many do.
+A program takes one link of an environment. It first selects the active points: those that are anchored, or may be in contact
+by the value of the grid's nearest node; most are neither. It compacts them, then takes one warp of points at a time, a thread
+per point: its depth (`skin_kernel`), and its new anchor, in place. The points with a strength are compacted too, in their
+order, and counted.
 
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
 """
@@ -21,17 +21,17 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.geometry.planes import tiny
 from tgdsl.geometry.shapes_kernel import chosen, dot
 from tgdsl.quantities.points.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 WORD, MANY = 32, 512
-"""Points that are taken together, by a program of one warp, and most that are looked at at once."""
+"""Points of a warp, which is a program, and most points that are selected from at a time."""
 REGISTERS = 72
-"""Of a lane, though a compiler would take 110 to 150: what a program waits for is memory, so many have to run at once."""
+"""Of a thread, where the compiler would take 110 to 150: the kernel is bound by memory latency, so occupancy counts."""
 MOST = 2**24
-"""Points of an object are fewer: their numbers are written down in float32."""
-TINY = tl.constexpr(1e-24)
-"""As `planes.tiny()`, of which a kernel can see constants alone."""
+"""Points of an object are fewer: the compaction holds their indices in float32."""
+TINY = tl.constexpr(tiny())
 
 
 @torch.library.custom_op("tgdsl::grip", mutates_args={"state"})

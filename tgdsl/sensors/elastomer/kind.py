@@ -111,7 +111,7 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     if "enter" in constants:
         law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
         if "shear_falloff" in constants:
-            pulls, after = point_anchors.gripped(list(gathered[Points].values()), law, state)
+            pulls, after = point_anchors.GRIP(list(gathered[Points].values()), law, state)
         else:
             shear, after = anchors.advance(felt, felt.pos, normal, law, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from tgdsl.errors import LowerError
 from tgdsl.sensors.elastomer.kernels import Skin
-from tgdsl.tensors.link_products import are_for_kernel, products
+from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
 """Time per multiply-add of each form, over that of a large matrix product (one CPU core, float32, 512 environments)."""
@@ -109,9 +109,9 @@ def apply(constants: Mapping[str, Tensor], name: str, planes: Sequence[Float[Ten
         name: The operator's name.
         planes: What goes in: any number of leading axes, taxels last.
     """
-    if (matrices := _matrices(constants, name)) and are_for_kernel(planes[0], matrices[0]):
+    if (matrices := _matrices(constants, name)) and LINK_PRODUCTS.takes_kernel(planes[0], matrices[0]):
         lines = [plane.reshape(-1, plane.shape[-1]) for plane in planes]
-        found = reduce(torch.add, [products(own, each) for own, each in zip(lines, matrices, strict=True)])
+        found = reduce(torch.add, [LINK_PRODUCTS(own, each) for own, each in zip(lines, matrices, strict=True)])
         return tuple(found.unflatten(1, planes[0].shape[:-1]).unbind())
     parts: list[tuple[Tensor, ...]] = []
     start = 0

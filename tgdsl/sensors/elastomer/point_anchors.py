@@ -25,11 +25,12 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.points.points import LinkPoints, ObjectPoints, are_for_kernel, link_points, tile_size
+from tgdsl.quantities.points.points import LINK_POINTS, LinkPoints, ObjectPoints, are_grids, tile_size
 from tgdsl.quantities.points.reference import ReferencePoints
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
 from tgdsl.sensors.elastomer.anchors import Law, capped
-from tgdsl.tensors.fusion import stored, takes_kernel
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.operations import Operation
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
 """What is carried from call to call: e_p in the link's frame [m], and 1 where the point holds on."""
@@ -77,8 +78,12 @@ class Pull(NamedTuple):
 
 def gripped(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
     """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
-    if not all(are_for_kernel(own) and len(own.source.links.shapes) == 1 for own in objects):
-        return advance([link_points(own) for own in objects], law, state)
+    return advance([LINK_POINTS(own) for own in objects], law, state)
+
+
+def _gripped_by_kernel(
+    objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]
+) -> tuple[list[Pull], dict[str, Tensor]]:
     from tgdsl.quantities.points.skin_kernel import grid_tables
     from tgdsl.sensors.elastomer.grip_kernel import grip
 
@@ -93,6 +98,17 @@ def gripped(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tenso
         pulls.append(Pull(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), count))
         first += source.pair.shape[0] * places.shape[2]
     return pulls, {}
+
+
+def _grip_inputs(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> list[Tensor]:
+    return [tensor for own in objects for tensor in LINK_POINTS.inputs(own)]
+
+
+def _have_one_grid(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> bool:
+    return all(len(own.source.links.shapes) == 1 and are_grids(own) for own in objects)
+
+
+GRIP = Operation("grip", gripped, _gripped_by_kernel, _grip_inputs, _have_one_grid)
 
 
 def advance(met: Sequence[LinkPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
@@ -117,7 +133,7 @@ def advance(met: Sequence[LinkPoints], law: Law, state: Mapping[str, Tensor]) ->
         is_taken = ~is_held & (law.reach - distance > law.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
         shape = points.distance.shape[1:]
-        strength = planes.vec(stored(part).unflatten(1, shape) for part in planes.scale(depth, moved))
+        strength = planes.vec(materialised(part).unflatten(1, shape) for part in planes.scale(depth, moved))
         pulls.append(Pull(points.taxels, points.tiles, points.area, points.pos, strength))
         for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
             after[name].append(plane)
@@ -129,21 +145,15 @@ def drag(pulls: Sequence[Pull], markers: Markers, num_envs: int) -> Vec:
     zero = markers.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
     total = (zero, zero, zero)
     for pull in pulls:
-        found = _summed(pull, markers)
+        found = POINT_SUM(pull, markers)
         if markers.reference_area is not None:
             found = planes.scale(pull.area / markers.reference_area, found)
         total = planes.add(total, found)
     return planes.sub(total, planes.scale(planes.dot(total, markers.normal), markers.normal))
 
 
-def _summed(pull: Pull, markers: Markers) -> Vec:
+def point_sum(pull: Pull, markers: Markers) -> Vec:
     """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of the points of one object."""
-    if takes_kernel(*pull.pos, *pull.strength, markers.falloff):
-        from tgdsl.sensors.elastomer.point_sum_kernel import point_sum
-
-        size, where = tile_size(pull.taxels), (list(markers.pos), list(markers.normal))
-        found = point_sum(list(pull.pos), list(pull.strength), pull.count, pull.tiles, size, *where, markers.falloff)
-        return planes.vec(found.unbind())
     num_taxels = markers.pos[0].shape[0]
     zero = markers.pos[0].new_zeros((pull.pos[0].shape[0], num_taxels))
     total = (zero, zero, zero)
@@ -161,6 +171,21 @@ def _summed(pull: Pull, markers: Markers) -> Vec:
         around = (first, num_taxels - last)
         total = planes.add(total, planes.vec(torch.nn.functional.pad(part, around) for part in found))
     return total
+
+
+def _point_sum_by_kernel(pull: Pull, markers: Markers) -> Vec:
+    from tgdsl.sensors.elastomer import point_sum_kernel
+
+    where = list(pull.pos), list(pull.strength), pull.count, pull.tiles, tile_size(pull.taxels)
+    found = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
+    return planes.vec(found.unbind())
+
+
+def _point_sum_inputs(pull: Pull, markers: Markers) -> list[Tensor]:
+    return [*pull.pos, *pull.strength, markers.falloff]
+
+
+POINT_SUM = Operation("point_sum", point_sum, _point_sum_by_kernel, _point_sum_inputs)
 
 
 def _summed_on_link(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: Tensor) -> Vec:
@@ -181,7 +206,8 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
     scale = torch.sqrt(falloff / math.log(2.0))
     z, own = (planes.vec(part[:, None] for part in vector) for vector in (pos, strength))
     offset_u, offset_v = (
-        stored(planes.dot(tangent, marker))[:, None] - _along(planes.vec(stored(part)[:, None] for part in tangent), z)
+        materialised(planes.dot(tangent, marker))[:, None]
+        - _along(planes.vec(materialised(part)[:, None] for part in tangent), z)
         for tangent in (planes.scale(scale, tangent) for tangent in _tangents(normal))
     )
     fall = torch.exp2(-offset_u * offset_u - offset_v * offset_v)
@@ -191,7 +217,7 @@ def _summed_at_once(pos: Vec, strength: Vec, marker: Vec, normal: Vec, falloff: 
 def _along(tangent: Vec, point: Vec) -> Tensor:
     """Return points along tangents, (env, taxel or 1, point): of one tangent it is kept, not formed anew for each marker."""
     found = planes.dot(tangent, point)
-    return stored(found) if tangent[0].shape[0] == 1 else found
+    return materialised(found) if tangent[0].shape[0] == 1 else found
 
 
 def _tangents(normal: Vec) -> tuple[Vec, Vec]:

@@ -1,9 +1,9 @@
 """The sum over points of `point_anchors` as one Triton kernel, for a GPU in float32 without derivatives.
 
-A program takes one environment and some tiles of markers, each of one link, which its lanes hold; points come one after the
-other. Most of them pull at nothing: the kernel is told how many do, which then stand first, or passes over groups that do not,
-so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is found along two tangents of
-each marker, scaled so that its square is the exponent of 2.
+A program takes one environment and some tiles of markers, each of one link: a thread per marker, a loop over the points. Few
+points are in contact. With `count` they come first and the loop ends after them; without it the loop skips groups of points
+that all have strength 0, so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is
+found along two tangents of each marker, scaled so that its square is the exponent of 2.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points, `marker` markers of all links, `tile`
 tiles.
@@ -22,11 +22,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
+from tgdsl.geometry.planes_kernel import LOG2_E
+
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
-"""Tiles of a program that is told how many points pull: at most of them none does."""
-LOG2_E = tl.constexpr(1.4426950408889634)
+"""Tiles of a program where the number of points that pull is given: for most tiles it is 0."""
 
 
 @triton_op("tgdsl::point_sum", mutates_args={})
@@ -75,26 +76,26 @@ def launch(
     run[(num_envs, triton.cdiv(tiles.shape[0], of_program))](
         *planes, falloff, found, tiles if count is None else count, tiles,
         tiles.shape[0], num_links, num_points, pos[0].stride(0), pos[0].stride(1), marker[0].shape[0],
-        IS_TOLD=count is not None, TILES=of_program, BLOCK=block, num_warps=1,
+        HAS_COUNT=count is not None, TILES=of_program, BLOCK=block, num_warps=1,
     )  # fmt: skip
     return found
 
 
 @triton.jit
 def point_sum_kernel(
-    z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, found, told, tiles,
+    z_x, z_y, z_z, s_x, s_y, s_z, x_x, x_y, x_z, n_x, n_y, n_z, falloff, found, count, tiles,
     num_tiles, num_links, num_points, stride_env, stride_link, num_markers,
-    IS_TOLD: tl.constexpr, TILES: tl.constexpr, BLOCK: tl.constexpr,
+    HAS_COUNT: tl.constexpr, TILES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Sum over the points of one environment for some tiles of markers."""
     env, first_tile = tl.program_id(0).to(tl.int64), tl.program_id(1) * TILES
     own = first_tile + tl.arange(0, TILES)
     links = tl.load(tiles + 3 * own, own < num_tiles, -1)
-    told += env * num_links
+    count += env * num_links
     are_links = links >= 0
     num_pulling = tl.where(are_links, num_points, 0)
-    if IS_TOLD:
-        num_pulling = tl.load(told + links, are_links, 0)
+    if HAS_COUNT:
+        num_pulling = tl.load(count + links, are_links, 0)
     busy = tl.sum((num_pulling > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
     found += env * num_markers
@@ -109,8 +110,8 @@ def point_sum_kernel(
             frame = _frame((x_x, x_y, x_z), (n_x, n_y, n_z), marker, is_marker, tl.load(falloff))
             at = env * stride_env + link * stride_link
             pos, strength = (z_x + at, z_y + at, z_z + at), (s_x + at, s_y + at, s_z + at)
-            if IS_TOLD:
-                for p in tl.range(0, tl.load(told + link), loop_unroll_factor=4):
+            if HAS_COUNT:
+                for p in tl.range(0, tl.load(count + link), loop_unroll_factor=4):
                     total = _added(total, frame, pos, strength, p)
             else:
                 total = _sum_of_all(total, frame, pos, strength, num_points)

@@ -43,7 +43,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.tensors.fusion import takes_kernel
+from tgdsl.tensors.operations import Operation
 
 LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
@@ -205,14 +205,6 @@ def shared_forces(
         levenberg: Least curvature of each step towards the moment [1]; of length 0 it leaves λ⁰.
     """
     taxel, inverse_radius = bodies.taxel, bodies.inverse_radius
-    if takes_kernel(depth, *point, *force, *torque, *normal):
-        from tgdsl.sensors.force_taxel import footprint_kernel
-
-        own = inverse_radius.flatten()[bodies.row]
-        weight = depth * own + unreached()
-        args = radius, levenberg, bodies.first, bodies.box
-        shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
-        return Shared(shared, sums[:, :3], sums[:, 3:])
     # Of torch's operations on a CPU `index` and `exp` wake other threads for a few thousand numbers, these do not.
     own = depth.index_select(1, taxel.flatten()).unflatten(1, taxel.shape)
     share, residual = footprint(
@@ -230,6 +222,27 @@ def shared_forces(
     padded = [(share * part[..., None]).sum(dim=2) for part in force]
     found = torch.stack([part.flatten(1).index_select(1, bodies.row) for part in padded], dim=1)
     return Shared(found, torch.stack([part.sum(dim=2) for part in padded], dim=1), torch.stack(residual, dim=1))
+
+
+def _shared_by_kernel(
+    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+) -> Shared:
+    from tgdsl.sensors.force_taxel import footprint_kernel
+
+    own = bodies.inverse_radius.flatten()[bodies.row]
+    weight = depth * own + unreached()
+    args = radius, levenberg, bodies.first, bodies.box
+    shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
+    return Shared(shared, sums[:, :3], sums[:, 3:])
+
+
+def _inputs(
+    bodies: Bodies, depth: Tensor, point: Vec, force: Vec, torque: Vec, normal: Vec, radius: Tensor, levenberg: Tensor
+) -> list[Tensor]:
+    return [depth, *point, *force, *torque, *normal]
+
+
+SHARED_FORCES = Operation("shared_forces", shared_forces, _shared_by_kernel, _inputs)
 
 
 def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:

@@ -24,7 +24,7 @@ import triton.language as tl
 from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
-from tgdsl.geometry.planes_kernel import add3, add6, cross, scale3, scale6, solve, times
+from tgdsl.geometry.planes_kernel import LOG2_E, add3, add6, cross, scale3, scale6, solve, times
 from tgdsl.geometry.shapes_kernel import dot
 
 ENVS = 8
@@ -41,10 +41,9 @@ BESIDE = tl.constexpr(0.25)
 """How far a contact stands beside the box of the taxels where moments are about that [footprints]."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
-LOG2_E = tl.constexpr(1.4426950408889634)
 NO_FORCE = tl.constexpr(1e-12)
 DAMPING = tl.constexpr(0.1)
-"""As in `footprint`, of which a kernel can see constants of its own file alone."""
+"""As in `footprint`."""
 
 
 @triton_op("tgdsl::shared_forces", mutates_args={})

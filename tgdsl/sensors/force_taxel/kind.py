@@ -158,7 +158,7 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     """Return the force [N], the pressure [Pa] if wanted, and by body what is missed [N] and left of the moment [N·m]."""
     contacts, felt = gathered[Contacts], gathered[ContactDepth]
     bodies = footprint.Bodies(*(constants[name] for name in footprint.Bodies._fields))
-    shared = footprint.shared_forces(
+    shared = footprint.SHARED_FORCES(
         bodies,
         felt.depth,
         contacts.pos,

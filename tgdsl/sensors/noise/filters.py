@@ -12,8 +12,8 @@ from torch import Tensor
 
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.noise.instant import Now, Signal
-from tgdsl.tensors.fusion import stored
-from tgdsl.tensors.link_products import products
+from tgdsl.tensors.fusion import materialised
+from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 KERNEL = "kernel/"
 """Kernels of the links, (σ, taxel from, taxel to): `kernel/0000` and so on, in the order of the taxels."""
@@ -26,7 +26,7 @@ def hysteresis(
     assert now.dt is not None
     ratio = now.dt / values["hysteresis_time"]
     ramp = torch.where(ratio > 0, -torch.expm1(-ratio) / torch.where(ratio > 0, ratio, 1.0), 1.0)
-    decay, ramp = stored(torch.exp(-ratio)), stored(ramp)
+    decay, ramp = materialised(torch.exp(-ratio)), materialised(ramp)
     lag = torch.where(now.age[..., None] == 0, 0.0, decay * memory["lag"] + ramp * (signal - memory["last"]))
     return signal + values["hysteresis_strength"] * lag, {"lag": lag, "last": signal}
 
@@ -44,7 +44,7 @@ def crosstalk(signal: Signal, values: Mapping[str, Tensor]) -> Signal:
 def _product(signal: Signal, kernels: Sequence[Tensor]) -> Signal:
     """Return the signal with each link's rows multiplied by its kernel, (from, to)."""
     lines = signal.flatten(0, 1)  # of all environments and channels: one product, not one for each environment
-    return products(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
+    return LINK_PRODUCTS(lines, [kernel[:, None] for kernel in kernels])[0].view(signal.shape)
 
 
 def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now) -> Signal:
@@ -60,8 +60,8 @@ def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now
     is_oldest = newer >= torch.clamp(now.age, max=length)
     start = torch.where(newer > 0, ages.gather(1, (newer - 1).clamp(min=0)), 0.0)
     rest = (late - start) / (ages.gather(1, newer.clamp(max=length - 1)) - start)
-    rest, newer = stored(torch.where(is_oldest, 0.0, rest)), stored(newer)
-    after, before = (_entry(ring, stored((now.step - newer - k) % length)) for k in (0, 1))
+    rest, newer = materialised(torch.where(is_oldest, 0.0, rest)), materialised(newer)
+    after, before = (_entry(ring, materialised((now.step - newer - k) % length)) for k in (0, 1))
     after = torch.where(newer[:, None] == 0, signal, after)
     return torch.where(rest[:, None] > 0, after + rest[:, None] * (before - after), after)
 

@@ -22,6 +22,7 @@ Shapes: `env` environments, `taxel` taxels.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -30,12 +31,14 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
 """What numbers are for: the first three are drawn at each step, the others at each reset."""
 
 PER_STEP = (READING, RADIUS, JITTER)
+UNIFORM_BITS, RADIUS_BITS, ANGLE_BITS = 23, 20, 10
+"""Bits of a word that make a uniform number, and those for radius and angle within a quadrant of two normal ones."""
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
 FIRST_PURPOSE, PURPOSE_STEP = 0x010DCD65, 0x0B873593
@@ -77,7 +80,7 @@ def streams(
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
     purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
     purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
-    found = stored(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
+    found = materialised(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
     halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
     return [{p: Stream(a[:, p, None], b[:, p, None]) for p in range(a.shape[1])} for a, b in halves]
 
@@ -88,8 +91,13 @@ def words(stream: Stream, index: Int[Tensor, "*row"]) -> Int[Tensor, "*both"]:
 
 
 def uniform(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> Tensor:
-    """Return numbers between 0 and 1, neither included: (k + 1/2) 2⁻²³."""
-    return ((word >> 9) & 0x7FFFFF).to(dtype) * 2.0**-23 + 2.0**-24
+    """Return numbers between 0 and 1, neither included: (k + 1/2) 2⁻²³, k the word's first bits."""
+    return _share(word, UNIFORM_BITS, dtype)
+
+
+def _share(word: Int[Tensor, "*row taxel"], num_bits: int, dtype: torch.dtype) -> Tensor:
+    """Return the middle of one of 2ⁿ equal parts of 0 to 1, by a word's first n bits."""
+    return ((word >> (32 - num_bits)) & (2**num_bits - 1)).to(dtype) * 2.0**-num_bits + 2.0 ** -(num_bits + 1)
 
 
 def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -98,10 +106,11 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     The angle is one of 2¹² at equal steps: ten bits for |b| < π/4, and two for the quadrant, which exchange sine and cosine and
     turn the cosine's sign. Both are their Taylor series there, to 3e-7.
     """
-    share = ((word >> 12) & 0xFFFFF).to(dtype) * 2.0**-20 + 2.0**-21
+    share = _share(word, RADIUS_BITS, dtype)
     square = -2.0 * torch.log(share)
     radius = square * torch.rsqrt(torch.clamp(square, min=2.0**-30))  # in 8 bits a share may be 1
-    angle = (((word >> 2) & 0x3FF).to(dtype) - 511.5) * (3.141592653589793 / 2048)
+    part = ((word >> 2) & (2**ANGLE_BITS - 1)).to(dtype) - (2**ANGLE_BITS - 1) / 2
+    angle = part * (math.pi / 2 ** (ANGLE_BITS + 1))
     turn = angle * angle
     sine = angle * (1 + turn * (-1 / 6 + turn * (1 / 120 - turn * (1 / 5040))))
     cosine = 1 + turn * (-1 / 2 + turn * (1 / 24 + turn * (-1 / 720 + turn * (1 / 40320))))

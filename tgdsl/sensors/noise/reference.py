@@ -24,8 +24,6 @@ from tgdsl.sensors.noise.stages import PARAMETERS
 Signal = Float[np.ndarray, "row channel"]
 Words = UInt64[np.ndarray, "*word"]
 WORD = 0xFFFFFFFF
-UNIFORM_BITS, RADIUS_BITS, ANGLE_BITS = 23, 20, 10
-"""Bits of a word that make a uniform number, and those for radius and angle within a quadrant of two normal ones."""
 
 
 def mix(word: Words) -> Words:
@@ -47,13 +45,13 @@ def words(key: tuple[int, int], env: int, counter: int, purpose: int, index: Wor
 
 def uniform(word: Words) -> Float[np.ndarray, "*word"]:
     """Return numbers between 0 and 1: the middles of 2²³ equal parts."""
-    return ((word >> np.uint64(32 - UNIFORM_BITS)) + 0.5) / 2.0**UNIFORM_BITS
+    return ((word >> np.uint64(32 - random.UNIFORM_BITS)) + 0.5) / 2.0**random.UNIFORM_BITS
 
 
 def normal_pair(word: Words) -> tuple[Float[np.ndarray, "*word"], Float[np.ndarray, "*word"]]:
     """Return two independent normal numbers for each word (Box and Muller 1958)."""
-    share = ((word >> np.uint64(32 - RADIUS_BITS)) + 0.5) / 2.0**RADIUS_BITS
-    part = ((word >> np.uint64(2)) % np.uint64(2**ANGLE_BITS) + 0.5) / 2.0**ANGLE_BITS - 0.5
+    share = ((word >> np.uint64(32 - random.RADIUS_BITS)) + 0.5) / 2.0**random.RADIUS_BITS
+    part = ((word >> np.uint64(2)) % np.uint64(2**random.ANGLE_BITS) + 0.5) / 2.0**random.ANGLE_BITS - 0.5
     small = part * math.pi / 2
     angle = np.where(word & np.uint64(2), math.pi - small, small)
     angle = np.where(word & np.uint64(1), math.pi / 2 - angle, angle)

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from tgdsl.sensors.noise import filters, random
 from tgdsl.sensors.noise.instant import Now, Signal, uniform
-from tgdsl.tensors.fusion import stored
+from tgdsl.tensors.fusion import materialised
 
 TERMS = ("radius_noise", "gain", "hysteresis", "crosstalk", "delay", "bias", "white_noise", "drift", "quantization", "dead")
 """The stages that a plan names, in their order."""
@@ -78,7 +78,7 @@ def knob_values(constants: Mapping[str, Tensor], now: Now | None) -> dict[str, T
         stream, like = now.streams[random.PARAMETER], constants[drawn[0]]
         place = [torch.full((1,), PARAMETERS.index(name), dtype=torch.int32, device=like.device) for name in drawn]
         for name, index in zip(drawn, place, strict=True):
-            share = stored(random.uniform(random.words(stream, index), like.dtype))
+            share = materialised(random.uniform(random.words(stream, index), like.dtype))
             low, high = constants[name]
             values[name] = low + share[..., None] * (high - low)
     return values
@@ -91,14 +91,14 @@ def shifted(radius: Tensor, shift: Tensor) -> Tensor:
 
 def radius_shift(half_width: Tensor, now: Now, like: Tensor) -> Tensor:
     """Return by how much each probe's radius is off (env, taxel) [m]."""
-    share = stored(uniform(now, random.RADIUS, 0, like))
+    share = materialised(uniform(now, random.RADIUS, 0, like))
     return half_width[:, 0] * (2 * share - 1)
 
 
 def gain(values: Mapping[str, Tensor], now: Now, like: Tensor) -> Tensor:
     """Return each taxel's gain (env, taxel)."""
     low, high = values["gain_low"][:, 0], values["gain_high"][:, 0]
-    share = stored(uniform(now, random.GAIN, 0, like))
+    share = materialised(uniform(now, random.GAIN, 0, like))
     return low + share * (high - low)
 
 
@@ -155,7 +155,7 @@ def _with_random_offset(
 
 
 def _quantized(signal: Signal, step: Tensor) -> Signal:
-    per_step = stored(torch.where(step > 0, 1 / torch.where(step > 0, step, 1.0), 0.0))
+    per_step = materialised(torch.where(step > 0, 1 / torch.where(step > 0, step, 1.0), 0.0))
     level = torch.where(step > 0, step * torch.round(signal * per_step), signal)
     return level.detach() + (signal - signal.detach()) if signal.requires_grad else level
 
@@ -165,7 +165,7 @@ def _with_dead(signal: Signal, values: Mapping[str, Tensor], now: Now) -> Signal
     one = signal[:, 0]
     share = uniform(now, random.DEAD, 1, one) if "dead_high" in values else torch.zeros_like(one)
     is_dead = uniform(now, random.DEAD, 0, one) < values["dead_probability"][:, 0]
-    share = stored(torch.where(is_dead, share, -1.0))
+    share = materialised(torch.where(is_dead, share, -1.0))
     share, stuck = share[:, None], values["dead_low"]
     if "dead_high" in values:
         stuck = stuck + share * (values["dead_high"] - stuck)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tgdsl.tensors import fusion
+from tgdsl.tensors import operations
 
 
 class OnGpu(torch.Tensor):
@@ -18,11 +18,11 @@ def on_gpu(dtype=torch.float32, requires_grad=False):
 
 @pytest.fixture(autouse=True)
 def triton(monkeypatch):
-    monkeypatch.setattr(fusion, "HAS_TRITON", True)
+    monkeypatch.setattr(operations, "HAS_TRITON", True)
 
 
 def test_a_kernel_takes_float32_on_a_gpu():
-    assert fusion.takes_kernel(on_gpu(), on_gpu())
+    assert operations.are_kernel_inputs(on_gpu(), on_gpu())
 
 
 @pytest.mark.parametrize("place", range(3))
@@ -31,9 +31,9 @@ def test_one_tensor_that_it_cannot_take_is_enough(place, other):
     """Whichever it is: on the host, of another dtype, or one whose derivatives are asked for."""
     tensors = [on_gpu() for _ in range(3)]
     tensors[place] = other
-    assert not fusion.takes_kernel(*tensors)
+    assert not operations.are_kernel_inputs(*tensors)
 
 
 def test_derivatives_that_nobody_asks_for_are_no_hindrance():
     with torch.no_grad():
-        assert fusion.takes_kernel(on_gpu(requires_grad=True), on_gpu())
+        assert operations.are_kernel_inputs(on_gpu(requires_grad=True), on_gpu())

@@ -1,0 +1,37 @@
+"""Noise in compiled modules."""
+
+import jaxtyping
+import pytest
+import torch
+from noisy_modules import EVERY_KNOB, FLOAT32_TOLERANCE, RANGES, read
+
+from tgdsl.testing.reference import full_scale_error
+
+
+@pytest.mark.slow
+def test_compiled_equals_eager(build, monkeypatch):
+    """At two numbers of environments: the second takes over the state of another module."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    sensors = {
+        "s": {"noise": EVERY_KNOB, "rate": 60, "history": 3, "readout": "both"},
+        "r": {"noise": RANGES, "history": {"length": 3, "reduce": "mean"}},
+        "d": {"kind": "contact_depth", "noise": {"white_noise": 1e-4, "read_delay": 0.013}, "rate": 60},
+    }
+    torch.compiler.reset()
+    eager, more, compiled = (build(torch.float32, **sensors) for _ in range(3))
+    compiled.compile()
+    agree_over_calls(compiled, eager, 4, range(8))
+    read(more, range(2), 37)
+    compiled.load_state_dict(more.state_dict())
+    agree_over_calls(compiled, more, 37, range(2, 8))
+
+
+def agree_over_calls(compiled, eager, num_envs, calls):
+    for call in calls:
+        if call == 5:
+            for touch in (eager, compiled):
+                touch.reset([1, 3])
+        (found,), (expected,) = (read(touch, range(call, call + 1), num_envs) for touch in (compiled, eager))
+        for name in expected:
+            a, b = (reading[name].flatten(0, -3) for reading in (found, expected))
+            assert full_scale_error(a, b.double().numpy()).max() < FLOAT32_TOLERANCE, name

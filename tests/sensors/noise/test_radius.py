@@ -1,0 +1,86 @@
+"""Noise of the probes' radii."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from noisy_modules import SCENE, document, felt_state, read
+
+import tgdsl
+from tgdsl.module.module import TactileModule
+from tgdsl.sensors.noise import stages
+from tgdsl.testing import only
+from tgdsl.testing.reference import full_scale_error
+
+
+def test_a_disturbed_radius_is_another_radius(build, tmp_path):
+    """Depths are exactly those of a module that is compiled with the radii that were drawn."""
+    touch = build(s={"kind": "contact_depth", "noise": {"radius_noise": 2e-3}})
+    made, drawn, num_felt = document(tmp_path, {"s": {"kind": "contact_depth"}}), [], 0
+    for call in range(4):
+        state = felt_state(touch, 2, call)
+        memory = touch.memory.tensors(2, None, touch.dtype, touch.device)
+        nows, knobs = touch._circumstances({}, memory)
+        shift = stages.radius_shift(knobs["s"]["radius_noise"], nows["s"], torch.zeros(2, 17, dtype=torch.float64))
+        readings = touch(state)["s"]
+        drawn.append(shift)
+        for env in range(2):
+            for link, first in (("pad", 0), ("tip", 12)):
+                for i, point in enumerate(made["robot"]["layout"]["resolutions"]["r"][link]["points"]):
+                    point["radius"] = 4e-3 + shift[env, first + i].item()
+            expected = tgdsl.compile(made, dtype=torch.float64)(only(state, slice(env, env + 1)))["s"]
+            torch.testing.assert_close(readings[env : env + 1], expected, rtol=1e-12, atol=1e-17)
+            num_felt += int(expected.count_nonzero())
+    assert num_felt > 5
+    values = torch.stack(drawn)
+    assert values.abs().max() <= 2e-3 and len(values.unique()) == values.numel()
+    assert values.min() < -1.5e-3 and values.max() > 1.5e-3
+
+
+def test_a_radius_is_never_negative(build):
+    """R̃ = max(0, R + ε): where R is gone a probe still reads how deep its centre is, as max(0, R̃ − φ) says."""
+    touch = build(s={"kind": "contact_depth", "gate": "geometric", "noise": {"radius_noise": 0.02}, "readout": "both"})
+    state = touch.example_state(40, spread=0.01)
+    readings = touch(state)
+    measured, clean = readings["s"], readings["s/clean"]
+    deep = clean > 4e-3  # the centre is inside
+    assert deep.any() and (measured[deep] >= clean[deep] - 4e-3 - 1e-12).all()
+    assert torch.isclose(measured[deep], clean[deep] - 4e-3, rtol=0, atol=1e-12).float().mean() > 0.2  # P(ε < −4 mm) = 0.4
+    assert (measured >= 0).all()
+
+
+RADIUS_ERRORS = {"points": 1e-12, "field": 0.1}
+"""Largest error over full scale at R ± ρ, against a module that is compiled with that radius."""
+
+
+@pytest.mark.parametrize("backend", ["points", pytest.param("field", marks=pytest.mark.slow)])
+def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
+    made = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, "tolerance": 0.02, "points": 1000}})
+    (tmp_path / "scene.xml").write_text(SCENE.replace('type="sphere" size=".025"', 'type="box" size=".01 .01 .01"'))
+
+    def of_radius(radius: float, noise: dict) -> TactileModule:
+        for own in made["robot"]["layout"]["resolutions"]["r"].values():
+            own["radius"] = radius
+        made["sensors"]["s"]["noise"] = noise
+        return tgdsl.compile(made, dtype=torch.float64)
+
+    touch = of_radius(0.01, {"radius_noise": "0.6 mm"})
+    state = felt_state(touch, 100)
+    for sign in (1, -1):
+        exact = of_radius(0.01 + sign * 6e-4, {})
+        if backend == "points":  # which points there are depends on the radius; the law is compared on the same ones
+            cloud = {name: value for name, value in touch.plan.arrays.items() if name.startswith("objects/item/moments/")}
+            exact = TactileModule(dataclasses.replace(exact.plan, arrays={**exact.plan.arrays, **cloud}), dtype=torch.float64)
+        monkeypatch.setattr(stages, "radius_shift", lambda half_width, *_, sign=sign: (sign * half_width[:, 0]).expand(100, 17))
+        error = full_scale_error(touch(state)["s"], exact(state)["s"].numpy())
+        print(f"{backend}, R {sign:+d} ρ: largest error {error.max():.2g} of full scale, RMS {np.sqrt(np.mean(error**2)):.2g}")
+        assert error.max() < RADIUS_ERRORS[backend]
+
+
+def test_the_clean_reading_of_points_is_that_of_a_sensor_without_noise(build):
+    """Radius noise of the measured reading leaves the clean one alone: the object is sampled in the same points."""
+    sensor = {"kind": "proximity", "backend": "points", "points": 200}
+    both, clean = build(s={**sensor, "noise": {"radius_noise": "0.6 mm"}, "readout": "both"}), build(s=sensor)
+    for a, b in zip(read(both, range(3)), read(clean, range(3)), strict=True):
+        assert full_scale_error(a["s/clean"], b["s"].numpy()).max() < 1e-12

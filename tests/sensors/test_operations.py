@@ -1,0 +1,145 @@
+"""All operations that have a kernel: the kernel is their definition, interpreted and on a GPU, and is launched when it can be."""
+
+import ast
+import json
+import sys
+from functools import cache, partial
+from pathlib import Path
+
+import pytest
+import torch
+from kernels import as_script, interpreted, needs_triton, use_kernels
+from operation_examples import EXAMPLES, mapped
+
+from tgdsl.sensors.operations import OPERATIONS
+
+PACKAGE = Path(__file__).parents[2] / "tgdsl"
+OPERATION = {operation.name: operation for operation in OPERATIONS}
+NAMES = list(OPERATION)
+KERNEL_FILES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*_kernel.py"))
+LIBRARIES = {"geometry/planes_kernel.py", "geometry/shapes_kernel.py"}
+"""Functions that kernels call."""
+
+
+def operators(file: str) -> set[str]:
+    """Return the names of the custom operators that a file defines."""
+    calls = [node for node in ast.walk(ast.parse((PACKAGE / file).read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    return {
+        call.args[0].value.removeprefix("tgdsl::")  # type: ignore[union-attr]
+        for call in calls
+        if ast.unparse(call.func).rpartition(".")[2] in ("triton_op", "custom_op")
+    }
+
+
+def test_each_kernel_belongs_to_an_operation():
+    assert len(NAMES) == len(OPERATIONS) and set(NAMES) == EXAMPLES.keys()
+    found = {file: operators(file) & set(NAMES) for file in KERNEL_FILES if file not in LIBRARIES}
+    assert {file for file, names in found.items() if len(names) != 1} == set()
+    assert sorted(name for names in found.values() for name in names) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("operation", OPERATIONS, ids=NAMES)
+def test_a_kernel_is_not_taken_on_a_cpu(operation):
+    example = EXAMPLES[operation.name]
+    assert not operation.takes_kernel(*example.arguments(torch.float32))
+
+
+def error_of(name, found, arguments):
+    """Return what is wrong with a result, by the definition in float64."""
+    example, exact = EXAMPLES[name], EXAMPLES[name].arguments(torch.float64)
+    expected = example.compared(OPERATION[name].definition(*exact), exact)
+    found = example.compared(found, arguments)
+    for i, (part, other, tolerance) in enumerate(zip(found, expected, example.tolerances, strict=True)):
+        if not other.double().abs().max() > 20 * tolerance:
+            return f"part {i} is nothing"
+        if not (part.double() - other.double()).abs().max() <= tolerance:
+            return f"part {i} is off by {(part.double() - other.double()).abs().max():.2g}"
+    return ""
+
+
+def interpret(name):
+    """Compare an interpreted kernel with the definition."""
+    use_kernels()
+    arguments = EXAMPLES[name].arguments(torch.float32)
+    return error_of(name, OPERATION[name](*arguments), arguments)
+
+
+def trace(name):
+    """Return "" if one graph of Dynamo holds the operator, whatever the device."""
+    use_kernels()
+    operators = []
+
+    def backend(graph, inputs):
+        operators.extend(str(node.target) for node in graph.graph.nodes)
+        raise NotImplementedError("no kernel runs on this device")
+
+    torch.compiler.reset()
+    try:
+        torch.compile(OPERATION[name], fullgraph=True, backend=backend)(*EXAMPLES[name].arguments(torch.float32))
+    except Exception as error:
+        if not operators:
+            return str(error)
+    return "" if f"tgdsl.{name}.default" in operators else f"there is no tgdsl::{name} in {operators}"
+
+
+def launch(name, is_compiled):
+    """Compare a GPU's kernel with the definition, and look whether it was launched."""
+    arguments = mapped(torch.Tensor.cuda, EXAMPLES[name].arguments(torch.float32))
+    torch.compiler.reset()
+    call = torch.compile(OPERATION[name], fullgraph=True) if is_compiled else OPERATION[name]
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        found = call(*arguments)
+        torch.cuda.synchronize()
+    (kernel,) = (Path(file).stem for file in KERNEL_FILES if name in operators(file))
+    if not any(event.key.startswith(kernel) for event in profile.key_averages()):
+        return f"no {kernel} among {[event.key for event in profile.key_averages()]}"
+    return error_of(name, mapped(torch.Tensor.cpu, found), mapped(torch.Tensor.cpu, arguments))
+
+
+MODES = {
+    "interpret": interpret,
+    "trace": trace,
+    "eager": partial(launch, is_compiled=False),
+    "compiled": partial(launch, is_compiled=True),
+}
+
+
+@pytest.fixture(scope="module")
+def errors():
+    """Return what is wrong in a mode, by the operations' names: one process for all of them."""
+
+    @cache
+    def of(mode):
+        return json.loads((interpreted if mode == "interpret" else as_script)(__file__, mode))
+
+    return of
+
+
+@needs_triton
+@pytest.mark.parametrize("name", NAMES)
+def test_an_interpreted_kernel_is_the_definition(errors, name):
+    assert errors("interpret")[name] == ""
+
+
+@needs_triton
+@pytest.mark.parametrize("name", NAMES)
+def test_one_graph_launches_the_kernel(errors, name):
+    assert errors("trace")[name] == ""
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("mode", ["eager", "compiled"])
+def test_a_gpu_launches_the_kernel_and_it_is_the_definition(errors, mode, name):
+    assert errors(mode)[name] == ""
+
+
+def main() -> None:
+    """Print what is wrong with each operation."""
+    with torch.no_grad():
+        print(json.dumps({name: MODES[sys.argv[1]](name) for name in NAMES}))
+
+
+if __name__ == "__main__":
+    main()
