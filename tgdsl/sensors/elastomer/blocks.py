@@ -12,10 +12,8 @@ from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
-from tgdsl.sensors.elastomer.boundary import correction, element_size
 from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, Skin
 from tgdsl.sensors.elastomer.operators import Response, Wish, fold
-from tgdsl.sensors.elastomer.pad import unroll
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -116,6 +114,10 @@ def _elastic_responses(spec: ElastomerSpec, part: Skin, is_active: Float[np.ndar
 
 def clamping(spec: ElastomerSpec, part: Skin, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
     """Return what clamping the pad's edge adds to `spread`: the edge is moved back by as much as it would move."""
+    # Here, so that only who clamps a pad waits for scikit-fem, and a compiled module runs without it.
+    from tgdsl.sensors.elastomer.clamped.boundary import correction, element_size
+    from tgdsl.sensors.elastomer.clamped.pad import unroll
+
     assert spec.boundary is not None and spec.thickness is not None
     added = np.zeros((3, 1, len(part.pos), len(part.pos)))
     if not part.is_active.any():
