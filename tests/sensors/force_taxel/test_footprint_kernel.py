@@ -7,7 +7,8 @@ import pytest
 import torch
 from kernels import interpreted, needs_triton
 
-from tgdsl.sensors.force_taxel.footprint import LEVENBERG, Bodies, box, place, shared_forces, unreached
+from tgdsl.sensors.force_taxel.constants import unreached
+from tgdsl.sensors.force_taxel.footprint import LEVENBERG, Bodies, box, place, shared_forces
 
 RADIUS = 0.01
 TOLERANCE = 1e-5

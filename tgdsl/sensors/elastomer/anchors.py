@@ -97,7 +97,7 @@ def advance_reference(
             s = rotation[k].T @ (e - offset[k]) - x
             t = found[i] = s - (s @ n) * n
             length = float(np.linalg.norm(t))
-            if law.slip is not None and length > law.slip * touch.depth[i] and length > 1e-15:
+            if law.slip is not None and length > law.slip * touch.depth[i] and length**2 > planes.tiny():
                 found[i] = t * (law.slip * touch.depth[i] / length)
                 e = e + rotation[k] @ (found[i] - t)
         else:

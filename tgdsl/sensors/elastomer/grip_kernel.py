@@ -21,6 +21,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.geometry import planes
 from tgdsl.geometry.shapes_kernel import chosen, dot
 from tgdsl.quantities.points.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
@@ -30,8 +31,7 @@ REGISTERS = 72
 """Of a lane, though a compiler would take 110 to 150: what a program waits for is memory, so many have to run at once."""
 MOST = 2**24
 """Points of an object are fewer: their numbers are written down in float32."""
-TINY = tl.constexpr(1e-24)
-"""As `planes.tiny()`, of which a kernel can see constants alone."""
+TINY = tl.constexpr(planes.tiny())
 
 
 @torch.library.custom_op("tgdsl::grip", mutates_args={"state"})

@@ -226,7 +226,7 @@ def reference_drag(
             if holds and phi <= law.reach + law.exit:
                 t = (z - e) - ((z - e) @ m) * m
                 length = float(np.linalg.norm(t))
-                if law.slip is not None and length > law.slip * h and length > 1e-15:
+                if law.slip is not None and length > law.slip * h and length**2 > planes.tiny():
                     e = e + t * (1.0 - law.slip * h / length)
                 for j in points.taxels:
                     r, s = (v - (v @ normal[j]) * normal[j] for v in (pos[j] - z, z - e))

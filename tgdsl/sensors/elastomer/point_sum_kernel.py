@@ -14,6 +14,7 @@ tiles.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import triton
@@ -26,7 +27,7 @@ GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
 """Tiles of a program that is told how many points pull: at most of them none does."""
-LOG2_E = tl.constexpr(1.4426950408889634)
+LOG2_E = tl.constexpr(math.log2(math.e))
 
 
 @triton_op("tgdsl::point_sum", mutates_args={})
