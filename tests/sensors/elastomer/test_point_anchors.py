@@ -10,7 +10,7 @@ from tgdsl.geometry.planes import vec
 from tgdsl.quantities.points.points import MetPoints, point_tiles
 from tgdsl.quantities.reference import ReferencePoints
 from tgdsl.sensors.elastomer import ELASTOMER
-from tgdsl.sensors.elastomer.anchors import Law
+from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, Markers, advance, drag, reference_drag
 from tgdsl.testing import SCENE, KindConformance
 
@@ -61,7 +61,7 @@ def test_shear_is_in_what_the_suite_compares(tmp_path):
         assert differences[0] == 0 and max(differences) > 5e-3
 
 
-LAW = Law(1e-3, 1e-5, 1e-4, None)
+STICK_SLIP = StickSlip(1e-3, 1e-5, 1e-4, None)
 TILES = torch.tensor(point_tiles([(0, 2)], 2))
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -72,15 +72,15 @@ class Skin:
     POS = np.array([[0.0, 0, 0], [4e-3, 3e-3, 0]])
     NORMAL = np.array([UP, [0.6, 0, 0.8]])
 
-    def __init__(self, law=LAW, gradient=UP):
-        self.law, self.gradient = law, np.broadcast_to(gradient, (2, 3))
+    def __init__(self, stick_slip=STICK_SLIP, gradient=UP):
+        self.stick_slip, self.gradient = stick_slip, np.broadcast_to(gradient, (2, 3))
         self.memory = {name: np.zeros(2) for name in PLANES}
 
     def step(self, pos, distance):
         pos = np.asarray(pos, dtype=float)
         distance = np.broadcast_to(np.asarray(distance, dtype=float), (2,))
         by_hand = ReferencePoints(np.arange(2), pos, distance, self.gradient, 3e-6)
-        expected, after = reference_drag([by_hand], self.POS, self.NORMAL, self.law, 2000.0, 6e-6, self.memory)
+        expected, after = reference_drag([by_hand], self.POS, self.NORMAL, self.stick_slip, 2000.0, 6e-6, self.memory)
 
         def rows(vectors):
             return vec(torch.from_numpy(np.array(part))[None, None] for part in vectors.T)
@@ -88,13 +88,13 @@ class Skin:
         phi, area = torch.tensor(distance)[None, None], torch.tensor([[3e-6]], dtype=torch.float64)
         met = MetPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
         before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
-        pulls, found = advance([met], self.law, before)
+        loads, found = advance([met], self.stick_slip, before)
         marker, normal = (vec(part[0, 0] for part in rows(vectors)) for vectors in (self.POS, self.NORMAL))
         markers = Markers(marker, normal, *torch.tensor([2000.0, 6e-6], dtype=torch.float64))
-        np.testing.assert_allclose(torch.stack(drag(pulls, markers, 1), dim=-1)[0], expected, rtol=1e-12, atol=1e-22)
+        np.testing.assert_allclose(torch.stack(drag(loads, markers, 1), dim=-1)[0], expected, rtol=1e-12, atol=1e-22)
         for name in PLANES:
             np.testing.assert_allclose(found[name][0], after[name], rtol=1e-12, atol=1e-18)
-        self.memory, self.pulls = after, torch.stack(pulls[0].strength, dim=-1)[0, 0].numpy()
+        self.memory, self.loads = after, torch.stack(loads[0].strength, dim=-1)[0, 0].numpy()
         return expected
 
 
@@ -122,15 +122,15 @@ def test_lifting_lets_go_and_touching_again_takes_hold_anew():
     np.testing.assert_array_equal(skin.memory["held"], [0, 1])
     skin.step(START + way, [1.0, 1e-3 + 0.9e-4])
     np.testing.assert_array_equal(skin.memory["held"], [0, 1])
-    assert not skin.pulls.any()  # held, but nothing presses
+    assert not skin.loads.any()  # held, but nothing presses
     skin.step(START + way, [1.0, 0.5e-3])
-    np.testing.assert_allclose(skin.pulls[1], 0.5e-3 * way, rtol=1e-12)
+    np.testing.assert_allclose(skin.loads[1], 0.5e-3 * way, rtol=1e-12)
     skin.step(START + way, [1.0, 1e-3 + 1.1e-4])
     assert not any(skin.memory[name].any() for name in PLANES)
     skin.step(START + way, 0.5e-3)
-    assert not skin.pulls.any()
+    assert not skin.loads.any()
     skin.step(START + 3 * way, 0.5e-3)
-    np.testing.assert_allclose(skin.pulls, [0.5e-3 * 2 * way] * 2, rtol=1e-12)
+    np.testing.assert_allclose(skin.loads, [0.5e-3 * 2 * way] * 2, rtol=1e-12)
     skin.step(START, np.inf)  # the gate closed
     assert not skin.memory["held"].any()
 
@@ -138,18 +138,18 @@ def test_lifting_lets_go_and_touching_again_takes_hold_anew():
 @pytest.mark.parametrize("gradient", [UP, np.array([0.0, 0.6, 0.8])])
 def test_the_cap_holds_exactly_and_the_anchor_is_dragged(gradient):
     """|Π_m s| ≤ μ' h in the tangent plane of the link at the point; moving back at once unloads from there."""
-    skin, h, slip = Skin(LAW._replace(slip=0.5), gradient), 0.4e-3, 0.5
+    skin, h, slip = Skin(STICK_SLIP._replace(slip=0.5), gradient), 0.4e-3, 0.5
     flat = np.eye(3) - np.outer(gradient, gradient)
     way = np.array([3e-3, 4e-3, 1e-3])
     skin.step(START, 1e-3 - h)
     skin.step(START + way, 1e-3 - h)
     t = flat @ way
     held = slip * h * t / np.linalg.norm(t)
-    np.testing.assert_allclose(skin.pulls @ flat, [h * held] * 2, rtol=1e-10)
-    np.testing.assert_allclose(skin.pulls @ gradient, h * (way @ gradient), rtol=1e-10)  # the rest stays
+    np.testing.assert_allclose(skin.loads @ flat, [h * held] * 2, rtol=1e-10)
+    np.testing.assert_allclose(skin.loads @ gradient, h * (way @ gradient), rtol=1e-10)  # the rest stays
     skin.step(START + way - 0.1 * held, 1e-3 - h)
-    np.testing.assert_allclose(skin.pulls @ flat, [h * 0.9 * held] * 2, rtol=1e-10)
-    below = Skin(LAW._replace(slip=0.5))
+    np.testing.assert_allclose(skin.loads @ flat, [h * 0.9 * held] * 2, rtol=1e-10)
+    below = Skin(STICK_SLIP._replace(slip=0.5))
     below.step(START, 1e-3 - h)
     anchors = [below.memory[name].copy() for name in PLANES]
     below.step(START + [0.49 * h, 0, 0], 1e-3 - h)
@@ -157,12 +157,12 @@ def test_the_cap_holds_exactly_and_the_anchor_is_dragged(gradient):
 
 
 def test_not_a_number_comes_out_and_is_not_remembered():
-    skin = Skin(LAW._replace(slip=0.5))
+    skin = Skin(STICK_SLIP._replace(slip=0.5))
     skin.step(START, [0.5e-3, 5.0])
     before = {name: torch.from_numpy(value)[None] for name, value in skin.memory.items()}
     nan = torch.full((1, 1, 2), torch.nan, dtype=torch.float64)
     broken = MetPoints(((0, 2),), TILES, (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
-    pulls, after = advance([broken], skin.law, before)
-    assert pulls[0].strength[0][0, 0, 0].isnan()
+    loads, after = advance([broken], skin.stick_slip, before)
+    assert loads[0].strength[0][0, 0, 0].isnan()
     for name in PLANES:
         torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)

@@ -8,7 +8,7 @@ from kernels import interpreted, needs_triton
 
 from tgdsl.geometry.planes import Vec, vec
 from tgdsl.quantities.points.points import point_tiles, tile_size
-from tgdsl.sensors.elastomer.point_anchors import Markers, Pull, _summed
+from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad, _summed
 
 pytestmark = needs_triton
 TOLERANCE = 1e-5
@@ -20,13 +20,13 @@ CASES = {
     "a group that is not full": (2, 41, 33, 0.3),
     "two chunks, a block that is not full": (2, 300, 100, 0.2),
     "two blocks": (2, 70, 150, 1.0),
-    "nothing pulls": (2, 50, 40, 0.0),
+    "nothing active": (2, 50, 40, 0.0),
 }
-"""Environments, points, markers, and which part of the points pulls."""
+"""Environments, points, markers, and share of active points."""
 
 
-def given(num_envs: int, num_points: int, num_markers: int, share: float) -> tuple[Pull, Markers]:
-    """Return points in float32 that pull in runs, and markers with normals all around, both signs of z among them.
+def given(num_envs: int, num_points: int, num_markers: int, share: float) -> tuple[ShearLoad, Markers]:
+    """Return active points in float32, in runs, and markers with normals all around, both signs of z among them.
 
     There are three links: one has most of the markers, one the last, the third none; the first marker is of no link.
     """
@@ -36,64 +36,64 @@ def given(num_envs: int, num_points: int, num_markers: int, share: float) -> tup
         return vec(scale * torch.randn(shape, generator=random) for _ in range(3))
 
     start = torch.randint(num_points, (num_envs, 3, 1), generator=random)
-    pulls = (torch.arange(num_points) - start) % num_points < share * num_points
-    strength = vec(part * pulls for part in drawn(1e-7, num_envs, 3, num_points))
+    is_active = (torch.arange(num_points) - start) % num_points < share * num_points
+    strength = vec(part * is_active for part in drawn(1e-7, num_envs, 3, num_points))
     normal = torch.nn.functional.normalize(torch.stack(drawn(1.0, num_markers)), dim=0)
     normal[:, 0] = torch.tensor([0.0, 0.0, -1.0])
     markers = Markers(drawn(0.03, num_markers), vec(normal.unbind()), torch.tensor(FALLOFF), None)
     last = num_markers - 1
     taxels = ((last, num_markers), (min(1, last), last), (0, 0))
     tiles = torch.tensor(point_tiles(taxels, num_markers), dtype=torch.int32)
-    return Pull(taxels, tiles, torch.ones(1, 1), drawn(0.03, num_envs, 3, num_points), strength), markers
+    return ShearLoad(taxels, tiles, torch.ones(1, 1), drawn(0.03, num_envs, 3, num_points), strength), markers
 
 
-def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
+def in_double(load: ShearLoad, markers: Markers) -> torch.Tensor:
     pos, strength, marker, normal = (
-        vec(part.double() for part in planes) for planes in (pull.pos, pull.strength, markers.pos, markers.normal)
+        vec(part.double() for part in planes) for planes in (load.pos, load.strength, markers.pos, markers.normal)
     )
     exact = Markers(marker, normal, markers.falloff.double(), None)
-    return torch.stack(_summed(pull._replace(pos=pos, strength=strength), exact))
+    return torch.stack(_summed(load._replace(pos=pos, strength=strength), exact))
 
 
-def told(pull: Pull) -> Pull:
-    """Return points, those that pull first, and how many they are; the others' numbers are none at all."""
-    pulls = torch.stack(pull.strength).ne(0).any(dim=0)
-    order = torch.argsort(pulls.int(), dim=-1, descending=True, stable=True)
-    count = pulls.sum(dim=-1, dtype=torch.int32)
-    is_one = torch.arange(pulls.shape[-1]) < count[..., None]
+def told(load: ShearLoad) -> ShearLoad:
+    """Return points, the active ones first, and their number; the others' numbers are none at all."""
+    is_active = torch.stack(load.strength).ne(0).any(dim=0)
+    order = torch.argsort(is_active.int(), dim=-1, descending=True, stable=True)
+    count = is_active.sum(dim=-1, dtype=torch.int32)
+    is_one = torch.arange(is_active.shape[-1]) < count[..., None]
     pos, strength = (
-        vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (pull.pos, pull.strength)
+        vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (load.pos, load.strength)
     )
-    return pull._replace(pos=pos, strength=strength, count=count)
+    return load._replace(pos=pos, strength=strength, count=count)
 
 
 def main() -> None:
     """Print the results of all cases, as a process that interprets kernels."""
     from tgdsl.sensors.elastomer.point_sum_kernel import launch, point_sum_kernel
 
-    def run(pull: Pull, markers: Markers) -> torch.Tensor:
-        how = (pull.count, pull.tiles, tile_size(pull.taxels))
-        return launch(point_sum_kernel, pull.pos, pull.strength, *how, markers.pos, markers.normal, markers.falloff)
+    def run(load: ShearLoad, markers: Markers) -> torch.Tensor:
+        how = (load.count, load.tiles, tile_size(load.taxels))
+        return launch(point_sum_kernel, load.pos, load.strength, *how, markers.pos, markers.normal, markers.falloff)
 
     found = {}
     for name, case in CASES.items():
-        pull, markers = given(*case)
-        expected = in_double(pull, markers)
+        load, markers = given(*case)
+        expected = in_double(load, markers)
         scale = expected.abs().max().clamp(min=1e-12)
-        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (pull, told(pull))]
+        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (load, told(load))]
 
-    pull, markers = given(3, 20, 10, 0.5)
-    wide = pull._replace(
-        pos=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in pull.pos),
-        strength=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in pull.strength),
+    load, markers = given(3, 20, 10, 0.5)
+    wide = load._replace(
+        pos=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in load.pos),
+        strength=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in load.strength),
     )
-    found["rows apart"] = float((run(wide, markers) - run(pull, markers)).abs().max())
+    found["rows apart"] = float((run(wide, markers) - run(load, markers)).abs().max())
 
-    pull.pos[1][0, 1] = torch.nan  # a pose
-    pull.strength[2][1, 1, 13] = torch.nan
-    for part in pull.strength:
+    load.pos[1][0, 1] = torch.nan  # a pose
+    load.strength[2][1, 1, 13] = torch.nan
+    for part in load.strength:
         part[0] = 0
-    isnan = run(pull, markers).isnan()
+    isnan = run(load, markers).isnan()
     own = slice(1, -1)
     found["not a number"] = [
         isnan[:, 0, own].all().item(),
@@ -121,7 +121,7 @@ def test_rows_may_lie_apart(found):
 
 
 def test_not_a_number_comes_out(found):
-    """Of a pose, though nothing pulls; of a strength in its own component; and of no other environment or link."""
+    """Of a pose, though no point is active; of a strength in its own component; and of no other environment or link."""
     assert found["not a number"] == [True, False, True, False]
 
 

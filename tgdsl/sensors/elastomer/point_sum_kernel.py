@@ -1,9 +1,9 @@
 """The sum over points of `point_anchors` as one Triton kernel, for a GPU in float32 without derivatives.
 
-A program takes one environment and some tiles of markers, each of one link, which its lanes hold; points come one after the
-other. Most of them pull at nothing: the kernel is told how many do, which then stand first, or passes over groups that do not,
-so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is found along two tangents of
-each marker, scaled so that its square is the exponent of 2.
+A program takes one environment and some tiles of markers, each of one link, one thread per marker; points come one after the
+other. Most of them are inactive, without a shear load: the kernel gets the number of active ones, which then come first, or
+skips inactive groups, so points that are near on the object should be near among all. The in-plane offset Π_n(x − z) is found
+along two tangents of each marker, scaled so that its square is the exponent of 2.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points, `marker` markers of all links, `tile`
 tiles.
@@ -26,7 +26,7 @@ from torch.library import triton_op, wrap_triton
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
-"""Tiles of a program that is told how many points pull: at most of them none does."""
+"""Tiles of a program that gets the number of active points: it is 0 for most."""
 LOG2_E = tl.constexpr(math.log2(math.e))
 
 
@@ -62,7 +62,7 @@ def launch(
         run: The kernel.
         pos: z_p, three planes in each link's frame [m].
         strength: s_p, likewise [m²]; all six lie in memory alike.
-        count: How many points of each link pull; they come first. None: it shows in the strengths.
+        count: Number of active points of each link; they come first. None: inactive ones have strength 0.
         tiles: What `points.point_tiles` returns; markers of no link read 0.
         block: `points.tile_size`.
         marker: x_j, three planes [m].
@@ -93,10 +93,10 @@ def point_sum_kernel(
     links = tl.load(tiles + 3 * own, own < num_tiles, -1)
     told += env * num_links
     are_links = links >= 0
-    num_pulling = tl.where(are_links, num_points, 0)
+    num_active = tl.where(are_links, num_points, 0)
     if IS_TOLD:
-        num_pulling = tl.load(told + links, are_links, 0)
-    busy = tl.sum((num_pulling > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
+        num_active = tl.load(told + links, are_links, 0)
+    busy = tl.sum((num_active > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
     found += env * num_markers
     for i in range(tl.minimum(TILES, num_tiles - first_tile)):
@@ -140,20 +140,20 @@ def _frame(pos, normal, marker, is_marker, falloff):
 
 @triton.jit
 def _sum_of_all(total, frame, pos, strength, num_points):
-    """Return the sum over all points; groups that pull at nothing are passed over."""
-    # The points of an environment share a pose: one that is not a number shows in the first, whether it pulls or not.
+    """Return the sum over all points; inactive groups are skipped."""
+    # The points of an environment share a pose: one that is not a number shows in the first, whether it is active or not.
     rest = 0.0 * (tl.load(pos[0]) + tl.load(pos[1]) + tl.load(pos[2]))
     total = (total[0] + rest, total[1] + rest, total[2] + rest)
     for start in range(0, num_points, 32 * GROUP):
         point = start + tl.arange(0, 32 * GROUP)
         is_point = point < num_points
-        pulls = tl.load(strength[0] + point, is_point, 0.0) != 0.0
-        pulls |= tl.load(strength[1] + point, is_point, 0.0) != 0.0
-        pulls |= tl.load(strength[2] + point, is_point, 0.0) != 0.0
-        groups = tl.max(tl.reshape(pulls.to(tl.int32), (32, GROUP)), axis=1)
-        pulling = tl.sum(groups << tl.arange(0, 32))
+        is_active = tl.load(strength[0] + point, is_point, 0.0) != 0.0
+        is_active |= tl.load(strength[1] + point, is_point, 0.0) != 0.0
+        is_active |= tl.load(strength[2] + point, is_point, 0.0) != 0.0
+        groups = tl.max(tl.reshape(is_active.to(tl.int32), (32, GROUP)), axis=1)
+        active_groups = tl.sum(groups << tl.arange(0, 32))
         for group in range(32):
-            if (pulling >> group) & 1:
+            if (active_groups >> group) & 1:
                 first = start + group * GROUP
                 for p in tl.range(first, tl.minimum(first + GROUP, num_points), loop_unroll_factor=4):
                     total = _added(total, frame, pos, strength, p)

@@ -23,7 +23,7 @@ from tgdsl.sensors.elastomer.clamped.mesh import mesh
 from tgdsl.sensors.elastomer.clamped.sheet import Sheet, open_sides, opened, refused, welded
 from tgdsl.surfaces.surface import Surface
 
-REACH = 1e-3
+MAX_OFFSET = 1e-3
 """Largest distance of a taxel from the pad's surface [m]."""
 BESIDE = 1e-4
 """Largest distance of a taxel from the pad's edge, measured outwards along the surface [m]."""
@@ -145,7 +145,7 @@ def _seated(
     """Return the triangle that each taxel sits on, and the barycentric coordinates of the place.
 
     Raises:
-        LowerError: A taxel is farther than `REACH` from the surface or lies beside its edge.
+        LowerError: A taxel is farther than `MAX_OFFSET` from the surface or lies beside its edge.
     """
     corners = sheet.vertices[sheet.faces]
     is_open = np.zeros(3 * len(corners), dtype=bool)
@@ -158,7 +158,7 @@ def _seated(
     face, weights = np.zeros(len(pos), dtype=np.int64), np.zeros((len(pos), 3))
     for i, (point, outward) in enumerate(zip(pos, normal, strict=True)):
         facing = np.flatnonzero(solid & (up @ outward >= FACING))
-        near = facing[((low[facing] <= point + REACH) & (point - REACH <= high[facing])).all(axis=1)]
+        near = facing[((low[facing] <= point + MAX_OFFSET) & (point - MAX_OFFSET <= high[facing])).all(axis=1)]
         facing = near if len(near) else facing
         if not len(facing):
             raise refused(
@@ -178,9 +178,9 @@ def _seated(
 
 def _check_seat(taxel: int, distance: float, beside: float) -> None:
     """Refuse a taxel that is too far from the surface, or too far outside its edge [m]."""
-    if distance <= REACH and beside <= BESIDE:
+    if distance <= MAX_OFFSET and beside <= BESIDE:
         return
-    place, limit = ("off the pad's surface", REACH) if distance > REACH else ("beside the pad's edge", BESIDE)
+    place, limit = ("off the pad's surface", MAX_OFFSET) if distance > MAX_OFFSET else ("beside the pad's edge", BESIDE)
     raise refused(
         f"taxel {taxel} is {1e3 * distance:.3g} mm {place}, {1e3 * limit:.3g} mm are allowed",
         "give a region that holds all taxels of the link",
