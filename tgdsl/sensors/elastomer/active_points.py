@@ -1,9 +1,9 @@
 """Compaction of the active points, those with a shear load, for the sum over points of `point_anchors` on a CPU.
 
 Of an object's points few are in contact at a time, and those that are near each other stand near in the list. An operator
-copies the blocks of points that hold an active one into rows of one length, each of one environment, which has as many rows as
-it takes; the sum over rows is left to torch's operations, so that Inductor fuses it. The length is chosen at each call: how many
-rows and slots there are is known at run time only.
+copies the blocks of points that hold an active one into rows of one length, each of one environment, which has as many rows
+as it takes; the sum over rows is left to torch's operations, so that Inductor fuses it. The length is chosen at each call:
+how many rows and slots there are is known at run time only.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points of it, `block` blocks of these, `row` rows of
 one link, `slot` points of one row.

@@ -1,9 +1,9 @@
 """Anchors of points on links that are grids, as one Triton kernel: `point_anchors.advance` on a GPU.
 
-A program takes one link of an environment. In chunks of points it finds candidates, which have an anchor or may be in the skin
-by the distance at the next node of the link's grid, and compacts their indices: most points are none. Then one thread per
-candidate finds its depth (`skin_kernel`) and advances its anchor in place. Active points, those with a shear load, are compacted
-in their order, and counted.
+A program takes one link of an environment. In chunks of points it finds candidates, which have an anchor or may be in the
+skin by the distance at the next node of the link's grid, and compacts their indices: most points are none. Then one thread
+per candidate finds its depth (`skin_kernel`) and advances its anchor in place. Active points, those with a shear load, are
+compacted in their order, and counted.
 
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
 """
