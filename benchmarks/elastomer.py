@@ -32,8 +32,8 @@ from torch import Tensor
 
 from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.sensors.elastomer import blocks, operators
-from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance_reference
-from tgdsl.sensors.elastomer.kernels import Skin
+from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance_reference
+from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.sensors.elastomer.operators import Wish
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
@@ -57,7 +57,7 @@ def spec_of(**fields: Any) -> ElastomerSpec:
     return ElastomerSpec.model_validate({"kind": "elastomer", "links": "pad", "feels": ["ball"], **fields})
 
 
-def square(num: int) -> tuple[Skin, Surface]:
+def square(num: int) -> tuple[LinkTaxels, Surface]:
     """Return a pad of num × num markers, and its surface: two triangles."""
     line = (np.arange(num) - (num - 1) / 2) * PITCH
     cell = np.stack(np.divmod(np.arange(num * num), num), axis=1)
@@ -66,29 +66,29 @@ def square(num: int) -> tuple[Skin, Surface]:
     corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
     surface = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, dtype=np.int64), (("pad",),))
     normal = np.broadcast_to([0.0, 0.0, 1.0], pos.shape).copy()
-    return Skin(pos, normal, np.full(len(pos), PITCH**2), cell, np.ones(len(pos), dtype=bool)), surface
+    return LinkTaxels(pos, normal, np.full(len(pos), PITCH**2), cell, np.ones(len(pos), dtype=bool)), surface
 
 
-def presses(skin: Skin, num_envs: int, seed: int = 0) -> dict[str, Tensor]:
+def presses(taxels: LinkTaxels, num_envs: int, seed: int = 0) -> dict[str, Tensor]:
     """Return what goes into each operator when spheres press into a pad and drag it: float64 planes (…, env, taxel)."""
     rng = np.random.default_rng(seed)
-    extent = np.abs(skin.pos[:, :2]).max()
+    extent = np.abs(taxels.pos[:, :2]).max()
     centre = rng.uniform(-extent, extent, (num_envs, 1, 2))
     radius, depth = rng.uniform(4e-3, 12e-3, (num_envs, 1)), rng.uniform(1e-4, 1e-3, (num_envs, 1))
-    square = ((skin.pos[:, :2] - centre) ** 2).sum(axis=2)
+    square = ((taxels.pos[:, :2] - centre) ** 2).sum(axis=2)
     h = np.maximum(0.0, depth - square / (2 * radius))
     slip = rng.normal(scale=1e-4, size=(3, num_envs, 1)) * np.array([1.0, 1.0, 0.0])[:, None, None]
     return {name: torch.from_numpy(value) for name, value in {"spread": h, "bulge": h**1.2, "drag": slip * h}.items()}
 
 
-def constants_of(skin: Skin, surface: Surface, fields: dict[str, Any]) -> dict[str, np.ndarray]:
+def constants_of(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return the folded operators of one form."""
     spec = spec_of(**fields)
     pad = surface if spec.boundary is not None else None
     found = {}
-    for name, response in blocks.responses(spec, skin, pad).items():
+    for name, response in blocks.responses(spec, taxels, pad).items():
         is_alike = not (name == "spread" and pad is not None)
-        folded = operators.fold(response, blocks.PLANES[name], skin, Wish(spec.operator, spec.tolerance), is_alike)
+        folded = operators.fold(response, blocks.PLANES[name], taxels, Wish(spec.operator, spec.tolerance), is_alike)
         found |= {f"{name}/0/{key}": value for key, value in folded.items()}
     return found
 
@@ -127,13 +127,15 @@ class Forms:
             plot(rows, self.device, unit, self.out / f"elastomer-{self.device}.png")
 
     def _pad(self, num: int) -> list[tuple[int, str, float, float]]:
-        skin, surface = square(num)
-        exact = {name: value.to(self.device) for name, value in presses(skin, self.num_envs).items()}
+        taxels, surface = square(num)
+        exact = {name: value.to(self.device) for name, value in presses(taxels, self.num_envs).items()}
         inputs = {name: value.float() for name, value in exact.items()}
         calls, errors, bytes_of = {}, {}, {}
         for form, fields in FORMS.items():
-            made = constants_of(skin, surface, fields)
-            dense = constants_of(skin, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields)
+            made = constants_of(taxels, surface, fields)
+            dense = constants_of(
+                taxels, surface, {**fields, "operator": "dense", "tolerance": None} if "svd" in form else fields
+            )
             truth = displacement(on(dense, self.device, torch.float64), exact)
             constants = on(made, self.device, torch.float32)
             found = displacement(constants, inputs)
@@ -211,50 +213,52 @@ class Curved:
                 links = [i for i, link in enumerate(layout.links) if link.name in layout.groups["tips"]]
                 for i in links[:2]:
                     own = layout.link_id == i
-                    skin = Skin(layout.pos[own], layout.normal[own], layout.area[own], layout.cell[own], layout.radius[own] > 0)
-                    if (skin.cell < 0).any():
+                    taxels = LinkTaxels(
+                        layout.pos[own], layout.normal[own], layout.area[own], layout.cell[own], layout.radius[own] > 0
+                    )
+                    if (taxels.cell < 0).any():
                         continue
-                    angle = np.degrees(np.arccos(np.clip(skin.normal @ skin.normal.mean(axis=0), -1, 1)))
-                    exact, flat = responses_of(skin), responses_of(flattened(skin))
-                    h = bumps(skin)
+                    angle = np.degrees(np.arccos(np.clip(taxels.normal @ taxels.normal.mean(axis=0), -1, 1)))
+                    exact, flat = responses_of(taxels), responses_of(flattened(taxels))
+                    h = bumps(taxels)
                     true, seen = (np.einsum("kji,ei->ekj", matrix, h) for matrix in (exact, flat))
                     error, scale = np.linalg.norm(seen - true, axis=1), np.linalg.norm(true, axis=1).max()
-                    dense = np.linalg.norm(in_float32(skin, h) - true, axis=1).max() / scale
+                    dense = np.linalg.norm(in_float32(taxels, h) - true, axis=1).max() / scale
                     name = f"{hand}, {resolution} | {layout.links[i].name} | {own.sum()} | {angle.max():.0f}°"
                     planar = f"{100 * error.max() / scale:.0f} % | {100 * np.sqrt((error**2).mean()) / scale:.1f} %"
                     print(f"| {name} | {dense:.0e} | {planar} |")
 
 
-def responses_of(skin: Skin) -> np.ndarray:
+def responses_of(taxels: LinkTaxels) -> np.ndarray:
     """Return the in-plane dilation per depth, (3, target, source)."""
-    return blocks.responses(spec_of(), skin, None)["spread"](np.arange(len(skin.pos)))[:, 0]
+    return blocks.responses(spec_of(), taxels, None)["spread"](np.arange(len(taxels.pos)))[:, 0]
 
 
-def in_float32(skin: Skin, h: np.ndarray) -> np.ndarray:
+def in_float32(taxels: LinkTaxels, h: np.ndarray) -> np.ndarray:
     """Return what a module's dense operator makes of depths (press, taxel), in float32."""
-    response = blocks.responses(spec_of(), skin, None)["spread"]
-    made = operators.fold(response, blocks.PLANES["spread"], skin, Wish("dense", None))
+    response = blocks.responses(spec_of(), taxels, None)["spread"]
+    made = operators.fold(response, blocks.PLANES["spread"], taxels, Wish("dense", None))
     constants = on({f"spread/0/{key}": value for key, value in made.items()}, "cpu", torch.float32)
     return torch.stack(operators.apply(constants, "spread", [torch.from_numpy(h).float()]), dim=1).double().numpy()
 
 
-def flattened(skin: Skin) -> Skin:
+def flattened(taxels: LinkTaxels) -> LinkTaxels:
     """Return the taxels as a regular grid in their mean plane, with one normal: what a planar FFT takes them for."""
-    normal = skin.normal.mean(axis=0)
+    normal = taxels.normal.mean(axis=0)
     normal /= np.linalg.norm(normal)
-    design = np.column_stack([skin.cell, np.ones(len(skin.cell))])
-    step = np.linalg.lstsq(design, skin.pos, rcond=None)[0]
+    design = np.column_stack([taxels.cell, np.ones(len(taxels.cell))])
+    step = np.linalg.lstsq(design, taxels.pos, rcond=None)[0]
     down = step[0] - (step[0] @ normal) * normal
     along = step[1] - (step[1] @ normal) * normal
     along -= (along @ down) / (down @ down) * down
-    pos = design @ np.stack([down, along, skin.pos.mean(axis=0) - skin.cell.mean(axis=0) @ np.stack([down, along])])
-    return Skin(pos, np.broadcast_to(normal, pos.shape).copy(), skin.area, skin.cell, skin.is_active)
+    pos = design @ np.stack([down, along, taxels.pos.mean(axis=0) - taxels.cell.mean(axis=0) @ np.stack([down, along])])
+    return LinkTaxels(pos, np.broadcast_to(normal, pos.shape).copy(), taxels.area, taxels.cell, taxels.is_active)
 
 
-def bumps(skin: Skin, num: int = 200) -> np.ndarray:
+def bumps(taxels: LinkTaxels, num: int = 200) -> np.ndarray:
     """Return depths (press, taxel) under balls of 5 mm that press 1 mm deep over random taxels [m]."""
-    chosen = np.random.default_rng(0).integers(len(skin.pos), size=num)
-    apart = np.linalg.norm(skin.pos[None] - skin.pos[chosen][:, None], axis=2)
+    chosen = np.random.default_rng(0).integers(len(taxels.pos), size=num)
+    apart = np.linalg.norm(taxels.pos[None] - taxels.pos[chosen][:, None], axis=2)
     return np.maximum(0.0, 1e-3 - apart**2 / (2 * 5e-3))
 
 
@@ -272,7 +276,7 @@ class Cycle:
         x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
         pos, normal = np.stack([x, y, 0 * x], axis=1), np.broadcast_to([0.0, 0.0, 1.0], (x.size, 3))
         h = depth - (x * x + y * y) / (2 * radius)
-        law, state = Law(0.0, 0.0, 1e-2, slip), {name: np.zeros(x.size) for name in PLANES}
+        stick_slip, state = StickSlip(0.0, 0.0, 1e-2, slip), {name: np.zeros(x.size) for name in PLANES}
         way = np.concatenate([np.linspace(0, 0.8, 33), np.linspace(0.8, -0.8, 65)[1:], np.linspace(-0.8, 0.8, 65)[1:]])
         found = []
         for s in way * slip * depth:
@@ -281,7 +285,7 @@ class Cycle:
                 np.maximum(h, 0), 0 * pos, 0 * pos, 0 * pos, -h[:, None], 0 * pos[:, None],
                 np.broadcast_to(np.eye(3), (x.size, 1, 3, 3)), moved,
             )  # fmt: skip
-            carried, state = advance_reference(touch, pos, normal, law, state)
+            carried, state = advance_reference(touch, pos, normal, stick_slip, state)
             found.append(carried[:, 0].sum() / (slip * np.maximum(h, 0).sum()))
         closed = {name: loop(way, power) for name, power in {"Winkler": 2.0, "Mindlin": 1.5}.items()}
         print("| s/s* | anchors Q/μP | Winkler 1 − (1 − s/s*)² | Cattaneo–Mindlin 1 − (1 − s/s*)^1.5 |\n|---|---|---|---|")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.geometry.planes import vec
-from tgdsl.sensors.elastomer.anchors import Law
+from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, Markers, point_sum
 
 
@@ -42,27 +42,27 @@ def felt_moments(dtype: torch.dtype) -> tuple:
     return pairs, slice(source.first_pair, source.first_pair + source.num_pairs), probes, source
 
 
-def grip(dtype: torch.dtype) -> tuple:
+def advance_anchors(dtype: torch.dtype) -> tuple:
     meeting = meetings.made("cubes", dtype)
-    law = Law(*(torch.tensor(part, dtype=torch.float32).to(dtype) for part in (1e-3, 1e-5, 1e-3, 0.4)))
+    stick_slip = StickSlip(*(torch.tensor(part, dtype=torch.float32).to(dtype) for part in (1e-3, 1e-5, 1e-3, 0.4)))
     num = meeting.source.pair.shape[0] * meeting.source.points[0].shape[2]
     rng = torch.Generator().manual_seed(0)
     held = torch.rand(meetings.NUM_ENVS, num, generator=rng).round()
     anchors = [0.003 * torch.randn(meetings.NUM_ENVS, num, generator=rng) * held for _ in range(3)]
-    return [meeting], law, {name: part.to(dtype) for name, part in zip(PLANES, (*anchors, held), strict=True)}
+    return [meeting], stick_slip, {name: part.to(dtype) for name, part in zip(PLANES, (*anchors, held), strict=True)}
 
 
-def gripped(found: tuple, arguments: tuple) -> list[Tensor]:
+def shear_loads(found: tuple, arguments: tuple) -> list[Tensor]:
     """Return what the points move markers by, and the anchors, which a kernel puts in the place of the old ones."""
-    (pull,), after = found
+    (load,), after = found
     _, _, state = arguments
-    places = 0.003 * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]]).to(pull.pos[0])
+    places = 0.003 * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]]).to(load.pos[0])
     markers = Markers(vec(places.T), vec((places / 0.003).T), places.new_tensor(2000.0), None)
-    if pull.count is not None:  # those that pull come first, and the rest means nothing
-        is_one = torch.arange(pull.pos[0].shape[2], device=places.device) < pull.count[..., None]
-        pos, strength = (vec(torch.where(is_one, part, 0.0) for part in parts) for parts in (pull.pos, pull.strength))
-        pull = pull._replace(pos=pos, strength=strength, count=None)
-    return [torch.stack(point_sum(pull, markers)), *((after or state)[name] for name in PLANES)]
+    if load.count is not None:  # those that load come first, and the rest means nothing
+        is_one = torch.arange(load.pos[0].shape[2], device=places.device) < load.count[..., None]
+        pos, strength = (vec(torch.where(is_one, part, 0.0) for part in parts) for parts in (load.pos, load.strength))
+        load = load._replace(pos=pos, strength=strength, count=None)
+    return [torch.stack(point_sum(load, markers)), *((after or state)[name] for name in PLANES)]
 
 
 def link_products(dtype: torch.dtype) -> tuple:
@@ -74,7 +74,7 @@ def link_products(dtype: torch.dtype) -> tuple:
 EXAMPLES = {
     "deepest": Example(deepest, lambda found, _: [found.depth, torch.stack(found.normal), found.pair], (3e-7, 2e-3, 0)),
     "felt_moments": Example(felt_moments, lambda found, _: [found.mass, torch.stack(found.first)], (3e-5, 3e-5)),
-    "grip": Example(grip, gripped, (1e-9, 3e-7, 3e-7, 3e-7, 0)),
+    "advance_anchors": Example(advance_anchors, shear_loads, (1e-9, 3e-7, 3e-7, 3e-7, 0)),
     "link_products": Example(link_products, lambda found, _: [found], (1e-4,)),
     "meet": Example(
         lambda dtype: (meetings.made("one link", dtype),),

@@ -6,6 +6,7 @@ operation is pointwise and a compiler fuses a whole sensor into one loop; a trai
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import torch
@@ -29,6 +30,11 @@ def tie() -> float:
 def tiny() -> float:
     """Return up to where squared lengths [m²] count as zero: the derivative of a reciprocal root is a float32 down to there."""
     return 1e-24
+
+
+def log2_e() -> float:
+    """Return log₂ e."""
+    return math.log2(math.e)
 
 
 def split(stacked: Tensor) -> Vec:

@@ -8,14 +8,13 @@ A matrix is its upper triangle, row by row: xx, xy, xz, yy, yz, zz.
 
 from __future__ import annotations
 
-import math
-
 import triton
 import triton.language as tl
 
+from tgdsl.geometry.planes import log2_e
 from tgdsl.geometry.shapes_kernel import dot
 
-LOG2_E = tl.constexpr(math.log2(math.e))
+LOG2_E = tl.constexpr(log2_e())
 
 
 @triton.jit

@@ -7,7 +7,7 @@ from typing import Any
 from tgdsl.quantities.contact_depth.search import DEEPEST
 from tgdsl.quantities.moments.nearby import FELT_MOMENTS
 from tgdsl.quantities.points.points import LINK_POINTS
-from tgdsl.sensors.elastomer.point_anchors import GRIP, POINT_SUM
+from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, SHEAR_LOADS
 from tgdsl.sensors.force_taxel.footprint import SHARED_FORCES
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 from tgdsl.tensors.operations import Operation
@@ -15,7 +15,7 @@ from tgdsl.tensors.operations import Operation
 OPERATIONS: tuple[Operation[..., Any], ...] = (
     DEEPEST,
     FELT_MOMENTS,
-    GRIP,
+    SHEAR_LOADS,
     LINK_PRODUCTS,
     LINK_POINTS,
     POINT_SUM,

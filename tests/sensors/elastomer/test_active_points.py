@@ -1,4 +1,4 @@
-"""The sum over the points that pull, compacted on a CPU, against the printed sum over all points in NumPy."""
+"""The sum over active points, compacted on a CPU, against the printed sum over all points in NumPy."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,12 @@ from tgdsl.geometry.planes import vec
 from tgdsl.quantities.points.points import point_tiles
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted, block_size
-from tgdsl.sensors.elastomer.point_anchors import Markers, Pull
+from tgdsl.sensors.elastomer.point_anchors import Markers, ShearLoad
 
 FALLOFF, NUM_MARKERS, TAXELS = 2000.0, 11, ((6, 10), (0, 6), (10, 10))
 """Markers of three links, of which one has none; the last marker is of no link."""
 CASES = {
-    # environments, points, share of the points that pull in each environment in turn
+    # environments, points, share of active points in each environment in turn
     "few": (40, 500, (0.05, 0.2, 0.0)),
     "one environment has most": (40, 500, (0.0, 0.01, 0.02, 0.0, 0.0, 0.9)),
     "all": (5, 60, (1.0,)),
@@ -25,8 +25,8 @@ CASES = {
 }
 
 
-def given(name: str, dtype: torch.dtype = torch.float64) -> tuple[Pull, Markers]:
-    """Return points that pull in runs, and markers with normals all around."""
+def given(name: str, dtype: torch.dtype = torch.float64) -> tuple[ShearLoad, Markers]:
+    """Return active points in runs, and markers with normals all around."""
     num_envs, num_points, shares = CASES[name]
     rng = np.random.default_rng(num_points)
     pos = 0.02 * rng.normal(size=(3, num_envs, 3, num_points))
@@ -41,16 +41,16 @@ def given(name: str, dtype: torch.dtype = torch.float64) -> tuple[Pull, Markers]
     def planes(stacked):
         return vec(torch.from_numpy(part).to(dtype) for part in stacked)
 
-    pull = Pull(TAXELS, torch.tensor(point_tiles(TAXELS, NUM_MARKERS)), torch.ones(1, 1), planes(pos), planes(strength))
-    return pull, Markers(planes(marker), planes(normal), torch.tensor(FALLOFF, dtype=dtype), None)
+    load = ShearLoad(TAXELS, torch.tensor(point_tiles(TAXELS, NUM_MARKERS)), torch.ones(1, 1), planes(pos), planes(strength))
+    return load, Markers(planes(marker), planes(normal), torch.tensor(FALLOFF, dtype=dtype), None)
 
 
-def printed(pull: Pull, markers: Markers) -> np.ndarray:
+def printed(load: ShearLoad, markers: Markers) -> np.ndarray:
     """Return Σ_p s_p exp(−λ |Π_nj(x_j − z_p)|²), (3, env, marker), marker by marker."""
-    z, s = (np.stack([part.double().numpy() for part in vector]) for vector in (pull.pos, pull.strength))
+    z, s = (np.stack([part.double().numpy() for part in vector]) for vector in (load.pos, load.strength))
     x, n = (np.stack([part.double().numpy() for part in vector]) for vector in (markers.pos, markers.normal))
     found = np.zeros((3, z.shape[1], NUM_MARKERS))
-    for link, (first, last) in enumerate(pull.taxels):
+    for link, (first, last) in enumerate(load.taxels):
         for j in range(first, last):
             r = x[:, j, None, None] - z[:, :, link]
             r = r - np.einsum("k,kep->ep", n[:, j], r) * n[:, j, None, None]
@@ -58,67 +58,67 @@ def printed(pull: Pull, markers: Markers) -> np.ndarray:
     return found
 
 
-def summed(pull: Pull, markers: Markers) -> torch.Tensor:
-    return torch.stack(point_anchors.point_sum(pull, markers))
+def summed(load: ShearLoad, markers: Markers) -> torch.Tensor:
+    return torch.stack(point_anchors.point_sum(load, markers))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 1e-6)])
 @pytest.mark.parametrize("name", CASES)
 def test_the_sum_is_as_printed(name, dtype, tolerance):
-    pull, markers = given(name, dtype)
-    expected = printed(pull, markers)
-    assert are_compacted(pull.pos, pull.strength)
+    load, markers = given(name, dtype)
+    expected = printed(load, markers)
+    assert are_compacted(load.pos, load.strength)
     assert (np.abs(expected).max(initial=0) > 0) == (name not in ("none", "no environment"))
-    np.testing.assert_allclose(summed(pull, markers), expected, rtol=0, atol=tolerance * np.abs(expected).max(initial=0))
+    np.testing.assert_allclose(summed(load, markers), expected, rtol=0, atol=tolerance * np.abs(expected).max(initial=0))
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_point_that_pulls_is_in_one_slot_of_its_environment(name):
-    pull, _ = given(name)
-    for link, (points, env) in enumerate(active_points(pull.pos, pull.strength)):
-        assert points.shape[1] == len(env) >= min(2, len(pull.pos[0]))
+    load, _ = given(name)
+    for link, (points, env) in enumerate(active_points(load.pos, load.strength)):
+        assert points.shape[1] == len(env) >= min(2, len(load.pos[0]))
         own = env[:, None].expand(points.shape[1:]).reshape(-1)
         slots = torch.cat([own[None].double(), points.flatten(1)])[:, (points[3:] != 0).any(dim=0).flatten()].T.tolist()
-        everyone = torch.stack([part[:, link] for part in (*pull.pos, *pull.strength)], dim=-1)
+        everyone = torch.stack([part[:, link] for part in (*load.pos, *load.strength)], dim=-1)
         wanted = [[float(e), *everyone[e, p].tolist()] for e, p in everyone[..., 3:].any(dim=-1).nonzero().tolist()]
         assert sorted(slots) == sorted(wanted)
 
 
 def test_few_points_take_few_slots():
     """In blocks of 10, runs of 5 % and 20 % of 500 points touch 4 and 11 blocks at most: far from all 50."""
-    pull, _ = given("few")
+    load, _ = given("few")
     assert block_size(500) == 10 and block_size(101) == 1
-    for points, _ in active_points(pull.pos, pull.strength):
-        assert points[0].numel() < 0.3 * pull.pos[0][:, 0].numel()
+    for points, _ in active_points(load.pos, load.strength):
+        assert points[0].numel() < 0.3 * load.pos[0][:, 0].numel()
 
 
 def test_not_a_number_comes_out_of_its_own_environment():
-    """Of a pose, though nothing pulls there, and of a strength in its own component."""
-    pull, markers = given("few")
-    assert not pull.strength[0][2, 1].any()
-    pull.pos[1][2, 1] = torch.nan
-    pull.strength[2][4, 0, 13] = torch.nan
-    found = summed(pull, markers).isnan()
+    """Of a pose, though no point is active, and of a strength in its own component."""
+    load, markers = given("few")
+    assert not load.strength[0][2, 1].any()
+    load.pos[1][2, 1] = torch.nan
+    load.strength[2][4, 0, 13] = torch.nan
+    found = summed(load, markers).isnan()
     assert found[:, 2, :6].all() and found[2, 4, 6:10].all()
     found[:, 2, :6] = found[2, 4, 6:10] = False
     assert not found.any()
 
 
 @pytest.mark.parametrize("num_threads", [1, 2])
-def test_one_graph_serves_all_numbers_of_points_that_pull(monkeypatch, num_threads):
-    """Compiled without a break, and not anew when other points pull."""
+def test_one_graph_serves_all_numbers_of_active_points(monkeypatch, num_threads):
+    """Compiled without a break, and not anew when other points are active."""
     monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     torch.compiler.reset()
     compiled = torch.compile(summed, fullgraph=True, dynamic=True)
-    pull, markers = given("few", torch.float32)
+    load, markers = given("few", torch.float32)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(num_threads)
-        compiled(pull, markers)
+        compiled(load, markers)
         with torch._dynamo.config.patch(error_on_recompile=True):
             for seed in range(4):
                 share = torch.rand(40, 3, 1, generator=torch.Generator().manual_seed(seed)) ** 4 * (seed > 0)
-                own = pull._replace(strength=vec(torch.where(torch.arange(500) < 500 * share, 1e-7, 0.0) for _ in range(3)))
+                own = load._replace(strength=vec(torch.where(torch.arange(500) < 500 * share, 1e-7, 0.0) for _ in range(3)))
                 expected = printed(own, markers)
                 np.testing.assert_allclose(compiled(own, markers), expected, rtol=0, atol=1e-6 * np.abs(expected).max())
     finally:
@@ -126,12 +126,12 @@ def test_one_graph_serves_all_numbers_of_points_that_pull(monkeypatch, num_threa
 
 
 def test_derivatives_are_those_of_the_sum_over_all_points():
-    """Whoever asks for derivatives gets them of every point, of those too that do not pull yet."""
-    pull, markers = given("two environments")
-    leaves = [part.clone().requires_grad_() for part in (*pull.pos, *pull.strength)]
+    """Whoever asks for derivatives gets them of every point, of those too that are not active yet."""
+    load, markers = given("two environments")
+    leaves = [part.clone().requires_grad_() for part in (*load.pos, *load.strength)]
 
     def read(*parts):
-        return 1e7 * summed(pull._replace(pos=vec(parts[:3]), strength=vec(parts[3:])), markers)
+        return 1e7 * summed(load._replace(pos=vec(parts[:3]), strength=vec(parts[3:])), markers)
 
     assert not are_compacted(vec(leaves[:3]), vec(leaves[3:]))
     with torch.no_grad():

@@ -8,19 +8,19 @@ from scipy.spatial.transform import Rotation
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth.query import Distance, Felt, Frame
 from tgdsl.quantities.reference import Touch
-from tgdsl.sensors.elastomer.anchors import PLANES, Law, advance, advance_reference
+from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
-LAW = Law(0.0, 1e-5, 1e-4, None)
+STICK_SLIP = StickSlip(0.0, 1e-5, 1e-4, None)
 UP = np.array([0.0, 0.0, 1.0])
 
 
 class Skin:
     """Taxels on a link, and the same scene for `advance` and its reference, which must agree at every step."""
 
-    def __init__(self, pos, normal=UP, law=LAW):
+    def __init__(self, pos, normal=UP, stick_slip=STICK_SLIP):
         self.pos = np.atleast_2d(np.asarray(pos, dtype=float))
         self.normal = np.broadcast_to(np.asarray(normal, dtype=float), self.pos.shape)
-        self.law = law
+        self.stick_slip = stick_slip
         self.memory = {name: np.zeros(len(self.pos)) for name in PLANES}
 
     def step(self, *objects):
@@ -32,13 +32,13 @@ class Skin:
         offset = np.broadcast_to(
             np.stack([-turn.T @ at for turn, (_, at, _) in zip(turns, objects, strict=True)]), (num, len(objects), 3)
         )
-        depth = np.maximum(0.0, (self.law.reach - phi).max(axis=1))
+        depth = np.maximum(0.0, (self.stick_slip.standoff - phi).max(axis=1))
         none = np.zeros((num, 3))
         touch = Touch(depth, none, none, none, phi, np.zeros((*phi.shape, 3)), rotation, offset)
         before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
-        expected, self.memory = advance_reference(touch, self.pos, self.normal, self.law, self.memory)
+        expected, self.memory = advance_reference(touch, self.pos, self.normal, self.stick_slip, self.memory)
         felt = self.felt(phi, rotation, offset, depth)
-        found, after = advance(felt, self.planes(self.pos), self.planes(self.normal), self.law, before)
+        found, after = advance(felt, self.planes(self.pos), self.planes(self.normal), self.stick_slip, before)
         np.testing.assert_allclose(torch.stack(found, dim=-1)[0], expected, rtol=1e-12, atol=1e-16)
         for name in PLANES:
             np.testing.assert_allclose(after[name][0], self.memory[name], rtol=1e-12, atol=1e-16)
@@ -112,7 +112,7 @@ def test_lifting_lets_go_and_touching_again_takes_hold_anew():
 
 
 def test_a_standoff_raises_both_thresholds():
-    skin = Skin([0, 0, 0], law=Law(2e-3, 1e-5, 1e-4, None))
+    skin = Skin([0, 0, 0], stick_slip=StickSlip(2e-3, 1e-5, 1e-4, None))
     skin.step((2e-3 - 0.5e-5, *HERE))
     assert skin.memory["object"][0] == 0
     skin.step((2e-3 - 2e-5, *HERE))
@@ -145,7 +145,7 @@ def test_one_object_holds_at_a_time():
 def test_the_cap_holds_exactly_and_the_anchor_is_dragged(way):
     """Beyond μ' h the displacement keeps its direction; moving back at once unloads from there, as a slider does."""
     slip, depth, turn = 0.5, 1e-3, [0.2, -0.1, 0.5]
-    skin, way = Skin([1e-3, 0, 0], law=LAW._replace(slip=slip)), np.array(way)
+    skin, way = Skin([1e-3, 0, 0], stick_slip=STICK_SLIP._replace(slip=slip)), np.array(way)
     skin.step((-depth, np.zeros(3), turn))
     found = skin.step((-depth, way, turn))[0]
     np.testing.assert_allclose(found, slip * depth * way / np.linalg.norm(way), rtol=1e-12, atol=1e-18)
@@ -158,7 +158,7 @@ def test_the_cap_holds_exactly_and_the_anchor_is_dragged(way):
 
 
 def test_below_the_cap_nothing_slides():
-    skin = Skin([0, 0, 0], law=LAW._replace(slip=0.5))
+    skin = Skin([0, 0, 0], stick_slip=STICK_SLIP._replace(slip=0.5))
     skin.step((-1e-3, *HERE))
     anchor = [skin.memory[name].copy() for name in PLANES]
     skin.step((-1e-3, [4.9e-4, 0, 0], [0.0, 0, 0]))
@@ -177,7 +177,7 @@ def test_a_tangential_cycle_is_the_winkler_coulomb_loop():
     line = np.linspace(-7e-3, 7e-3, 121)
     x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
     h = depth - (x * x + y * y) / (2 * radius)
-    skin = Skin(np.stack([x, y, 0 * x], axis=1), law=Law(0.0, 0.0, 1e-2, slip))
+    skin = Skin(np.stack([x, y, 0 * x], axis=1), stick_slip=StickSlip(0.0, 0.0, 1e-2, slip))
     limit, full = slip * depth, slip * np.maximum(h, 0).sum()
 
     def pull(s):
@@ -218,7 +218,7 @@ def test_gradients_are_finite_at_every_corner(dtype):
     state = dict.fromkeys(PLANES[:3], zero) | {"object": torch.tensor([[0.0, 1, 1, 1, 1]], dtype=dtype)}
     flat = (zero[0], zero[0], zero[0])
     slip = torch.tensor(0.5, dtype=dtype, requires_grad=True)
-    found, after = advance(felt, flat, (zero[0], zero[0], one[0]), LAW._replace(slip=slip), state)
+    found, after = advance(felt, flat, (zero[0], zero[0], one[0]), STICK_SLIP._replace(slip=slip), state)
     total = sum(part.sum() for part in (*found, *after.values()))
     for gradient in torch.autograd.grad(total, [depth, phi, along, slip], allow_unused=True):
         assert gradient is None or torch.isfinite(gradient).all()
@@ -231,8 +231,8 @@ def test_not_a_number_comes_out_and_is_not_remembered():
     before = {name: torch.from_numpy(value.copy())[None] for name, value in skin.memory.items()}
     nan = np.full((2, 1, 3, 3), np.nan)
     felt = Skin.felt(nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
-    law = LAW._replace(slip=0.5)
-    found, after = advance(felt, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), law, before)
+    stick_slip = STICK_SLIP._replace(slip=0.5)
+    found, after = advance(felt, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), stick_slip, before)
     assert found[0][0, 0].isnan()
     for name in PLANES:
         torch.testing.assert_close(after[name], before[name], rtol=0, atol=0)

@@ -11,7 +11,7 @@ from tgdsl.sensors.elastomer import ElastomerSpec
 from tgdsl.sensors.elastomer.blocks import responses
 from tgdsl.sensors.elastomer.bonded_layer import Layer, profiles, response, tabulated
 from tgdsl.sensors.elastomer.half_space import half_space, patch_radius, patch_transform
-from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, Skin, offset
+from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, LinkTaxels, offset
 
 G = 7e4
 NUS = [0.0, 0.3, 0.48, 0.5]
@@ -228,7 +228,7 @@ def sheet(n, side, curve=None):
     if curve:
         pos = np.stack([curve * np.sin(x / curve), y, curve * np.cos(x / curve)], axis=1)
         normal = np.stack([np.sin(x / curve), 0 * x, np.cos(x / curve)], axis=1)
-    return Skin(pos, normal, np.full(n * n, (side / n) ** 2), cell, np.ones(n * n, dtype=bool))
+    return LinkTaxels(pos, normal, np.full(n * n, (side / n) ** 2), cell, np.ones(n * n, dtype=bool))
 
 
 ELASTIC = {"youngs_modulus": 2e5, "poissons_ratio": 0.45, "normal_stiffness": 1e8}
@@ -287,7 +287,9 @@ def test_elastic_displacements_between_curved_frames():
     """A pressed taxel seen from another whose normal is tilted: along the target's own normal and tangent; hand-made."""
     tilt = np.deg2rad(15)
     normal = np.array([[0, 0, 1.0], [np.sin(tilt), 0, np.cos(tilt)]])
-    part = Skin(np.array([[0, 0, 0], [4e-3, 0, -5e-4]]), normal, np.full(2, 4e-6), np.full((2, 2), -1), np.ones(2, dtype=bool))
+    part = LinkTaxels(
+        np.array([[0, 0, 0], [4e-3, 0, -5e-4]]), normal, np.full(2, 4e-6), np.full((2, 2), -1), np.ones(2, dtype=bool)
+    )
     u = Elastic(Layer(np.inf, 0.0, G, 0.3)).displacement(part, np.array([0]))[:, :, 1, 0]
     between = np.array([4e-3, 0, -5e-4])
     r = between - (between @ normal[1]) * normal[1]

@@ -9,7 +9,7 @@ from tgdsl.errors import LowerError, SpecError
 from tgdsl.module.state import SceneState
 from tgdsl.sensors.elastomer import ElastomerSpec
 from tgdsl.sensors.elastomer.blocks import PLANES, clamping, gaussian, responses
-from tgdsl.sensors.elastomer.kernels import Skin
+from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.sensors.elastomer.operators import COST, Wish, apply, fold, grid
 from tgdsl.surfaces.surface import Surface
 
@@ -27,7 +27,7 @@ def regular(rows, columns, pitch=(1.5e-3, 2e-3), shuffle=None):
     order = np.arange(len(cell)) if shuffle is None else np.random.default_rng(shuffle).permutation(len(cell))
     cell, num = cell[order], len(cell)
     pos = (cell * pitch) @ TILT[:2] + [0.01, -0.02, 0.03]
-    return Skin(pos, np.tile(TILT[2], (num, 1)), np.full(num, 3e-6), cell, np.ones(num, dtype=bool))
+    return LinkTaxels(pos, np.tile(TILT[2], (num, 1)), np.full(num, 3e-6), cell, np.ones(num, dtype=bool))
 
 
 def applied(response, planes, part, form, tolerance=None, seed=0, dtype=torch.float64):
@@ -121,11 +121,11 @@ def test_a_large_grid_is_convolved_without_its_matrix():
 
 
 IRREGULAR = {
-    "have no row and column": lambda p: Skin(p.pos, p.normal, p.area, np.full_like(p.cell, -1), p.is_active),
-    "cells are empty or inactive": lambda p: Skin(p.pos, p.normal, p.area, p.cell, np.arange(12) != 5),
-    "beside its place": lambda p: Skin(p.pos + 1e-8 * np.eye(12, 3), p.normal, p.area, p.cell, p.is_active),
-    "the normals differ": lambda p: Skin(p.pos, p.normal + 1e-5 * np.eye(12, 3), p.area, p.cell, p.is_active),
-    "the areas differ": lambda p: Skin(p.pos, p.normal, p.area * np.linspace(1, 1.001, 12), p.cell, p.is_active),
+    "have no row and column": lambda p: LinkTaxels(p.pos, p.normal, p.area, np.full_like(p.cell, -1), p.is_active),
+    "cells are empty or inactive": lambda p: LinkTaxels(p.pos, p.normal, p.area, p.cell, np.arange(12) != 5),
+    "beside its place": lambda p: LinkTaxels(p.pos + 1e-8 * np.eye(12, 3), p.normal, p.area, p.cell, p.is_active),
+    "the normals differ": lambda p: LinkTaxels(p.pos, p.normal + 1e-5 * np.eye(12, 3), p.area, p.cell, p.is_active),
+    "the areas differ": lambda p: LinkTaxels(p.pos, p.normal, p.area * np.linspace(1, 1.001, 12), p.cell, p.is_active),
 }
 
 
@@ -142,7 +142,7 @@ def test_a_convolution_elsewhere_is_refused_by_name(what):
 def test_a_hole_in_the_grid_is_refused():
     part = regular(3, 4)
     keep = np.arange(12) != 5
-    holed = Skin(part.pos[keep], part.normal[keep], part.area[keep], part.cell[keep], part.is_active[keep])
+    holed = LinkTaxels(part.pos[keep], part.normal[keep], part.area[keep], part.cell[keep], part.is_active[keep])
     assert "1 of 3 × 4 cells are empty" in str(grid(holed))
     assert isinstance(grid(part), np.ndarray)
 
@@ -204,7 +204,7 @@ def pad_of(num, side, inset):
     """Num × num taxels on a flat pad, the outermost `inset` [m] from its edge."""
     line = np.linspace(inset - side / 2, side / 2 - inset, num)
     pos = np.stack([*np.meshgrid(line, line, indexing="ij"), np.zeros((num, num))], axis=-1).reshape(-1, 3)
-    return Skin(
+    return LinkTaxels(
         pos, np.tile([0.0, 0, 1], (num**2, 1)), np.full(num**2, 4e-6), np.full((num**2, 2), -1), np.ones(num**2, dtype=bool)
     )
 
@@ -245,7 +245,7 @@ def test_clamping_is_linear_and_by_the_edges_own_displacement():
     column = np.array([[0.0, value, 0] for value in y])
     pos = np.concatenate([row, column])
     num = len(pos)
-    part = Skin(pos, np.tile([0.0, 0, 1], (num, 1)), np.full(num, 1e-6), np.full((num, 2), -1), np.ones(num, dtype=bool))
+    part = LinkTaxels(pos, np.tile([0.0, 0, 1], (num, 1)), np.full(num, 1e-6), np.full((num, 2), -1), np.ones(num, dtype=bool))
     made = spec(thickness=thickness, dilation_falloff=80000, boundary={"drag": drag, "bulk": bulk})
     added = clamping(made, part, rectangle(2 * half, 0.024))[:, 0, :9, 9:].sum(axis=2)
     edge = np.array([[half, 0.0, 0]])

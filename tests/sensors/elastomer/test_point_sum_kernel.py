@@ -8,59 +8,59 @@ from kernels import interpreted, needs_triton, use_kernels
 from pulling_points import CASES, given
 
 from tgdsl.geometry.planes import vec
-from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, Markers, Pull
+from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, Markers, ShearLoad
 
 pytestmark = needs_triton
 TOLERANCE = 1e-5
 """Of the largest sum: what float32 leaves of positions of some centimetres and of a few hundred terms."""
 
 
-def in_double(pull: Pull, markers: Markers) -> torch.Tensor:
+def in_double(load: ShearLoad, markers: Markers) -> torch.Tensor:
     pos, strength, marker, normal = (
-        vec(part.double() for part in planes) for planes in (pull.pos, pull.strength, markers.pos, markers.normal)
+        vec(part.double() for part in planes) for planes in (load.pos, load.strength, markers.pos, markers.normal)
     )
     exact = Markers(marker, normal, markers.falloff.double(), None)
-    return torch.stack(POINT_SUM(pull._replace(pos=pos, strength=strength), exact))
+    return torch.stack(POINT_SUM(load._replace(pos=pos, strength=strength), exact))
 
 
-def counted(pull: Pull) -> Pull:
-    """Return points, those that pull first, and how many they are; the others' numbers are none at all."""
-    pulls = torch.stack(pull.strength).ne(0).any(dim=0)
-    order = torch.argsort(pulls.int(), dim=-1, descending=True, stable=True)
-    count = pulls.sum(dim=-1, dtype=torch.int32)
-    is_one = torch.arange(pulls.shape[-1]) < count[..., None]
+def counted(load: ShearLoad) -> ShearLoad:
+    """Return points, those that load first, and how many they are; the others' numbers are none at all."""
+    loads = torch.stack(load.strength).ne(0).any(dim=0)
+    order = torch.argsort(loads.int(), dim=-1, descending=True, stable=True)
+    count = loads.sum(dim=-1, dtype=torch.int32)
+    is_one = torch.arange(loads.shape[-1]) < count[..., None]
     pos, strength = (
-        vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (pull.pos, pull.strength)
+        vec(torch.where(is_one, part.gather(-1, order), torch.nan) for part in planes) for planes in (load.pos, load.strength)
     )
-    return pull._replace(pos=pos, strength=strength, count=count)
+    return load._replace(pos=pos, strength=strength, count=count)
 
 
 def main() -> None:
     """Print the results of all cases, as a process that interprets kernels."""
     use_kernels()
 
-    def run(pull: Pull, markers: Markers) -> torch.Tensor:
-        return torch.stack(POINT_SUM(pull, markers))
+    def run(load: ShearLoad, markers: Markers) -> torch.Tensor:
+        return torch.stack(POINT_SUM(load, markers))
 
     found = {}
     for name, case in CASES.items():
-        pull, markers = given(*case)
-        expected = in_double(pull, markers)
+        load, markers = given(*case)
+        expected = in_double(load, markers)
         scale = expected.abs().max().clamp(min=1e-12)
-        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (pull, counted(pull))]
+        found[name] = [float((run(own, markers) - expected).abs().max() / scale) for own in (load, counted(load))]
 
-    pull, markers = given(3, 20, 10, 0.5)
-    wide = pull._replace(
-        pos=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in pull.pos),
-        strength=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in pull.strength),
+    load, markers = given(3, 20, 10, 0.5)
+    wide = load._replace(
+        pos=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in load.pos),
+        strength=vec(torch.cat([0 * part, part], dim=1)[:, 3:] for part in load.strength),
     )
-    found["rows apart"] = float((run(wide, markers) - run(pull, markers)).abs().max())
+    found["rows apart"] = float((run(wide, markers) - run(load, markers)).abs().max())
 
-    pull.pos[1][0, 1] = torch.nan  # a pose
-    pull.strength[2][1, 1, 13] = torch.nan
-    for part in pull.strength:
+    load.pos[1][0, 1] = torch.nan  # a pose
+    load.strength[2][1, 1, 13] = torch.nan
+    for part in load.strength:
         part[0] = 0
-    isnan = run(pull, markers).isnan()
+    isnan = run(load, markers).isnan()
     own = slice(1, -1)
     found["not a number"] = [
         isnan[:, 0, own].all().item(),
@@ -88,7 +88,7 @@ def test_rows_may_lie_apart(found):
 
 
 def test_not_a_number_comes_out(found):
-    """Of a pose, though nothing pulls; of a strength in its own component; and of no other environment or link."""
+    """Of a pose, though no point is active; of a strength in its own component; and of no other environment or link."""
     assert found["not a number"] == [True, False, True, False]
 
 

@@ -32,7 +32,7 @@ def is_searchable(shapes: Collection[str], wants: Collection[str]) -> bool:
 def search(
     pairs: Pairs,
     probes: Probes,
-    targets: Sequence[Geoms],
+    targets: Sequence[Target],
     known: Mapping[str, Tensor],
     reach: Reach,
     wants: Collection[str],

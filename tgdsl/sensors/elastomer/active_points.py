@@ -1,9 +1,9 @@
-"""Compaction of the points that pull, for the sum over points of `point_anchors` on a CPU.
+"""Compaction of the active points, those with a shear load, for the sum over points of `point_anchors` on a CPU.
 
 Of an object's points few are in contact at a time, and those that are near each other stand near in the list. An operator
-copies the blocks of points in which any pulls into rows of one length, each of one environment, which has as many rows as it
-takes; the sum over rows is left to torch's operations, so that Inductor fuses it. The length is chosen at each call: how many
-rows and slots there are is known at run time only.
+copies the blocks of points that hold an active one into rows of one length, each of one environment, which has as many rows
+as it takes; the sum over rows is left to torch's operations, so that Inductor fuses it. The length is chosen at each call:
+how many rows and slots there are is known at run time only.
 
 Shapes: `env` environments, `link` links that may meet an object, `point` points of it, `block` blocks of these, `row` rows of
 one link, `slot` points of one row.
@@ -40,7 +40,7 @@ def are_compacted(pos: Vec, strength: Vec) -> bool:
 
 
 def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:
-    """Yield the points that pull on each link: places [m] and strengths [m²] in rows, and the environment of each row.
+    """Yield the active points of each link: places [m] and strengths [m²] in rows, and the environment of each row.
 
     Args:
         pos: z_p, planes (env, link, point) in each link's frame [m].
@@ -49,8 +49,8 @@ def active_points(pos: Vec, strength: Vec) -> Iterator[Row]:
     Yields:
         An empty slot has the strength 0.
     """
-    pulls = (strength[0] != 0) | (strength[1] != 0) | (strength[2] != 0) | ~torch.isfinite(pos[0] + pos[1] + pos[2])
-    blocks = pulls.unflatten(2, (-1, block_size(pulls.shape[2]))).any(dim=3)
+    is_active = (strength[0] != 0) | (strength[1] != 0) | (strength[2] != 0) | ~torch.isfinite(pos[0] + pos[1] + pos[2])
+    blocks = is_active.unflatten(2, (-1, block_size(is_active.shape[2]))).any(dim=3)
     return zip(*compacted([*pos, *strength], blocks), strict=True)
 
 
@@ -59,13 +59,15 @@ def block_size(num_points: int) -> int:
     return max(size for size in range(1, LARGEST_BLOCK + 1) if num_points % size == 0)
 
 
-@torch.library.custom_op("tgdsl::compacted", mutates_args=(), schema="(Tensor[] planes, Tensor pulls) -> (Tensor[], Tensor[])")
-def compacted(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """Return places and strengths in blocks that pull, and the environments of rows, link by link; see `active_points`."""
+@torch.library.custom_op(
+    "tgdsl::compacted", mutates_args=(), schema="(Tensor[] planes, Tensor is_active) -> (Tensor[], Tensor[])"
+)
+def compacted(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """Return places and strengths in active blocks, and the environments of rows, link by link; see `active_points`."""
     num_envs, num_links, num_points = planes[0].shape
-    size = num_points // max(pulls.shape[2], 1)
-    count = pulls.transpose(0, 1).sum(dim=2)
-    length = _row_length(count, pulls.shape[2], size)
+    size = num_points // max(is_active.shape[2], 1)
+    count = is_active.transpose(0, 1).sum(dim=2)
+    length = _row_length(count, is_active.shape[2], size)
     if length is None:
         every = torch.arange(num_envs)
         return [torch.stack([plane[:, link] for plane in planes]) for link in range(num_links)], [
@@ -75,7 +77,7 @@ def compacted(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[T
     num_rows = (count + (length - 1)) // length
     sizes = num_rows.sum(dim=1).tolist()
     env = torch.repeat_interleave(torch.arange(num_envs).repeat(num_links), num_rows.reshape(-1)).split(sizes)
-    index = _index(pulls, count, num_rows, length).split([length * num for num in sizes])
+    index = _index(is_active, count, num_rows, length).split([length * num for num in sizes])
     rows, envs = [], []
     for own, of_env in zip(index, env, strict=True):
         lacking = max(FEWEST - len(of_env), 0)
@@ -90,10 +92,10 @@ def compacted(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[T
 
 
 @compacted.register_fake
-def _(planes: list[Tensor], pulls: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+def _(planes: list[Tensor], is_active: Tensor) -> tuple[list[Tensor], list[Tensor]]:
     context = torch.library.get_ctx()
     slots = expect_size(context.new_dynamic_size(min=1), EXPECTED[1])
-    nums = [expect_size(context.new_dynamic_size(min=FEWEST), EXPECTED[0]) for _ in range(pulls.shape[1])]
+    nums = [expect_size(context.new_dynamic_size(min=FEWEST), EXPECTED[0]) for _ in range(is_active.shape[1])]
     rows = [planes[0].new_empty((6, num, slots)) for num in nums]
     return rows, [planes[0].new_empty((num,), dtype=torch.int64) for num in nums]
 
@@ -102,7 +104,7 @@ def _row_length(count: Int[Tensor, "link env"], num_blocks: int, size: int) -> i
     """Return the number of blocks of a row that costs least, or None if to sum over all points costs little more.
 
     Args:
-        count: How many blocks pull.
+        count: Number of active blocks.
         num_blocks: How many there are.
         size: Points of each.
     """
@@ -115,11 +117,11 @@ def _row_length(count: Int[Tensor, "link env"], num_blocks: int, size: int) -> i
 
 
 def _index(
-    pulls: Bool[Tensor, "env link block"], count: Int[Tensor, "link env"], num_rows: Int[Tensor, "link env"], length: int
+    is_active: Bool[Tensor, "env link block"], count: Int[Tensor, "link env"], num_rows: Int[Tensor, "link env"], length: int
 ) -> Int[Tensor, " place"]:
     """Return the block at each place of the rows, counted through (env, link, block), link after link; −1: none."""
-    num_envs, num_links, num_blocks = pulls.shape
-    found = pulls.transpose(0, 1).reshape(-1).nonzero()[:, 0]
+    num_envs, num_links, num_blocks = is_active.shape
+    found = is_active.transpose(0, 1).reshape(-1).nonzero()[:, 0]
     pair = torch.arange(num_links * num_envs).view(num_links, num_envs)
     there = torch.arange(num_envs) * num_links + torch.arange(num_links)[:, None]
     count, num_rows = count.reshape(-1), num_rows.reshape(-1)

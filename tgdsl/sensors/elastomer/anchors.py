@@ -1,7 +1,7 @@
-"""Anchors: where each taxel holds on to the object that it touches, and how far that place has been carried since.
+"""Anchors: the material point of an object that each taxel sticks to, and its tangential displacement since.
 
 A taxel i takes an anchor e_i, the object's material point at the taxel, in the object's frame, when the deepest object is
-deeper than `enter`; it lets go when that object is farther than `exit` beyond the reach, or may no longer be felt. One object
+deeper than `enter`; it is released when that object is farther than `exit` above the skin, or may no longer be felt. One object
 at a time holds an anchor: the deepest when it was taken, the first among equals. In the link's frame the displacement is
 
     s_i = R_oᵀ (e_i − c_o) − x_i,        t_i = Π_ni(s_i)                                      [m]
@@ -31,43 +31,45 @@ PLANES = ("anchor_x", "anchor_y", "anchor_z", "object")
 """What is carried from call to call: e_i [m], and the number of its object from 1, 0 for none."""
 
 
-class Law(NamedTuple):
-    """When anchors are taken, kept and dragged; numbers, or scalar tensors.
+class StickSlip(NamedTuple):
+    """Stick and slip of a contact: when it gets an anchor, loses it, and slides; numbers, or scalar tensors.
 
     Attributes:
-        reach: Distance up to which objects are felt [m].
-        enter: Depth at which an anchor is taken [m].
-        exit: Distance beyond the reach at which it is let go [m].
-        slip: Largest displacement per depth [1]; None: it never slides.
+        standoff: s, height of the undeformed skin, up to which objects are felt [m].
+        enter: Depth from which a contact sticks [m].
+        exit: Distance above the skin at which the anchor is released [m].
+        slip: Largest tangential displacement per depth [1]; None: it never slides.
     """
 
-    reach: float | Tensor
+    standoff: float | Tensor
     enter: float | Tensor
     exit: float | Tensor
     slip: float | Tensor | None
 
 
-def advance(felt: Penetration, pos: Vec, normal: Vec, law: Law, state: Mapping[str, Tensor]) -> tuple[Vec, dict[str, Tensor]]:
+def advance(
+    felt: Penetration, pos: Vec, normal: Vec, stick_slip: StickSlip, state: Mapping[str, Tensor]
+) -> tuple[Vec, dict[str, Tensor]]:
     """Return the tangential displacements t [m] and the new anchors."""
     anchor, held_by = (state["anchor_x"], state["anchor_y"], state["anchor_z"]), state["object"]
     zero = torch.zeros_like(felt.depth)
     moved, holds = (zero, zero, zero), []
     for k, (name, distance) in enumerate(felt.distances.items(), start=1):
         frame = felt.frames[name]
-        holds.append((held_by == k) & ~(distance.value > law.reach + law.exit))
+        holds.append((held_by == k) & ~(distance.value > stick_slip.standoff + stick_slip.exit))
         here = planes.rotate_back(frame.rotation, planes.sub(anchor, frame.offset))
         moved = planes.where(holds[-1], planes.sub(here, pos), moved)
     stretch = planes.sub(moved, planes.scale(planes.dot(moved, normal), normal))
-    kept, slides = (stretch, None) if law.slip is None else capped(stretch, law.slip * felt.depth)
+    kept, slides = (stretch, None) if stick_slip.slip is None else capped(stretch, stick_slip.slip * felt.depth)
     slid = planes.sub(kept, stretch)
     is_free = ~torch.stack(holds).any(dim=0)
-    taken, holder, deepest = (zero, zero, zero), zero, zero + law.enter
+    taken, holder, deepest = (zero, zero, zero), zero, zero + stick_slip.enter
     for k, ((name, distance), is_held) in enumerate(zip(felt.distances.items(), holds, strict=True), start=1):
         rotation, offset = felt.frames[name]
         dragged = anchor
         if slides is not None:
             dragged = planes.where(slides, planes.add(anchor, planes.rotate(rotation, slid)), anchor)
-        depth = law.reach - distance.value
+        depth = stick_slip.standoff - distance.value
         is_taken = is_free & (depth > torch.where(holder > 0, deepest + planes.tie(), deepest))
         taken = planes.where(is_held, dragged, planes.where(is_taken, planes.add(planes.rotate(rotation, pos), offset), taken))
         holder = torch.where(is_held | is_taken, float(k), holder)
@@ -84,7 +86,7 @@ def capped(stretch: Vec, limit: Tensor) -> tuple[Vec, Tensor]:
 
 
 def advance_reference(
-    touch: ReferencePenetration, pos: np.ndarray, normal: np.ndarray, law: Law, state: Mapping[str, np.ndarray]
+    touch: ReferencePenetration, pos: np.ndarray, normal: np.ndarray, stick_slip: StickSlip, state: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return t (taxel, 3) [m] and the new anchors of one environment, taxel by taxel."""
     found = np.zeros((len(pos), 3))
@@ -93,15 +95,15 @@ def advance_reference(
         phi, rotation, offset = touch.distance[i], touch.rotation[i], touch.offset[i]
         k = int(state["object"][i]) - 1
         e = np.array([state[name][i] for name in PLANES[:3]])
-        if k >= 0 and not phi[k] > law.reach + law.exit:
+        if k >= 0 and not phi[k] > stick_slip.standoff + stick_slip.exit:
             s = rotation[k].T @ (e - offset[k]) - x
             t = found[i] = s - (s @ n) * n
             length = float(np.linalg.norm(t))
-            if law.slip is not None and length > law.slip * touch.depth[i] and length > 1e-15:
-                found[i] = t * (law.slip * touch.depth[i] / length)
+            if stick_slip.slip is not None and length > stick_slip.slip * touch.depth[i] and length**2 > planes.tiny():
+                found[i] = t * (stick_slip.slip * touch.depth[i] / length)
                 e = e + rotation[k] @ (found[i] - t)
         else:
-            k = _deepest(law.reach - phi, float(law.enter))
+            k = _deepest(stick_slip.standoff - phi, float(stick_slip.enter))
             e = rotation[k] @ x + offset[k] if k >= 0 else np.zeros(3)
         for name, value in zip(PLANES, (*e, k + 1), strict=True):
             after[name][i] = value

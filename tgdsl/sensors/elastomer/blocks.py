@@ -12,10 +12,8 @@ from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
-from tgdsl.sensors.elastomer.boundary import correction, element_size
-from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, Skin
+from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, LinkTaxels
 from tgdsl.sensors.elastomer.operators import Response, Wish, fold
-from tgdsl.sensors.elastomer.pad import unroll
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -23,15 +21,15 @@ PLANES = {"spread": (3, 1), "bulge": (1, 1), "drag": (1, 1), "traction": (3, 3),
 """Planes that each operator puts out and takes in."""
 
 
-def skin(layout: Layout, link: int) -> Skin:
+def link_taxels(layout: Layout, link: int) -> LinkTaxels:
     """Return the taxels of one link; inactive ones, whose area may be nothing, get the others' mean."""
     own = layout.link_id == link
     is_active, area = layout.radius[own] > 0, layout.area[own]
     mean = area[is_active].mean() if is_active.any() else 1.0
-    return Skin(layout.pos[own], layout.normal[own], np.where(is_active, area, mean), layout.cell[own], is_active)
+    return LinkTaxels(layout.pos[own], layout.normal[own], np.where(is_active, area, mean), layout.cell[own], is_active)
 
 
-def gaussian(spec: ElastomerSpec, part: Skin) -> Gaussian:
+def gaussian(spec: ElastomerSpec, part: LinkTaxels) -> Gaussian:
     """Return the paper's kernels for one link."""
     smoothing = part.spacing if spec.thickness is None else spec.thickness
     return Gaussian(spec.dilation_falloff, spec.shear_falloff, spec.compressibility, smoothing, spec.normalize == "peak")
@@ -45,7 +43,7 @@ def elastic(spec: ElastomerSpec) -> Elastic:
     return Elastic(Layer(thickness, spec.marker_depth, modulus, spec.poissons_ratio))
 
 
-def weights(spec: ElastomerSpec, part: Skin) -> Float[np.ndarray, " taxel"]:
+def weights(spec: ElastomerSpec, part: LinkTaxels) -> Float[np.ndarray, " taxel"]:
     """Return a_i of the Gaussian kernel [1]; 0 for inactive taxels."""
     area = np.ones(len(part.area)) if spec.model == "paper" else part.area / spec.reference_area
     return np.where(part.is_active, area, 0.0)
@@ -69,7 +67,7 @@ def fold_links(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> di
 
 def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: SurfaceOf) -> dict[str, np.ndarray]:
     """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
-    part = skin(layout, link)
+    part = link_taxels(layout, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
     wish, constants = Wish(spec.operator, spec.tolerance), {}
     for name, response in responses(spec, part, pad).items():
@@ -79,7 +77,7 @@ def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: Surfa
     return constants
 
 
-def responses(spec: ElastomerSpec, part: Skin, pad: Surface | None) -> dict[str, Response]:
+def responses(spec: ElastomerSpec, part: LinkTaxels, pad: Surface | None) -> dict[str, Response]:
     """Return the operators of one link by name."""
     is_active = part.is_active.astype(np.float64)[:, None]
     if spec.kernel != "gaussian":
@@ -102,7 +100,7 @@ def responses(spec: ElastomerSpec, part: Skin, pad: Surface | None) -> dict[str,
     return {"spread": spread, "bulge": bulge, **({"drag": drag} if spec.anchored == "taxels" else {})}
 
 
-def _elastic_responses(spec: ElastomerSpec, part: Skin, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:
+def _elastic_responses(spec: ElastomerSpec, part: LinkTaxels, is_active: Float[np.ndarray, "taxel 1"]) -> dict[str, Response]:
     material = elastic(spec)
 
     def traction(source: np.ndarray) -> np.ndarray:
@@ -114,8 +112,12 @@ def _elastic_responses(spec: ElastomerSpec, part: Skin, is_active: Float[np.ndar
     return {"traction": traction} if spec.has_shear else {"pressure": pressure}
 
 
-def clamping(spec: ElastomerSpec, part: Skin, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
+def clamping(spec: ElastomerSpec, part: LinkTaxels, pad: Surface) -> Float[np.ndarray, "3 1 target source"]:
     """Return what clamping the pad's edge adds to `spread`: the edge is moved back by as much as it would move."""
+    # Here, so that only who clamps a pad waits for scikit-fem, and a compiled module runs without it.
+    from tgdsl.sensors.elastomer.clamped.boundary import correction, element_size
+    from tgdsl.sensors.elastomer.clamped.pad import unroll
+
     assert spec.boundary is not None and spec.thickness is not None
     added = np.zeros((3, 1, len(part.pos), len(part.pos)))
     if not part.is_active.any():

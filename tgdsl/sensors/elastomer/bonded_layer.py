@@ -111,11 +111,11 @@ def tabulated(r: np.ndarray, layer: Layer, patch: float) -> Profiles:
     return Profiles(*np.moveaxis(CubicSpline(knots, table)(r), -1, 0))
 
 
-def _quadrature(reach: float, layer: Layer, patch: float) -> tuple[np.ndarray, np.ndarray]:
+def _quadrature(largest_distance: float, layer: Layer, patch: float) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes k [1/m] and weights of Gauss' rule on panels that follow both J(kr) and the response."""
     b = (1.0 + QUADRATIC) * patch
     last = CUTOFF / b
-    panel = np.pi / max(reach, 2.0 * layer.thickness, 4.0 * b)
+    panel = np.pi / max(largest_distance, 2.0 * layer.thickness, 4.0 * b)
     edges = np.linspace(0.0, last, int(np.ceil(last / panel)) + 1)
     half = 0.5 * np.diff(edges)[:, None]
     return (edges[:-1, None] + half * (1.0 + NODES)).reshape(-1), (half * WEIGHTS).reshape(-1)

@@ -23,7 +23,7 @@ Matrix = Float[np.ndarray, "out in target source"]
 
 
 @dataclass(frozen=True, eq=False)
-class Skin:
+class LinkTaxels:
     """The taxels of one link, body frame: positions [m], unit normals, areas [m²], grid cells, and which are active."""
 
     pos: Float[np.ndarray, "taxel 3"]
@@ -68,22 +68,22 @@ class Gaussian:
         size = self.compressibility * local + (1.0 - self.compressibility) * stretch
         return (r * (size / peak if self.is_normalized else size))[:, None]
 
-    def bulge(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+    def bulge(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
         """Return g of the dilation, (1, 1, target, source)."""
-        return self._fall(self.dilation_falloff, skin, source)
+        return self._fall(self.dilation_falloff, taxels, source)
 
-    def drag(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+    def drag(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
         """Return g of the shear, (1, 1, target, source)."""
-        return self._fall(self.shear_falloff, skin, source)
+        return self._fall(self.shear_falloff, taxels, source)
 
-    def _fall(self, falloff: float, skin: Skin, source: np.ndarray) -> Matrix:
-        r = offset(skin.pos, skin.normal, skin.pos[source])
+    def _fall(self, falloff: float, taxels: LinkTaxels, source: np.ndarray) -> Matrix:
+        r = offset(taxels.pos, taxels.normal, taxels.pos[source])
         return np.exp(-falloff * np.einsum("kji,kji->ji", r, r))[None, None]
 
 
 @dataclass(frozen=True)
 class Elastic:
-    """A linear elastic skin.
+    """A linear elastic taxels.
 
     Attributes:
         layer: Its thickness [m], infinite for a half-space, the markers' depth [m], G [Pa] and ν.
@@ -103,14 +103,14 @@ class Elastic:
         find = bonded_layer.profiles if is_exact else bonded_layer.tabulated
         return find(r, layer, float(patch_radius(mean_area)))
 
-    def displacement(self, skin: Skin, source: Int[np.ndarray, " source"]) -> Matrix:
+    def displacement(self, taxels: LinkTaxels, source: Int[np.ndarray, " source"]) -> Matrix:
         """Return displacement per traction [m/Pa], (3, 3, target, source), both vectors in the body's frame."""
-        n, m = skin.normal, skin.normal[source]
-        area = skin.area[source]
-        r = offset(skin.pos, n, skin.pos[source])
+        n, m = taxels.normal, taxels.normal[source]
+        area = taxels.area[source]
+        r = offset(taxels.pos, n, taxels.pos[source])
         length = np.sqrt(np.einsum("kji,kji->ji", r, r))
         e = r / np.where(length > 0, length, 1.0)
-        found = Profiles(*(part * area for part in self.profiles(length, area, float(skin.spacing**2))))
+        found = Profiles(*(part * area for part in self.profiles(length, area, float(taxels.spacing**2))))
         flat = np.eye(3)[:, :, None] - np.einsum("jk,jl->klj", n, n)
         own = np.eye(3)[:, :, None] - np.einsum("ik,il->kli", m, m)
         twist = found.along - found.bend

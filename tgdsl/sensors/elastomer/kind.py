@@ -2,7 +2,7 @@
 
 Taxels are markers and sources alike; those of one link act on each other. With n_j the normal at x_j, Π_n(z) = z − (z · n) n,
 r_ij = Π_nj(x_j − x_i), depth h_i = max(0, s − min_o φ_o(x_i)) of the felt objects o under the skin's height s [m], and t_i
-the tangential displacement of the object's material since the taxel took hold of it [m] (`anchors`), the Gaussian kernel gives
+the tangential displacement of the object's material since the taxel stuck to it [m] (`anchors`), the Gaussian kernel gives
 
     u_j = Σ_i a_i s_d ( r_ij h_i (c g + (1 − c) ḡ/ρ̄ ρ) + n_j h_i^α g ) + Σ_i a_i s_s Π_nj(t_i) h_i exp(−λ_s |r_ij|²)      [m]
     g = exp(−λ_d |r_ij|²),    ρ = 1/(|r_ij|² + ε²),    ḡ = e^(−1/2)/√(2 λ_d),    ρ̄ = 1/(2 ε),    a_i = A_i/A_ref
@@ -70,9 +70,9 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants["normal_stiffness"] = scalar(spec.normal_stiffness)
     else:
         constants |= {"dilation_strength": scalar(spec.dilation_strength), "depth_exponent": scalar(spec.depth_exponent)}
-    reach = np.full(layout.num_taxels, spec.standoff)
+    standoff = np.full(layout.num_taxels, spec.standoff)
     if spec.anchored is None:
-        depth = ContactDepth(spec.objects, spec.is_gated, radius=reach)
+        depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff)
         return Lowered(CHANNELS, constants, requests=(depth,), notes=spec.notes)
     constants |= {"standoff": scalar(spec.standoff), "enter": scalar(spec.enter), "exit": scalar(spec.exit)}
     if spec.slip is not None:
@@ -81,18 +81,18 @@ def lower(spec: ElastomerSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered
         constants["shear_stiffness"] = scalar(spec.normal_stiffness * spec.stiffness_ratio)
     else:
         constants["shear_strength"] = scalar(spec.shear_strength)
-    span = spec.standoff + spec.exit
+    max_distance = spec.standoff + spec.exit
     if spec.anchored == "taxels":
         state = {name: Memory() for name in anchors.PLANES}
-        depth = ContactDepth(spec.objects, spec.is_gated, radius=reach, range=span, distance=True, frame=True)
+        depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance, distance=True, frame=True)
         return Lowered(CHANNELS, constants, state, requests=(depth,), notes=spec.notes)
     constants |= {"shear_falloff": scalar(spec.shear_falloff), "is_active": (layout.radius > 0).astype(np.float64)}
     constants |= {f"{FLAT}{first}": np.asarray(1) for first in _flat_links(layout)}
     if spec.model != "paper":
         constants["reference_area"] = scalar(spec.reference_area)
     state = {name: Memory(shape=Points, overwritten=True) for name in point_anchors.PLANES}
-    depth = ContactDepth(spec.objects, spec.is_gated, radius=reach, range=span)
-    points = Points(spec.objects, spec.is_gated, num_points=spec.points, range=span)
+    depth = ContactDepth(spec.objects, spec.is_gated, radius=standoff, range=max_distance)
+    points = Points(spec.objects, spec.is_gated, num_points=spec.points, range=max_distance)
     return Lowered(CHANNELS, constants, state, requests=(depth, points), notes=spec.notes)
 
 
@@ -107,19 +107,19 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     """Return the displacement planes [m] and the new anchors."""
     normal = planes.split(constants["normal"].T)
     felt = gathered[ContactDepth]
-    shear, pulls, after = None, None, {}
+    shear, loads, after = None, None, {}
     if "enter" in constants:
-        law = anchors.Law(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
+        stick_slip = anchors.StickSlip(constants["standoff"], constants["enter"], constants["exit"], constants.get("slip"))
         if "shear_falloff" in constants:
-            pulls, after = point_anchors.GRIP(list(gathered[Points].values()), law, state)
+            loads, after = point_anchors.SHEAR_LOADS(list(gathered[Points].values()), stick_slip, state)
         else:
-            shear, after = anchors.advance(felt, felt.pos, normal, law, state)
+            shear, after = anchors.advance(felt, felt.pos, normal, stick_slip, state)
     move = _elastic if "normal_stiffness" in constants else _gaussian
     found = move(felt.depth, shear, normal, constants)
-    if pulls is not None:
+    if loads is not None:
         flat = frozenset(int(name.removeprefix(FLAT)) for name in constants if name.startswith(FLAT))
         markers = Markers(felt.pos, normal, constants["shear_falloff"], constants.get("reference_area"), flat)
-        dragged = point_anchors.drag(pulls, markers, felt.depth.shape[0])
+        dragged = point_anchors.drag(loads, markers, felt.depth.shape[0])
         found = planes.add(found, planes.scale(constants["shear_strength"] * constants["is_active"], dragged))
     return {channel.name: plane for channel, plane in zip(CHANNELS, found, strict=True)}, after
 

@@ -25,7 +25,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from tgdsl.errors import LowerError
-from tgdsl.sensors.elastomer.kernels import Skin
+from tgdsl.sensors.elastomer.kernels import LinkTaxels
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 
 COST = {"dense": 1.0, "svd": 1.0, "fft": 32.0}
@@ -49,21 +49,23 @@ class Wish(NamedTuple):
         return 1e-3 if self.tolerance is None else self.tolerance
 
 
-def fold(response: Response, planes: tuple[int, int], skin: Skin, wish: Wish, is_alike: bool = True) -> dict[str, np.ndarray]:
+def fold(
+    response: Response, planes: tuple[int, int], taxels: LinkTaxels, wish: Wish, is_alike: bool = True
+) -> dict[str, np.ndarray]:
     """Return the constants of one link's operator.
 
     Args:
         response: Its matrix.
         planes: Numbers of planes that go out and in.
-        skin: The link's taxels.
+        taxels: The link's taxels.
         wish: The form.
         is_alike: Whether the response depends on nothing but the way from source to target where the taxels are alike.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
     """
-    num = len(skin.pos)
-    cells = grid(skin) if is_alike and wish.form in ("auto", "fft") else None
+    num = len(taxels.pos)
+    cells = grid(taxels) if is_alike and wish.form in ("auto", "fft") else None
     if wish.form == "fft" and isinstance(cells, str):
         raise LowerError(f"`fft` needs taxels on a regular planar grid: {cells}", "operator", "use dense, svd or auto")
     on_grid = cells if isinstance(cells, np.ndarray) else None
@@ -78,26 +80,26 @@ def fold(response: Response, planes: tuple[int, int], skin: Skin, wish: Wish, is
     return {"matrix": matrix}
 
 
-def grid(skin: Skin) -> Int[np.ndarray, "row column"] | str:
+def grid(taxels: LinkTaxels) -> Int[np.ndarray, "row column"] | str:
     """Return the taxel in each cell of a full, regular, planar grid, or else say what it lacks."""
-    if (skin.cell < 0).any():
-        return f"{int((skin.cell < 0).any(axis=1).sum())} taxels have no row and column"
-    cell = skin.cell - skin.cell.min(axis=0)
+    if (taxels.cell < 0).any():
+        return f"{int((taxels.cell < 0).any(axis=1).sum())} taxels have no row and column"
+    cell = taxels.cell - taxels.cell.min(axis=0)
     rows, columns = (int(n) for n in cell.max(axis=0) + 1)
-    if rows * columns != len(cell) or not skin.is_active.all() or len(np.unique(cell, axis=0)) != len(cell):
-        return f"{rows * columns - int(skin.is_active.sum())} of {rows} × {columns} cells are empty or inactive"
+    if rows * columns != len(cell) or not taxels.is_active.all() or len(np.unique(cell, axis=0)) != len(cell):
+        return f"{rows * columns - int(taxels.is_active.sum())} of {rows} × {columns} cells are empty or inactive"
     cells = np.empty((rows, columns), dtype=np.int64)
     cells[cell[:, 0], cell[:, 1]] = np.arange(len(cell))
-    first = skin.pos[cells[0, 0]]
-    steps = [(skin.pos[cells[-1, 0]] - first) / max(rows - 1, 1), (skin.pos[cells[0, -1]] - first) / max(columns - 1, 1)]
-    off = np.linalg.norm(skin.pos - first - cell @ np.stack(steps), axis=1).max()
+    first = taxels.pos[cells[0, 0]]
+    steps = [(taxels.pos[cells[-1, 0]] - first) / max(rows - 1, 1), (taxels.pos[cells[0, -1]] - first) / max(columns - 1, 1)]
+    off = np.linalg.norm(taxels.pos - first - cell @ np.stack(steps), axis=1).max()
     pitch = min((float(np.linalg.norm(step)) for step in steps if step.any()), default=1.0)
     if off > SAME * pitch:
         return f"a taxel is {off:.2g} m beside its place, the spacing is {pitch:.2g} m"
-    if np.linalg.norm(skin.normal - skin.normal[0], axis=1).max() > SAME:
+    if np.linalg.norm(taxels.normal - taxels.normal[0], axis=1).max() > SAME:
         return "the normals differ"
-    if np.ptp(skin.area) > SAME * skin.area.max():
-        return f"the areas differ, from {skin.area.min():.3g} to {skin.area.max():.3g} m²"
+    if np.ptp(taxels.area) > SAME * taxels.area.max():
+        return f"the areas differ, from {taxels.area.min():.3g} to {taxels.area.max():.3g} m²"
     return cells
 
 

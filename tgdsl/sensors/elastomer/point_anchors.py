@@ -1,8 +1,8 @@
 """Anchors on points of the objects, as in the paper: where each point was when it sank into the skin, and how far it came.
 
 A point p of an object, z_p its place in the link's frame and φ the signed distance to the link's own surface, takes the anchor
-e_p = z_p when it is deeper than `enter` in the skin, and lets go when it is farther than `exit` above it, or may no longer be
-felt. With h_p = max(0, s − φ(z_p)) its depth [m], s the skin's height, and m_p = ∇φ(z_p), it moves the markers j by
+e_p = z_p when it is deeper than `enter` in the skin, and is released when it is farther than `exit` above it, or may no longer
+be felt. With h_p = max(0, s − φ(z_p)) its depth [m], s the skin's height, and m_p = ∇φ(z_p), it moves the markers j by
 
     u_j = s_s Π_nj Σ_p w_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²)                     [m]
 
@@ -28,12 +28,12 @@ from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.points.points import LINK_POINTS, LinkPoints, ObjectPoints, are_grids, tile_size
 from tgdsl.quantities.points.reference import ReferencePoints
 from tgdsl.sensors.elastomer.active_points import active_points, are_compacted
-from tgdsl.sensors.elastomer.anchors import Law, capped
+from tgdsl.sensors.elastomer.anchors import StickSlip, capped
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.operations import Operation
 
 PLANES = ("anchor_x", "anchor_y", "anchor_z", "held")
-"""What is carried from call to call: e_p in the link's frame [m], and 1 where the point holds on."""
+"""State: e_p in the link's frame [m], and 1 where the point has an anchor."""
 BLOCK = 64
 """Points that are summed at once where nothing fuses the sum, so that memory stays bounded."""
 
@@ -56,8 +56,8 @@ class Markers(NamedTuple):
     flat: frozenset[int] = frozenset()
 
 
-class Pull(NamedTuple):
-    """What the points of one object pull with, planes (env, link, point) in each link's frame.
+class ShearLoad(NamedTuple):
+    """Shear loads of the points of one object, planes (env, link, point) in each link's frame.
 
     Attributes:
         taxels: First of each link's taxels, and one beyond the last.
@@ -65,7 +65,7 @@ class Pull(NamedTuple):
         area: Surface of the object that each stands for [m²], (case, 1).
         pos: z_p [m].
         strength: (z_p − e_p) h_p [m²].
-        count: How many points of each link pull, (env, link), which then come first; None: it shows in the strengths.
+        count: Number of active points of each link, (env, link), which then come first; None: inactive ones have strength 0.
     """
 
     taxels: tuple[tuple[int, int], ...]
@@ -76,44 +76,48 @@ class Pull(NamedTuple):
     count: Tensor | None = None
 
 
-def gripped(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
-    """Return what the points of each object pull with, and the new anchors: nothing if a kernel has put them in their place."""
-    return advance([LINK_POINTS(own) for own in objects], law, state)
+def shear_loads(
+    objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
+) -> tuple[list[ShearLoad], dict[str, Tensor]]:
+    """Return the shear loads of each object's points, and the new anchors: none if a kernel has written them in place."""
+    return advance([LINK_POINTS(own) for own in objects], stick_slip, state)
 
 
-def _gripped_by_kernel(
-    objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]
-) -> tuple[list[Pull], dict[str, Tensor]]:
+def _shear_loads_by_kernel(
+    objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
+) -> tuple[list[ShearLoad], dict[str, Tensor]]:
     from tgdsl.quantities.points.skin_kernel import grid_tables
-    from tgdsl.sensors.elastomer.grip_kernel import grip
+    from tgdsl.sensors.elastomer.anchor_kernel import advance_anchors
 
-    pulls, first = [], 0
-    numbers = [part for part in law if isinstance(part, Tensor)]
+    loads, first = [], 0
+    numbers = [part for part in stick_slip if isinstance(part, Tensor)]
     for pairs, source in objects:
         places, tables = torch.stack(source.points)[:, :, 0], grid_tables(source.links, 0)
         is_cubic, pose = source.links.shapes[0] == "tricubic", [*pairs.rotation, *pairs.offset]
         planes_of = [state[name] for name in PLANES]
-        found, count = grip(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
+        found, count = advance_anchors(pose, pairs.gate, source.pair, places, *tables, is_cubic, numbers, planes_of, first)
         x, y, z, *strength = found.unbind()
-        pulls.append(Pull(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), count))
+        loads.append(ShearLoad(source.taxels, source.tiles, source.area, (x, y, z), planes.vec(strength), count))
         first += source.pair.shape[0] * places.shape[2]
-    return pulls, {}
+    return loads, {}
 
 
-def _grip_inputs(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> list[Tensor]:
+def _anchor_inputs(objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]) -> list[Tensor]:
     return [tensor for own in objects for tensor in LINK_POINTS.inputs(own)]
 
 
-def _have_one_grid(objects: Sequence[ObjectPoints], law: Law, state: Mapping[str, Tensor]) -> bool:
+def _have_one_grid(objects: Sequence[ObjectPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]) -> bool:
     return all(len(own.source.links.shapes) == 1 and are_grids(own) for own in objects)
 
 
-GRIP = Operation("grip", gripped, _gripped_by_kernel, _grip_inputs, _have_one_grid)
+SHEAR_LOADS = Operation("advance_anchors", shear_loads, _shear_loads_by_kernel, _anchor_inputs, _have_one_grid)
 
 
-def advance(met: Sequence[LinkPoints], law: Law, state: Mapping[str, Tensor]) -> tuple[list[Pull], dict[str, Tensor]]:
-    """Return what the points of each object pull with, and the new anchors."""
-    pulls, after, start = [], {name: [] for name in PLANES}, 0
+def advance(
+    met: Sequence[LinkPoints], stick_slip: StickSlip, state: Mapping[str, Tensor]
+) -> tuple[list[ShearLoad], dict[str, Tensor]]:
+    """Return what the points of each object load with, and the new anchors."""
+    loads, after, start = [], {name: [] for name in PLANES}, 0
     for points in met:
         # Flat as the state is: a compiler then reads and writes that in one loop.
         distance = points.distance.flatten(1)
@@ -121,48 +125,48 @@ def advance(met: Sequence[LinkPoints], law: Law, state: Mapping[str, Tensor]) ->
         end = start + distance.shape[1]
         x, y, z, held = (state[name][:, start:end] for name in PLANES)
         anchor, start = (x, y, z), end
-        is_held = (held > 0) & ~(distance > law.reach + law.exit)
-        depth = torch.relu(law.reach - distance)
+        is_held = (held > 0) & ~(distance > stick_slip.standoff + stick_slip.exit)
+        depth = torch.relu(stick_slip.standoff - distance)
         zero = torch.zeros_like(depth)
         moved = planes.where(is_held, planes.sub(pos, anchor), (zero, zero, zero))
-        if law.slip is not None:
+        if stick_slip.slip is not None:
             stretch = planes.sub(moved, planes.scale(planes.dot(moved, gradient), gradient))
-            kept, slides = capped(stretch, law.slip * depth)
+            kept, slides = capped(stretch, stick_slip.slip * depth)
             slid = planes.sub(stretch, kept)
             moved, anchor = planes.sub(moved, slid), planes.where(slides, planes.add(anchor, slid), anchor)
-        is_taken = ~is_held & (law.reach - distance > law.enter)
+        is_taken = ~is_held & (stick_slip.standoff - distance > stick_slip.enter)
         taken = planes.where(is_held, anchor, planes.where(is_taken, pos, (zero, zero, zero)))
         shape = points.distance.shape[1:]
         strength = planes.vec(materialised(part).unflatten(1, shape) for part in planes.scale(depth, moved))
-        pulls.append(Pull(points.taxels, points.tiles, points.area, points.pos, strength))
+        loads.append(ShearLoad(points.taxels, points.tiles, points.area, points.pos, strength))
         for name, plane in zip(PLANES, (*taken, (is_held | is_taken).to(zero.dtype)), strict=True):
             after[name].append(plane)
-    return pulls, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}
+    return loads, {name: torch.cat(parts, dim=1) if parts else state[name] for name, parts in after.items()}
 
 
-def drag(pulls: Sequence[Pull], markers: Markers, num_envs: int) -> Vec:
+def drag(loads: Sequence[ShearLoad], markers: Markers, num_envs: int) -> Vec:
     """Return u_j / s_s of all markers [m²], planes (env, taxel)."""
     zero = markers.pos[0].new_zeros((num_envs, markers.pos[0].shape[0]))
     total = (zero, zero, zero)
-    for pull in pulls:
-        found = POINT_SUM(pull, markers)
+    for load in loads:
+        found = POINT_SUM(load, markers)
         if markers.reference_area is not None:
-            found = planes.scale(pull.area / markers.reference_area, found)
+            found = planes.scale(load.area / markers.reference_area, found)
         total = planes.add(total, found)
     return planes.sub(total, planes.scale(planes.dot(total, markers.normal), markers.normal))
 
 
-def point_sum(pull: Pull, markers: Markers) -> Vec:
+def point_sum(load: ShearLoad, markers: Markers) -> Vec:
     """Return Σ_p (z_p − e_p) h_p exp(−λ_s |Π_nj(x_j − z_p)|²) [m²] of the points of one object."""
     num_taxels = markers.pos[0].shape[0]
-    zero = markers.pos[0].new_zeros((pull.pos[0].shape[0], num_taxels))
+    zero = markers.pos[0].new_zeros((load.pos[0].shape[0], num_taxels))
     total = (zero, zero, zero)
-    rows = active_points(pull.pos, pull.strength) if are_compacted(pull.pos, pull.strength) else None
-    for link, (first, last) in enumerate(pull.taxels):
+    rows = active_points(load.pos, load.strength) if are_compacted(load.pos, load.strength) else None
+    for link, (first, last) in enumerate(load.taxels):
         pos = planes.vec(part[first:last] for part in markers.pos)
         normal = planes.vec(part[first : first + 1 if first in markers.flat else last] for part in markers.normal)
         if rows is None:
-            z, strength = (planes.vec(part[:, link] for part in vector) for vector in (pull.pos, pull.strength))
+            z, strength = (planes.vec(part[:, link] for part in vector) for vector in (load.pos, load.strength))
             found = _summed_on_link(z, strength, pos, normal, markers.falloff)
         else:
             points, env = next(rows)
@@ -173,16 +177,16 @@ def point_sum(pull: Pull, markers: Markers) -> Vec:
     return total
 
 
-def _point_sum_by_kernel(pull: Pull, markers: Markers) -> Vec:
+def _point_sum_by_kernel(load: ShearLoad, markers: Markers) -> Vec:
     from tgdsl.sensors.elastomer import point_sum_kernel
 
-    where = list(pull.pos), list(pull.strength), pull.count, pull.tiles, tile_size(pull.taxels)
+    where = list(load.pos), list(load.strength), load.count, load.tiles, tile_size(load.taxels)
     found = point_sum_kernel.point_sum(*where, list(markers.pos), list(markers.normal), markers.falloff)
     return planes.vec(found.unbind())
 
 
-def _point_sum_inputs(pull: Pull, markers: Markers) -> list[Tensor]:
-    return [*pull.pos, *pull.strength, markers.falloff]
+def _point_sum_inputs(load: ShearLoad, markers: Markers) -> list[Tensor]:
+    return [*load.pos, *load.strength, markers.falloff]
 
 
 POINT_SUM = Operation("point_sum", point_sum, _point_sum_by_kernel, _point_sum_inputs)
@@ -236,7 +240,7 @@ def reference_drag(
     met: Sequence[ReferencePoints],
     pos: Float[np.ndarray, "taxel 3"],
     normal: Float[np.ndarray, "taxel 3"],
-    law: Law,
+    stick_slip: StickSlip,
     falloff: float,
     reference_area: float | None,
     state: Mapping[str, np.ndarray],
@@ -248,17 +252,17 @@ def reference_drag(
         weight = 1.0 if reference_area is None else points.area / reference_area
         for z, phi, m in zip(points.pos, points.distance, points.gradient, strict=True):
             e, holds = np.array([state[name][row] for name in PLANES[:3]]), state["held"][row] > 0
-            h = max(0.0, law.reach - phi)
-            if holds and phi <= law.reach + law.exit:
+            h = max(0.0, stick_slip.standoff - phi)
+            if holds and phi <= stick_slip.standoff + stick_slip.exit:
                 t = (z - e) - ((z - e) @ m) * m
                 length = float(np.linalg.norm(t))
-                if law.slip is not None and length > law.slip * h and length > 1e-15:
-                    e = e + t * (1.0 - law.slip * h / length)
+                if stick_slip.slip is not None and length > stick_slip.slip * h and length**2 > planes.tiny():
+                    e = e + t * (1.0 - stick_slip.slip * h / length)
                 for j in points.taxels:
                     r, s = (v - (v @ normal[j]) * normal[j] for v in (pos[j] - z, z - e))
                     found[j] += weight * h * s * np.exp(-falloff * (r @ r))
             else:
-                holds = law.reach - phi > law.enter
+                holds = stick_slip.standoff - phi > stick_slip.enter
                 e = z if holds else np.zeros(3)
             for name, value in zip(PLANES, (*e, float(holds)), strict=True):
                 after[name][row] = value

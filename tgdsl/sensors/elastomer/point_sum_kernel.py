@@ -27,7 +27,7 @@ from tgdsl.geometry.planes_kernel import LOG2_E
 GROUP = tl.constexpr(8)
 """Points that are passed over together."""
 TILES = 4
-"""Tiles of a program where the number of points that pull is given: for most tiles it is 0."""
+"""Tiles of a program where the number of points that load is given: for most tiles it is 0."""
 
 
 @triton_op("tgdsl::point_sum", mutates_args={})
@@ -62,7 +62,7 @@ def launch(
         run: The kernel.
         pos: z_p, three planes in each link's frame [m].
         strength: s_p, likewise [m²]; all six lie in memory alike.
-        count: How many points of each link pull; they come first. None: it shows in the strengths.
+        count: Number of active points of each link; they come first. None: inactive ones have strength 0.
         tiles: What `points.point_tiles` returns; markers of no link read 0.
         block: `points.tile_size`.
         marker: x_j, three planes [m].
@@ -93,10 +93,10 @@ def point_sum_kernel(
     links = tl.load(tiles + 3 * own, own < num_tiles, -1)
     count += env * num_links
     are_links = links >= 0
-    num_pulling = tl.where(are_links, num_points, 0)
+    num_active = tl.where(are_links, num_points, 0)
     if HAS_COUNT:
-        num_pulling = tl.load(count + links, are_links, 0)
-    busy = tl.sum((num_pulling > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
+        num_active = tl.load(count + links, are_links, 0)
+    busy = tl.sum((num_active > 0).to(tl.int32) << tl.arange(0, TILES), axis=0)
     plane = tl.num_programs(0).to(tl.int64) * num_markers
     found += env * num_markers
     for i in range(tl.minimum(TILES, num_tiles - first_tile)):
@@ -140,20 +140,20 @@ def _frame(pos, normal, marker, is_marker, falloff):
 
 @triton.jit
 def _sum_of_all(total, frame, pos, strength, num_points):
-    """Return the sum over all points; groups that pull at nothing are passed over."""
-    # The points of an environment share a pose: one that is not a number shows in the first, whether it pulls or not.
+    """Return the sum over all points; inactive groups are skipped."""
+    # The points of an environment share a pose: one that is not a number shows in the first, whether it is active or not.
     rest = 0.0 * (tl.load(pos[0]) + tl.load(pos[1]) + tl.load(pos[2]))
     total = (total[0] + rest, total[1] + rest, total[2] + rest)
     for start in range(0, num_points, 32 * GROUP):
         point = start + tl.arange(0, 32 * GROUP)
         is_point = point < num_points
-        pulls = tl.load(strength[0] + point, is_point, 0.0) != 0.0
-        pulls |= tl.load(strength[1] + point, is_point, 0.0) != 0.0
-        pulls |= tl.load(strength[2] + point, is_point, 0.0) != 0.0
-        groups = tl.max(tl.reshape(pulls.to(tl.int32), (32, GROUP)), axis=1)
-        pulling = tl.sum(groups << tl.arange(0, 32))
+        is_active = tl.load(strength[0] + point, is_point, 0.0) != 0.0
+        is_active |= tl.load(strength[1] + point, is_point, 0.0) != 0.0
+        is_active |= tl.load(strength[2] + point, is_point, 0.0) != 0.0
+        groups = tl.max(tl.reshape(is_active.to(tl.int32), (32, GROUP)), axis=1)
+        active_groups = tl.sum(groups << tl.arange(0, 32))
         for group in range(32):
-            if (pulling >> group) & 1:
+            if (active_groups >> group) & 1:
                 first = start + group * GROUP
                 for p in tl.range(first, tl.minimum(first + GROUP, num_points), loop_unroll_factor=4):
                     total = _added(total, frame, pos, strength, p)

@@ -16,7 +16,7 @@ from tgdsl.quantities.points import Points
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.elastomer import blocks
-from tgdsl.sensors.elastomer.anchors import Law, advance_reference
+from tgdsl.sensors.elastomer.anchors import StickSlip, advance_reference
 from tgdsl.sensors.elastomer.kernels import Elastic
 from tgdsl.sensors.elastomer.point_anchors import reference_drag
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
@@ -36,12 +36,12 @@ def reference(
         raise NotImplementedError("the reference has no clamped boundary")
     touch = gathered[ContactDepth]
     shear, found, after = np.zeros((layout.num_taxels, 3)), np.zeros((layout.num_taxels, 3)), {}
-    law = Law(spec.standoff, spec.enter, spec.exit, spec.slip)
+    stick_slip = StickSlip(spec.standoff, spec.enter, spec.exit, spec.slip)
     if spec.anchored == "taxels":
-        shear, after = advance_reference(touch, layout.pos, layout.normal, law, state)
+        shear, after = advance_reference(touch, layout.pos, layout.normal, stick_slip, state)
     elif spec.anchored == "points":
         area = None if spec.model == "paper" else spec.reference_area
-        args = layout.pos, layout.normal, law, spec.shear_falloff, area, state
+        args = layout.pos, layout.normal, stick_slip, spec.shear_falloff, area, state
         drag, after = reference_drag(gathered[Points], *args)
         found = np.where(layout.radius[:, None] > 0, spec.shear_strength * drag, 0.0)
     for link in range(len(layout.links)):

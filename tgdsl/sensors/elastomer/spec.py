@@ -86,14 +86,14 @@ class ElastomerSpec(ContactProbeSpec):
     friction: NonNegative | None = None
     """μ, friction coefficient of the skin [1]; null: it never slides, as in the paper."""
     anchors: Literal["taxels", "points"] | None = None
-    """What takes hold: each taxel of the object that it touches, or `points` sampled on each object of the skin that they touch
+    """What sticks by an anchor: each taxel to the object that it touches, or `points` sampled on each object to the skin
     (the paper; gaussian); default: `taxels`, under `model: paper` `points`."""
     points: Annotated[StrictInt, Field(ge=1)] = 1000
     """Points of each object, for `anchors: points`."""
     enter: Annotated[Radius, Usual("length", high=0.1)] = 1e-5
-    """Depth at which a taxel takes hold of an object, or a point of the skin [m]."""
+    """Depth from which a taxel sticks to an object, or a point to the skin [m]."""
     exit: Annotated[Radius, Usual("length", high=0.1)] = 1e-4
-    """Distance at which it lets go [m]."""
+    """Distance at which its anchor is released [m]."""
     boundary: BoundarySpec | None = None
     """An edge that is clamped, for the in-plane dilation (gaussian); needs `thickness`."""
     operator: Literal["auto", "dense", "fft", "svd"] = "auto"
@@ -140,7 +140,7 @@ class ElastomerSpec(ContactProbeSpec):
 
     @property
     def anchored(self) -> Literal["taxels", "points"] | None:
-        """What takes hold; None without shear."""
+        """What sticks by an anchor; None without shear."""
         default = "points" if self.model == "paper" else "taxels"
         return (self.anchors or default) if self.has_shear else None
 

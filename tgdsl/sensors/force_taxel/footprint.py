@@ -43,35 +43,13 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
+from tgdsl.sensors.force_taxel.constants import damping, no_force, unreached, wholly
 from tgdsl.tensors.operations import Operation
 
 LEVENBERG = 1e-3
 """Least curvature of the dual ε [1], in footprints squared: taxels that spread less in some direction make no moment there."""
 FAR = 1e3
 """Where inactive taxels are for a kernel that does not know of them [m]: beyond all contacts' reach."""
-
-
-def unreached() -> float:
-    """Return the weight of a taxel that the object does not reach [probe's radius of depth]: someone must carry the load."""
-    return 1e-3
-
-
-def damping() -> float:
-    """Return what a step of β counts beside its effect on the shares [1].
-
-    It bounds steps where taxels of hardly any share decide.
-    """
-    return 0.1
-
-
-def log2_e() -> float:
-    """Return log₂ e."""
-    return 1.4426950408889634
-
-
-def no_force() -> float:
-    """Return the force [N] below which a direction fades to zero."""
-    return 1e-12
 
 
 class Footprint(NamedTuple):
@@ -118,7 +96,7 @@ def footprint(
     each, of = planes.vec(part[..., None] for part in normal), planes.vec(part[..., None, :] for part in inward)
     pull = (1 - apart).clamp(min=0) * planes.dot(each, of).clamp(0, 1)
     weight = (depth[..., None, :] + unreached()) * pull**2
-    near = (pull.amax(dim=-1) / 0.75).clamp(max=1)
+    near = (pull.amax(dim=-1) / wholly()).clamp(max=1)
     captured = near * near * (3 - 2 * near)
     strength = torch.sqrt(planes.dot(force, force) + no_force() ** 2)
     lever = planes.cross(arm, planes.vec((part / strength)[..., None] for part in force))
@@ -248,7 +226,7 @@ SHARED_FORCES = Operation("shared_forces", shared_forces, _shared_by_kernel, _in
 def _tilted(weight: Tensor, lever: Vec, tilt: Vec) -> Tensor:
     """Return shares ∝ weight · exp(β · g), which sum to 1, or are all zero where all weights are."""
     exponent = torch.where(weight > 0, planes.dot(planes.vec(part[..., None, None] for part in tilt), lever), 0.0)
-    weight = weight * torch.exp2(log2_e() * (exponent - exponent.detach().amax(dim=-1, keepdim=True)))
+    weight = weight * torch.exp2(planes.log2_e() * (exponent - exponent.detach().amax(dim=-1, keepdim=True)))
     total = weight.sum(dim=-1, keepdim=True)
     return weight / torch.where(total == 0, 1.0, total)
 
@@ -317,7 +295,7 @@ def reference(
         apart = np.where(is_active, np.sum((pos - point[c]) ** 2, axis=1) / radius**2, 4.0)
         pull = np.maximum(0.0, 1.0 - apart) * np.clip(-2.0 * outward @ normal[c], 0.0, 1.0)
         weight[c] = (depth + unreached()) * pull**2
-        t = min(1.0, pull.max() / 0.75)
+        t = min(1.0, pull.max() / wholly())
         captured[c] = t**2 * (3.0 - 2.0 * t)
     lever = [np.cross(pos - point[c], force[c] / strength[c]) / radius for c in range(num)]
     load = captured * strength

@@ -26,6 +26,7 @@ from torch.library import triton_op, wrap_triton
 
 from tgdsl.geometry.planes_kernel import LOG2_E, add3, add6, cross, scale3, scale6, solve, times
 from tgdsl.geometry.shapes_kernel import dot
+from tgdsl.sensors.force_taxel.constants import damping, no_force, wholly
 
 ENVS = 8
 """Environments of a program, which is one warp: a lane for each of their contacts of a group."""
@@ -41,9 +42,9 @@ BESIDE = tl.constexpr(0.25)
 """How far a contact stands beside the box of the taxels where moments are about that [footprints]."""
 LIMIT = tl.constexpr(64.0)
 """More than any exponent of 2 in `FEW_STEPS` steps, which is √10 · 12 / ln 2."""
-NO_FORCE = tl.constexpr(1e-12)
-DAMPING = tl.constexpr(0.1)
-"""As in `footprint`."""
+NO_FORCE = tl.constexpr(no_force())
+DAMPING = tl.constexpr(damping())
+WHOLLY = tl.constexpr(wholly())
 
 
 @triton_op("tgdsl::shared_forces", mutates_args={})
@@ -303,7 +304,7 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
         x, y, z = x + px, y + py, z + pz
         xx, xy, xz = xx + px * arm[0], xy + px * arm[1], xz + px * arm[2]
         yy, yz, zz = yy + py * arm[1], yz + py * arm[2], zz + pz * arm[2]
-    near = tl.minimum(nearest / 0.75, 1.0, propagate_nan=tl.PropagateNan.ALL)
+    near = tl.minimum(nearest / WHOLLY, 1.0, propagate_nan=tl.PropagateNan.ALL)
     captured = near * near * (3.0 - 2.0 * near)
     norm = tl.where(total == 0, 0.0, 1.0 / total)
     x, y, z = norm * x, norm * y, norm * z

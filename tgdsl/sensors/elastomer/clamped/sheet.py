@@ -2,6 +2,7 @@
 
 A soup comes in, as a robot's meshes are. Vertices that coincide are welded, an edge that another triangle's vertex lies on is
 split there (a T-junction would otherwise be a slit), and where two parts of the sheet touch in one vertex each gets its own.
+libigl and trimesh weld by rounding, which leaves apart what lies on two sides of a rounding limit, and close no T-junctions.
 
 Shapes: `v` vertices, `f` triangles, `pair` edges that two triangles share, `seg` edges of one triangle only.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
+import igl
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
@@ -66,14 +68,6 @@ def open_sides(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " seg"]:
     """Return the sides that only one triangle has."""
     edge, count = _edges(faces)
     return np.flatnonzero(count[edge] == 1)
-
-
-def components(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
-    """Return which connected part each triangle belongs to; parts that only touch in a vertex are two."""
-    edge, count = _edges(faces)
-    face = np.repeat(np.arange(len(faces)), 3)
-    incidence = coo_matrix((np.ones(len(edge)), (face, edge)), shape=(len(faces), len(count))).tocsr()
-    return connected_components(incidence @ incidence.T, directed=False)[1].astype(np.int64)
 
 
 def welded(corners: Float[np.ndarray, "f 3 3"]) -> Sheet:
@@ -145,39 +139,8 @@ def opened(sheet: Sheet) -> Sheet:
             f"the pad's surface is not orientable: neighbouring triangles near {_point(place)} are wound against each other",
             "wind all triangles counter-clockwise seen from outside",
         )
-    return _parted(sheet, pairs)
-
-
-def _parted(sheet: Sheet, pairs: Int[np.ndarray, "pair 2"]) -> Sheet:
-    """Return the sheet with corners that are joined across edges as its vertices."""
-    side, twin = pairs.T
-    start = np.concatenate([side, twin])
-    end = np.concatenate([_next(twin), _next(side)])
-    corner_count = sheet.faces.size
-    graph = coo_matrix((np.ones(len(start)), (start, end)), shape=(corner_count, corner_count))
-    _, vertex = connected_components(graph, directed=False)
-    source = sheet.faces.ravel()[np.unique(vertex, return_index=True)[1]]
-    return Sheet(sheet.vertices[source], vertex.reshape(-1, 3).astype(np.int64))
-
-
-def _next(side: Int[np.ndarray, " h"]) -> Int[np.ndarray, " h"]:
-    """Return the corner at which a side ends; it starts at the corner of its own number."""
-    return side - side % 3 + (side + 1) % 3
-
-
-def loops(faces: Int[np.ndarray, "f 3"]) -> list[Int[np.ndarray, " n"]]:
-    """Return the vertices along each closed edge of a sheet, the surface on the left."""
-    first, last = half_edges(faces)
-    sides = open_sides(faces)
-    follow = dict(zip(first[sides].tolist(), last[sides].tolist(), strict=True))
-    found = []
-    while follow:
-        vertex, chain = next(iter(follow)), []
-        while vertex in follow:
-            chain.append(vertex)
-            vertex = follow.pop(vertex)
-        found.append(np.array(chain, dtype=np.int64))
-    return found
+    faces, source = (np.asarray(part, dtype=np.int64) for part in igl.split_nonmanifold(sheet.faces))
+    return Sheet(sheet.vertices[source], faces)
 
 
 def _point(place: Float[np.ndarray, 3]) -> str:

@@ -1,9 +1,9 @@
-"""The state update of anchored points as one Triton kernel, where the links are grids: `point_anchors.advance` on a GPU.
+"""Anchors of points on links that are grids, as one Triton kernel: `point_anchors.advance` on a GPU.
 
-A program takes one link of an environment. It first selects the active points: those that are anchored, or may be in contact
-by the value of the grid's nearest node; most are neither. It compacts them, then takes one warp of points at a time, a thread
-per point: its depth (`skin_kernel`), and its new anchor, in place. The points with a strength are compacted too, in their
-order, and counted.
+A program takes one link of an environment. In chunks of points it finds candidates, which have an anchor or may be in the
+skin by the distance at the next node of the link's grid, and compacts their indices: most points are none. Then one thread
+per candidate finds its depth (`skin_kernel`) and advances its anchor in place. Active points, those with a shear load, are
+compacted in their order, and counted.
 
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
 """
@@ -21,21 +21,21 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.geometry.planes import tiny
+from tgdsl.geometry import planes
 from tgdsl.geometry.shapes_kernel import chosen, dot
 from tgdsl.quantities.points.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
-WORD, MANY = 32, 512
-"""Points of a warp, which is a program, and most points that are selected from at a time."""
+LANES, CHUNK = 32, 512
+"""Threads of a program, which is one warp, and most points of a chunk."""
 REGISTERS = 72
-"""Of a thread, where the compiler would take 110 to 150: the kernel is bound by memory latency, so occupancy counts."""
+"""Registers per thread, where a compiler would take 110 to 150: the kernel waits for memory, so occupancy decides."""
 MOST = 2**24
-"""Points of an object are fewer: the compaction holds their indices in float32."""
-TINY = tl.constexpr(tiny())
+"""Points of an object are fewer: their indices are stored as float32."""
+TINY = tl.constexpr(planes.tiny())
 
 
-@torch.library.custom_op("tgdsl::grip", mutates_args={"state"})
-def grip(
+@torch.library.custom_op("tgdsl::advance_anchors", mutates_args={"state"})
+def advance_anchors(
     pose: list[Tensor],
     gate: Tensor | None,
     pair: Tensor,
@@ -44,18 +44,18 @@ def grip(
     counts: Tensor,
     values: Tensor,
     is_cubic: bool,
-    law: list[Tensor],
+    stick_slip: list[Tensor],
     state: list[Tensor],
     first: int,
 ) -> tuple[Tensor, Tensor]:
-    """Advance anchors in place, and return what pulls; see `launch`.
+    """Advance anchors in place, and return the active points; see `launch`.
 
     It is no `triton_op`: places that depend on what was read would make a compiler conclude that all arguments may change.
     """
-    return launch(grip_kernel, pose, gate, pair, points, frames, counts, values, is_cubic, law, state, first)
+    return launch(anchor_kernel, pose, gate, pair, points, frames, counts, values, is_cubic, stick_slip, state, first)
 
 
-@grip.register_fake
+@advance_anchors.register_fake
 def _(pose: list[Tensor], gate: Tensor | None, pair: Tensor, points: Tensor, *_rest: Any) -> tuple[Tensor, Tensor]:
     return _empty(pose, pair, points)
 
@@ -70,11 +70,11 @@ def launch(
     counts: Int[Tensor, "link 4"],
     values: Float[Tensor, " node"],
     is_cubic: bool,
-    law: list[Float[Tensor, ""]],
+    stick_slip: list[Float[Tensor, ""]],
     state: list[Float[Tensor, "env all"]],
     first: int,
 ) -> tuple[Float[Tensor, "6 env link point"], Int[Tensor, "env link"]]:
-    """Run the kernel and return z_p [m] and (z_p − e_p) h_p [m²] of points that pull, and how many do.
+    """Run the kernel and return z_p [m] and (z_p − e_p) h_p [m²] of active points, and their number.
 
     Those of a link come first, in their order; the numbers after them mean nothing.
 
@@ -88,24 +88,24 @@ def launch(
         counts: Index of each grid's first node, and the number of its nodes along each axis.
         values: `Grid.values`.
         is_cubic: Whether it is interpolated by cubes.
-        law: Reach, enter, exit, and slip if there is friction: see `anchors.Law`.
+        stick_slip: Standoff, enter, exit, and slip if there is friction: see `anchors.StickSlip`.
         state: The planes that `point_anchors.PLANES` names, changed in place.
         first: Where the object's points begin in them, link after link.
     """
-    found, num_pulling = _empty(pose, pair, points)
+    found, num_active = _empty(pose, pair, points)
     _, num_envs, num_links, num_points = found.shape
     assert num_points < MOST
     points, gates = points.contiguous(), pose[0] if gate is None else gate
-    reach, enter, exit, *slip = law
+    standoff, enter, exit, *slip = stick_slip
     run[(num_envs * num_links,)](
-        found, num_pulling, *state, reach, enter, exit, slip[0] if slip else reach, *pose, gates, pair, points,
+        found, num_active, *state, standoff, enter, exit, slip[0] if slip else standoff, *pose, gates, pair, points,
         frames.contiguous(), counts.contiguous(), values, first, state[0].stride(0),
         num_links, num_points, *pose[0].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
-        SLIDES=len(slip) > 0, IS_GATED=gate is not None, IS_CUBIC=is_cubic, WORD=WORD,
-        MANY=min(max(triton.next_power_of_2(num_points), WORD), MANY), num_warps=1, maxnreg=REGISTERS,
+        SLIDES=len(slip) > 0, IS_GATED=gate is not None, IS_CUBIC=is_cubic, LANES=LANES,
+        CHUNK=min(max(triton.next_power_of_2(num_points), LANES), CHUNK), num_warps=1, maxnreg=REGISTERS,
     )  # fmt: skip
-    return found, num_pulling
+    return found, num_active
 
 
 def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,11 +116,11 @@ def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Te
 
 
 @triton.jit
-def grip_kernel(
-    found, num_pulling, anchor_x, anchor_y, anchor_z, held, reach, enter, exit, slip,
+def anchor_kernel(
+    found, num_active, anchor_x, anchor_y, anchor_z, held, standoff, enter, exit, slip,
     xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values, first, state_env,
     num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
-    SLIDES: tl.constexpr, IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, WORD: tl.constexpr, MANY: tl.constexpr,
+    SLIDES: tl.constexpr, IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, LANES: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """Advance all points on one link of one environment; see `launch`."""
     row = tl.program_id(0).to(tl.int64)
@@ -136,55 +136,55 @@ def grip_kernel(
     lost = _lost(pose)
 
     num_found = tl.full((), 0, tl.int32)
-    for start in range(0, num_points, MANY):
-        point = start + tl.arange(0, MANY)
+    for start in range(0, num_points, CHUNK):
+        point = start + tl.arange(0, CHUNK)
         is_point = point < num_points
         # A pose that is not a number comes out of all points, whatever the gate says.
-        wants = ((tl.load(state[3] + point, is_point, 0.0) + lost <= 0) == 0) & is_point
+        candidates = ((tl.load(state[3] + point, is_point, 0.0) + lost <= 0) == 0) & is_point
         if is_open:
             skin = surface(frames, counts, values, link)
             at = cells(skin, placed(pose, points, point_axis, point, is_point))
             is_in = is_within(skin, at) & is_point
-            wants |= ((nearest(skin, at, is_in) - skin[3] > tl.load(reach)) == 0) & is_in
-        num_wanted = tl.sum(wants.to(tl.int32), axis=0)
-        if num_wanted > 0:
+            candidates |= ((nearest(skin, at, is_in) - skin[3] > tl.load(standoff)) == 0) & is_in
+        num_candidates = tl.sum(candidates.to(tl.int32), axis=0)
+        if num_candidates > 0:
             skin = surface(frames, counts, values, link)
-            law = (tl.load(reach), tl.load(enter), tl.load(exit), tl.load(slip))
-            # The list stands where what pulls will: never more of that than was read of the list.
-            listed = found + start
-            tl.store(listed + _place(wants), point.to(tl.float32), wants)
+            stick_slip = (tl.load(standoff), tl.load(enter), tl.load(exit), tl.load(slip))
+            # The compacted indices occupy the output's memory: never more is written than has been read of them.
+            compacted = found + start
+            tl.store(compacted + _rank(candidates), point.to(tl.float32), candidates)
             tl.debug_barrier()
-            for low in range(0, num_wanted, WORD):
-                place = low + tl.arange(0, WORD)
-                is_wanted = place < num_wanted
-                chosen_points = tl.load(listed + place, is_wanted, 0.0).to(tl.int32)
-                here = placed(pose, points, point_axis, chosen_points, is_wanted)
+            for low in range(0, num_candidates, LANES):
+                place = low + tl.arange(0, LANES)
+                is_candidate = place < num_candidates
+                chosen_points = tl.load(compacted + place, is_candidate, 0.0).to(tl.int32)
+                here = placed(pose, points, point_axis, chosen_points, is_candidate)
                 distance, gradient = outside(here)
                 if is_open:
-                    distance, gradient = measured(skin, here, is_wanted, IS_CUBIC)
-                pull = _advanced(chosen_points, is_wanted, here, distance, gradient, law, state, SLIDES)
-                pulls = ((pull[0] + lost != 0) | (pull[1] != 0) | (pull[2] != 0)) & is_wanted
-                to = found + (num_found + _place(pulls))
-                tl.store(to, here[0], pulls)
-                tl.store(to + plane, here[1], pulls)
-                tl.store(to + 2 * plane, here[2], pulls)
-                tl.store(to + 3 * plane, pull[0], pulls)
-                tl.store(to + 4 * plane, pull[1], pulls)
-                tl.store(to + 5 * plane, pull[2], pulls)
-                num_found += tl.sum(pulls.to(tl.int32), axis=0)
-    tl.store(num_pulling + row, num_found)
+                    distance, gradient = measured(skin, here, is_candidate, IS_CUBIC)
+                strength = _advanced(chosen_points, is_candidate, here, distance, gradient, stick_slip, state, SLIDES)
+                is_active = ((strength[0] + lost != 0) | (strength[1] != 0) | (strength[2] != 0)) & is_candidate
+                to = found + (num_found + _rank(is_active))
+                tl.store(to, here[0], is_active)
+                tl.store(to + plane, here[1], is_active)
+                tl.store(to + 2 * plane, here[2], is_active)
+                tl.store(to + 3 * plane, strength[0], is_active)
+                tl.store(to + 4 * plane, strength[1], is_active)
+                tl.store(to + 5 * plane, strength[2], is_active)
+                num_found += tl.sum(is_active.to(tl.int32), axis=0)
+    tl.store(num_active + row, num_found)
 
 
 @triton.jit
-def _place(are):
+def _rank(are):
     """Return how many of a block there are before each."""
     return tl.cumsum(are.to(tl.int32), axis=0) - are.to(tl.int32)
 
 
 @triton.jit
-def _advanced(point, is_point, here, distance, gradient, law, state, SLIDES: tl.constexpr):
-    """Advance the anchors of some points of a link, and return what they pull with."""
-    reach, enter, exit, slip = law
+def _advanced(point, is_point, here, distance, gradient, stick_slip, state, SLIDES: tl.constexpr):
+    """Advance the anchors of some points of a link, and return their shear loads (z_p − e_p) h_p [m²]."""
+    standoff, enter, exit, slip = stick_slip
     anchor_x, anchor_y, anchor_z, held = state
     held_before = tl.load(held + point, is_point, 0.0) > 0
     anchor = (
@@ -192,14 +192,14 @@ def _advanced(point, is_point, here, distance, gradient, law, state, SLIDES: tl.
         tl.load(anchor_z + point, held_before, 0.0),
     )  # fmt: skip
     # What is not a number is no less than anything.
-    is_held = held_before & ((distance > reach + exit) == 0)
-    depth = tl.maximum(reach - distance, 0.0, propagate_nan=tl.PropagateNan.ALL)
+    is_held = held_before & ((distance > standoff + exit) == 0)
+    depth = tl.maximum(standoff - distance, 0.0, propagate_nan=tl.PropagateNan.ALL)
     none = tl.zeros_like(depth)
     way = (here[0] - anchor[0], here[1] - anchor[1], here[2] - anchor[2])
     moved = chosen(is_held, way, (none, none, none))
     if SLIDES:
         moved, anchor = _slid(moved, anchor, gradient, slip * depth)
-    is_taken = (is_held == 0) & (reach - distance > enter) & is_point
+    is_taken = (is_held == 0) & (standoff - distance > enter) & is_point
     kept = chosen(is_held, anchor, chosen(is_taken, here, (none, none, none)))
     is_changed = held_before | is_taken
     tl.store(anchor_x + point, kept[0], is_changed)

@@ -3,20 +3,22 @@
 The edge is thinned to the vertices that give it its shape and cut into pieces no longer than the element size; inside stand the
 points of nested triangular lattices, of which those with spacing 2^k sizes are used where the edge is at least 2^k / `GRADE`
 sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are halved, and what lies outside is removed.
+Neither scikit-fem nor libigl meshes an outline, and the meshers that do are not under a free licence.
 
 Shapes: `n` vertices of a loop, `p` points, `m` triangles, `seg` pieces of the edge.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
+import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay, KDTree
+from skfem import MeshTri
 
-from tgdsl.sensors.elastomer.sheet import half_edges, open_sides, refused
+from tgdsl.sensors.elastomer.clamped.sheet import refused
 
 MAX_CORNERS = 20_000
 """Bound on the corners of all triangles; the finite elements have four nodes for each."""
@@ -34,20 +36,7 @@ ROUNDS = 40
 """Times that pieces of the edge may be halved."""
 
 
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles of a plane region.
-
-    Attributes:
-        points: Corners [m].
-        triangles: Indices of their corners, counter-clockwise.
-    """
-
-    points: Float[np.ndarray, "p 2"]
-    triangles: Int[np.ndarray, "m 3"]
-
-
-def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> Mesh:
+def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
     """Return triangles of about `size` [m] at the edge that fill the closed loops of `outline` [m].
 
     Raises:
@@ -63,15 +52,23 @@ def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> Mesh:
         )
     for _ in range(ROUNDS):
         everything = np.concatenate([points, inner])
-        triangles = _oriented(everything, Delaunay(everything).simplices)
-        missing = _missing(triangles, pieces)
+        triangles = Delaunay(everything).simplices.astype(np.int64)
+        triangles = triangles[np.abs(igl.doublearea(everything, triangles)) > 1e-7]
+        found = MeshTri(np.ascontiguousarray(everything.T), np.ascontiguousarray(triangles.T), sort_t=False)
+        missing = ~np.isin(_sides(pieces), _sides(np.asarray(found.facets).T))
         if not missing.any():
             break
         points, pieces = _halved(points, pieces, missing)
-    centre = everything[triangles].mean(axis=1)
-    triangles = triangles[_is_within(centre, points, pieces)]
-    _check(everything, triangles, pieces)
-    return Mesh(np.multiply(everything, size), triangles)
+    within = np.flatnonzero(_is_within(everything[triangles].mean(axis=1), points, pieces))
+    _check(found, within, pieces)
+    kept = found.restrict(within)
+    assert isinstance(kept, MeshTri)
+    return kept.scaled(size)
+
+
+def _sides(ends: Int[np.ndarray, "seg 2"]) -> Int[np.ndarray, " seg"]:
+    """Return one number for each pair of points, in whichever order."""
+    return np.sort(ends, axis=1).astype(np.int64) @ [1 << 32, 1]
 
 
 def _edge(outline: list[Float[np.ndarray, "n 2"]]) -> tuple[Float[np.ndarray, "p 2"], Int[np.ndarray, "seg 2"]]:
@@ -99,30 +96,14 @@ def _sampled(loop: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "p 2"]:
     closed = np.concatenate([loop, loop[:1]])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     far = int(np.argmax(np.linalg.norm(loop - loop[0], axis=1)))
-    kept = np.array(sorted({0, far, len(loop)} | _shaping(closed, 0, far) | _shaping(closed, far, len(loop))))
+    # Douglas and Peucker, 1973
+    halves = (igl.ramer_douglas_peucker(np.ascontiguousarray(half), SHAPE)[1] for half in (closed[: far + 1], closed[far:]))
+    kept = np.unique(np.concatenate([at + np.asarray(half) for at, half in zip((0, far), halves, strict=True)]))
     places = [
         np.linspace(way[a], way[b], max(1, int(np.ceil(way[b] - way[a] - 1e-6))), endpoint=False) for a, b in pairwise(kept)
     ]
     place = np.concatenate(places)
     return np.stack([np.interp(place, way, closed[:, k]) for k in range(2)], axis=1)
-
-
-def _shaping(line: Float[np.ndarray, "n 2"], first: int, last: int) -> set[int]:
-    """Return the vertices between two that a line needs to stay within `SHAPE` of itself (Douglas and Peucker, 1973)."""
-    found: set[int] = set()
-    waiting = [(first, last)]
-    while waiting:
-        a, b = waiting.pop()
-        if b - a < 2:
-            continue
-        offset, chord = line[a + 1 : b] - line[a], line[b] - line[a]
-        place = np.clip(offset @ chord / max(float(chord @ chord), np.finfo(float).tiny), 0.0, 1.0)
-        gap = np.linalg.norm(offset - place[:, None] * chord, axis=1)
-        if gap.max() > SHAPE:
-            middle = a + 1 + int(np.argmax(gap))
-            found.add(middle)
-            waiting += [(a, middle), (middle, b)]
-    return found
 
 
 def _inside(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) -> Float[np.ndarray, "q 2"]:
@@ -156,28 +137,8 @@ def _dense(points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]) -
 def _is_within(
     where: Float[np.ndarray, "q 2"], points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"]
 ) -> Bool[np.ndarray, " q"]:
-    """Return which points are inside the edge: a ray to the right crosses it an odd number of times."""
-    a, b = points[pieces[:, 0]], points[pieces[:, 1]]
-    odd = np.zeros(len(where), dtype=bool)
-    for (ax, ay), (bx, by) in zip(a, b, strict=True):
-        spans = np.flatnonzero((ay > where[:, 1]) != (by > where[:, 1]))
-        x, y = where[spans].T
-        odd[spans] ^= x < ax + (y - ay) * (bx - ax) / (by - ay)
-    return odd
-
-
-def _oriented(points: Float[np.ndarray, "p 2"], triangles: np.ndarray) -> Int[np.ndarray, "m 3"]:
-    """Return the triangles that are more than a line, counter-clockwise."""
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    turned = np.where((area < 0)[:, None], triangles[:, ::-1], triangles)
-    return turned[np.abs(area) > 1e-7].astype(np.int64)
-
-
-def _missing(triangles: Int[np.ndarray, "m 3"], pieces: Int[np.ndarray, "seg 2"]) -> Bool[np.ndarray, " seg"]:
-    ends = np.sort(np.stack(half_edges(triangles), axis=1), axis=1)
-    count = int(max(ends.max(), pieces.max())) + 1
-    return ~np.isin(np.sort(pieces, axis=1) @ [count, 1], ends @ [count, 1])
+    """Return which points are inside the edge."""
+    return np.abs(igl.winding_number(points, pieces, where)) > 0.5
 
 
 def _halved(
@@ -190,14 +151,12 @@ def _halved(
     return np.concatenate([points, points[cut].mean(axis=1)]), np.concatenate([pieces[~which], *halves])
 
 
-def _check(points: Float[np.ndarray, "p 2"], triangles: Int[np.ndarray, "m 3"], pieces: Int[np.ndarray, "seg 2"]) -> None:
-    """Refuse a mesh whose edge is not the region's."""
-    first, last = half_edges(triangles)
-    sides = open_sides(triangles)
-    got = {(int(a), int(b)) for a, b in np.sort(np.stack([first[sides], last[sides]], axis=1), axis=1)}
-    wanted = {(int(a), int(b)) for a, b in np.sort(pieces, axis=1)}
-    if not len(triangles) or got != wanted:
+def _check(found: MeshTri, within: Int[np.ndarray, " m"], pieces: Int[np.ndarray, "seg 2"]) -> None:
+    """Refuse triangles of a mesh whose edge is not the region's."""
+    facet, count = np.unique(np.asarray(found.t2f)[:, within], return_counts=True)
+    wrong = np.setxor1d(_sides(np.asarray(found.facets).T[facet[count == 1]]), _sides(pieces))
+    if not len(within) or len(wrong):
         raise refused(
-            f"no triangles fill the pad: {len(got ^ wanted)} pieces of its edge do not bound the mesh",
+            f"no triangles fill the pad: {len(wrong)} pieces of its edge do not bound the mesh",
             "its outline may have spikes or slits; select a region with a plain outline",
         )

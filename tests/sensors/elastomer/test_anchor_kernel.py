@@ -13,12 +13,12 @@ from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.points.points import met_points
 from tgdsl.sensors.elastomer import point_anchors
-from tgdsl.sensors.elastomer.anchors import Law
-from tgdsl.sensors.elastomer.point_anchors import GRIP, PLANES, advance, gripped
+from tgdsl.sensors.elastomer.anchors import StickSlip
+from tgdsl.sensors.elastomer.point_anchors import PLANES, SHEAR_LOADS, advance, shear_loads
 
 PALM = Path(__file__).parents[3] / "examples" / "xhand1_palm.yaml"
-STICKS, SLIDES = Law(1e-3, 1e-5, 1e-3, None), Law(1e-3, 1e-5, 1e-3, 0.4)
-LAWS = {"sticks": STICKS, "slides": SLIDES}
+STICKS, SLIDES = StickSlip(1e-3, 1e-5, 1e-3, None), StickSlip(1e-3, 1e-5, 1e-3, 0.4)
+CONTACT_LAWS = {"sticks": STICKS, "slides": SLIDES}
 CASES = ("one link", "cubes", "many points")
 STEPS, BEFORE = 5, 7
 """Steps of a run, and how many points of other objects stand before those that are looked at."""
@@ -42,9 +42,9 @@ def moved(meeting, step):
     return meeting._replace(pairs=pairs._replace(rotation=rot(turn), offset=offset, gate=gate))
 
 
-def of(law, dtype):
-    """Return a law's numbers as a module has them."""
-    return Law(*(None if part is None else torch.tensor(part, dtype=torch.float32).to(dtype) for part in law))
+def of(stick_slip, dtype):
+    """Return its numbers as a module has them."""
+    return StickSlip(*(None if part is None else torch.tensor(part, dtype=torch.float32).to(dtype) for part in stick_slip))
 
 
 def nothing_held(meeting):
@@ -53,24 +53,24 @@ def nothing_held(meeting):
     return {name: torch.cat([torch.full((NUM_ENVS, BEFORE), 9.0), torch.zeros(NUM_ENVS, num)], dim=1) for name in PLANES}
 
 
-def by_kernel(meeting, law, state):
-    """Return what pulls, and change the state in place, as `gripped` has the kernel do on a GPU."""
+def by_kernel(meeting, stick_slip, state):
+    """Return the active points, and change the state in place, as `shear_loads` has the kernel do on a GPU."""
     from tgdsl.quantities.points.skin_kernel import grid_tables
-    from tgdsl.sensors.elastomer.grip_kernel import grip_kernel, launch
+    from tgdsl.sensors.elastomer.anchor_kernel import anchor_kernel, launch
 
     (rotation, offset, _, gate), source = meeting
-    places, numbers = torch.stack(source.points)[:, :, 0], [part for part in law if part is not None]
+    places, numbers = torch.stack(source.points)[:, :, 0], [part for part in stick_slip if part is not None]
     how = (*grid_tables(source.links, 0), source.links.shapes[0] == "tricubic")
     held = [state[name] for name in PLANES]
-    return launch(grip_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
+    return launch(anchor_kernel, [*rotation, *offset], gate, source.pair, places, *how, numbers, held, BEFORE)
 
 
 def first_ones(count, num_points):
-    """Return which columns of (env, link, point) hold a point that pulls."""
+    """Return which columns of (env, link, point) hold an active point."""
     return torch.arange(num_points) < count[..., None]
 
 
-def check(case, law):
+def check(case, stick_slip):
     """Make some steps, and compare each with the torch code in float64 from the same anchors.
 
     Returns how many points took hold, let go, slid and pulled.
@@ -79,45 +79,45 @@ def check(case, law):
     state, seen = nothing_held(meeting), torch.zeros(4)
     for step in range(STEPS):
         before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
-        (pull,), expected = advance([met_points(moved(exact, step))], of(law, torch.float64), before)
-        found, count = by_kernel(moved(meeting, step), of(law, torch.float32), state)
+        (load,), expected = advance([met_points(moved(exact, step))], of(stick_slip, torch.float64), before)
+        found, count = by_kernel(moved(meeting, step), of(stick_slip, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
             torch.testing.assert_close(plane[:, BEFORE:].double(), expected[name], rtol=0, atol=PLACE)
-        pulls = torch.stack(pull.strength).ne(0).any(dim=0)
-        assert torch.equal(count, pulls.sum(dim=-1)), (case, step)
+        is_active = torch.stack(load.strength).ne(0).any(dim=0)
+        assert torch.equal(count, is_active.sum(dim=-1)), (case, step)
         apart = (
-            found[:, first_ones(count, pulls.shape[2])].double() - torch.stack([*pull.pos, *pull.strength])[:, pulls]
+            found[:, first_ones(count, is_active.shape[2])].double() - torch.stack([*load.pos, *load.strength])[:, is_active]
         ).abs()
         assert not apart.numel() or (apart[:3].max() <= PLACE and apart[3:].max() <= STRENGTH), (case, step)
         held, after = before["held"] > 0, expected["held"] > 0
         dragged = held & after & (expected["anchor_x"] != before["anchor_x"])
-        seen += torch.stack([part.sum() for part in (after & ~held, held & ~after, dragged, pulls)])
+        seen += torch.stack([part.sum() for part in (after & ~held, held & ~after, dragged, is_active)])
     return seen
 
 
 def check_strange_poses():
     """A pose that is not a number comes out, gated or not, is not remembered, and is in no other link or environment."""
-    meeting, law = made("cubes", torch.float32), of(SLIDES, torch.float32)
+    meeting, stick_slip = made("cubes", torch.float32), of(SLIDES, torch.float32)
     state = nothing_held(meeting)
     for step in range(2):
-        by_kernel(moved(meeting, step), law, state)
+        by_kernel(moved(meeting, step), stick_slip, state)
     num_points = meeting.source.points[0].shape[2]
-    clean, count = by_kernel(moved(meeting, 1), law, {name: plane.clone() for name, plane in state.items()})
+    clean, count = by_kernel(moved(meeting, 1), stick_slip, {name: plane.clone() for name, plane in state.items()})
     own, others = slice(BEFORE, BEFORE + num_points), torch.ones(count.shape, dtype=torch.bool)
     others[2, 0] = False
     for gate in (0.0, -torch.inf, torch.nan):
         broken, after = moved(meeting, 1), {name: plane.clone() for name, plane in state.items()}
         pair = int(broken.source.pair[0])
         broken.pairs.offset[1][2, pair], broken.pairs.gate[2, pair] = torch.nan, gate
-        found, told = by_kernel(broken, law, after)
+        found, told = by_kernel(broken, stick_slip, after)
         assert told[2, 0] == num_points and found[0, 2, 0].isnan().all()
         for name, plane in after.items():
             expected = state[name][2, own] if gate != -torch.inf else torch.zeros(num_points)
             assert torch.equal(plane[2, own], expected) or name != "held"
         assert torch.equal(told[others], count[others])
-        pulls = first_ones(told, num_points) & others[..., None]
-        assert torch.equal(found[:, pulls], clean[:, pulls])
+        is_active = first_ones(told, num_points) & others[..., None]
+        assert torch.equal(found[:, is_active], clean[:, is_active])
 
 
 def check_sums():
@@ -128,12 +128,12 @@ def check_sums():
     numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
     for step in range(3):
         before = {name: plane.double() for name, plane in state.items()}
-        pulls, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
+        loads, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
-        expected = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
-        pulls, after = GRIP([moved(meeting, step)], of(SLIDES, torch.float32), state)
+        expected = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
+        loads, after = SHEAR_LOADS([moved(meeting, step)], of(SLIDES, torch.float32), state)
         markers = point_anchors.Markers(vec(0.003 * places.T.float()), vec(places.T.float()), *numbers.float())
-        found = torch.stack(point_anchors.drag(pulls, markers, NUM_ENVS))
+        found = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
         assert after == {} and (step != 1 or expected.abs().max() > 1e-9)
         torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
 
@@ -141,9 +141,9 @@ def check_sums():
 def compare() -> None:
     """Make all comparisons: run where `TRITON_INTERPRET` is set."""
     use_kernels()
-    for law in LAWS.values():
-        seen = torch.stack([check(case, law) for case in CASES]).sum(dim=0)
-        assert (seen[[0, 1, 3]] > 10).all() and (seen[2] > 10) == (law.slip is not None), seen
+    for stick_slip in CONTACT_LAWS.values():
+        seen = torch.stack([check(case, stick_slip) for case in CASES]).sum(dim=0)
+        assert (seen[[0, 1, 3]] > 10).all() and (seen[2] > 10) == (stick_slip.slip is not None), seen
     check_strange_poses()
     check_sums()
 
@@ -169,16 +169,16 @@ def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
     assert 0.5 < max(below) < 0.95
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_without_a_kernel_all_objects_are_advanced_by_torch(law):
+@pytest.mark.parametrize("stick_slip", CONTACT_LAWS)
+def test_without_a_kernel_all_objects_are_advanced_by_torch(stick_slip):
     """Of links with several meshes too."""
     for case in ("cubes", "several meshes"):
         meeting = made(case, torch.float64)
         state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
-        (pull,), after = gripped([meeting], of(LAWS[law], torch.float64), state)
-        (expected,), wanted = advance([met_points(meeting)], of(LAWS[law], torch.float64), state)
-        assert pull.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
-        assert torch.equal(torch.stack(pull.strength), torch.stack(expected.strength))
+        (load,), after = shear_loads([meeting], of(CONTACT_LAWS[stick_slip], torch.float64), state)
+        (expected,), wanted = advance([met_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
+        assert load.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
+        assert torch.equal(torch.stack(load.strength), torch.stack(expected.strength))
 
 
 if __name__ == "__main__":

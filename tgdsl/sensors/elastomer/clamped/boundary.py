@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import bmat, coo_matrix, csr_matrix
+from scipy.sparse import block_diag, bmat, csr_matrix
 from scipy.sparse.linalg import splu
+from skfem import BilinearForm
+from skfem.helpers import dot
 
-from tgdsl.sensors.elastomer.mesh import MAX_CORNERS
-from tgdsl.sensors.elastomer.pad import Pad
-from tgdsl.sensors.elastomer.sheet import refused
+from tgdsl.sensors.elastomer.clamped.mesh import MAX_CORNERS
+from tgdsl.sensors.elastomer.clamped.pad import Pad
+from tgdsl.sensors.elastomer.clamped.sheet import refused
 
 PER_LAYER = 4
 """Elements across the boundary layer."""
@@ -64,17 +66,16 @@ def correction(pad: Pad, thickness: float, drag: float, bulk: float) -> Float[np
         drag: β [1].
         bulk: K [1].
     """
-    xx, xy, yy, mass = _integrals(pad)
-    taxel = np.repeat(np.arange(len(pad.taxel_nodes)), 6)
-    shape = (len(pad.taxel_nodes), len(pad.nodes))
-    at_taxels = csr_matrix(coo_matrix((pad.taxel_weights.ravel(), (taxel, pad.taxel_nodes.ravel())), shape=shape))
-    apart = xx + yy + drag / thickness**2 * mass
+    apart = csr_matrix(BilinearForm(lambda u, v, _: dot(u.grad, v.grad) + drag / thickness**2 * u * v).assemble(pad.basis))
     if bulk == 0:
-        one = _spread(apart, at_taxels, pad.edge)
-        return np.block([[one, np.zeros_like(one)], [np.zeros_like(one), one]])
-    stiffness = csr_matrix(bmat([[apart + bulk * xx, bulk * xy], [bulk * xy.T, apart + bulk * yy]]))
-    edge = np.concatenate([pad.edge, pad.edge + len(pad.nodes)])
-    return _spread(stiffness, csr_matrix(bmat([[at_taxels, None], [None, at_taxels]])), edge)
+        return np.kron(np.eye(2), _spread(apart, pad.at_taxels, pad.edge))
+    xx, xy, yy = (
+        BilinearForm(lambda u, v, _, i=i, j=j: bulk * v.grad[i] * u.grad[j]).assemble(pad.basis)
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    edge = np.concatenate([pad.edge, pad.edge + pad.basis.N])
+    stiffness = csr_matrix(bmat([[apart + xx, xy], [xy.T, apart + yy]]))
+    return _spread(stiffness, csr_matrix(block_diag([pad.at_taxels] * 2)), edge)
 
 
 def _spread(stiffness: csr_matrix, at_taxels: csr_matrix, edge: np.ndarray) -> np.ndarray:
@@ -91,42 +92,3 @@ def _spread(stiffness: csr_matrix, at_taxels: csr_matrix, edge: np.ndarray) -> n
     )
     adjoint = factor.solve(at_taxels[:, inner].toarray().T)
     return at_taxels[:, edge].toarray() - (rows[:, edge].T @ adjoint).T
-
-
-def _integrals(pad: Pad) -> tuple[csr_matrix, csr_matrix, csr_matrix, csr_matrix]:
-    """Return ∫ ∂x φi ∂x φj, ∫ ∂x φi ∂y φj, ∫ ∂y φi ∂y φj and ∫ φi φj [m²] over the pad."""
-    corners = pad.nodes[pad.triangles[:, :3]]
-    side = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)  # opposite each corner
-    twice = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]
-    slope = np.stack([-side[:, :, 1], side[:, :, 0]], axis=2) / twice[:, None, None]  # of each barycentric coordinate
-    stiffness, mass = _reference()
-    both = np.einsum("m,max,mby,abij->xymij", 0.5 * twice, slope, slope, stiffness, optimize=True)
-    blocks = [both[0, 0], both[0, 1], both[1, 1], 0.5 * twice[:, None, None] * mass]
-    row = np.repeat(pad.triangles, 6, axis=1).ravel()
-    column = np.tile(pad.triangles, (1, 6)).ravel()
-    count = len(pad.nodes)
-    xx, xy, yy, m = (csr_matrix(coo_matrix((block.ravel(), (row, column)), shape=(count, count))) for block in blocks)
-    return xx, xy, yy, m
-
-
-def _reference() -> tuple[Float[np.ndarray, "3 3 6 6"], Float[np.ndarray, "6 6"]]:
-    """Return the means over a triangle of ∂φi/∂λa ∂φj/∂λb and of φi φj, λ its barycentric coordinates.
-
-    The first by the rule of the sides' middles, exact for quadratic products; the second in closed form (Zienkiewicz and
-    Taylor, *The Finite Element Method*, vol. 1: mean of λ1^p λ2^q λ3^r is 2 p! q! r! / (p + q + r + 2)!).
-    """
-    stiffness = np.zeros((3, 3, 6, 6))
-    for at in 0.5 * (1 - np.eye(3)):
-        slope = np.zeros((3, 6))
-        for k in range(3):
-            following = (k + 1) % 3
-            slope[k, k] = 4 * at[k] - 1
-            slope[k, 3 + k], slope[following, 3 + k] = 4 * at[following], 4 * at[k]
-        stiffness += np.einsum("ai,bj->abij", slope, slope) / 3
-    apart, opposite = -1 / 180, -4 / 180
-    mass = np.full((6, 6), 16 / 180)
-    mass[:3, :3] = np.where(np.eye(3, dtype=bool), 6 / 180, apart)
-    mass[3:, 3:] += np.eye(3) * 16 / 180
-    mass[:3, 3:] = np.where(np.roll(np.eye(3, dtype=bool), 1, axis=1), opposite, 0.0)
-    mass[3:, :3] = mass[:3, 3:].T
-    return stiffness, mass
