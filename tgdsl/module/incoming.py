@@ -27,6 +27,11 @@ class Incoming:
         self._warned: set[str] = set()
         self.slot_watch = SlotWatch(plan.inputs)
 
+    @property
+    def held_dt(self) -> object:
+        """Stands for the time that calls are apart, as a tensor: another object after it was written anew."""
+        return self._dt
+
     def tensors(self, state: SceneState, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return the fields of a state that are wanted, by name; those of earlier substeps as `substep/<i>/<field>`.
 

@@ -25,7 +25,8 @@ from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.objects import ObjectChoices, Values
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
-from tgdsl.tensors.env_ids import EnvIds, env_indices
+from tgdsl.runtime.simulators.substep_states import SubstepStates
+from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 
 class Simulation(ABC):
@@ -85,6 +86,11 @@ class Simulation(ABC):
         """
         return Joints(self.model)
 
+    @cached_property
+    def _earlier(self) -> SubstepStates:
+        """The states of the last control step's earlier physics steps."""
+        return SubstepStates(self._touch.inputs)
+
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints, in the order of `qpos`."""
@@ -119,7 +125,15 @@ class Simulation(ABC):
                 GPU as soon as it is known.
         """
         self._begin_step(control)
-        self._advance(self.substeps)
+        if not self._earlier.are_wanted:
+            self._advance(self.substeps)
+            return
+        self._earlier.begin(self.substeps)
+        for i in range(self.substeps):
+            if i:
+                self._earlier.note(self._state(float(self.model.opt.timestep)))
+            self._advance(1)
+        self._earlier.restart(self._faults.restarted)
 
     def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
         """Advance all environments by one control step, and hand out the state after each of its physics steps.
@@ -145,12 +159,14 @@ class Simulation(ABC):
     def state(self) -> SceneState:
         """Return what the module wants on its device, all of one instant; `dt` is that of a control step.
 
+        If it has sensors that are advanced at each physics step, the states after the earlier ones are in `substeps`.
+
         After `step` the instant is the start of the last physics step, where MuJoCo has evaluated poses, velocities and
         contacts: with `substeps=1` that before the step. After `reset`, `set_state` and `forward` it is where the environments
         are.
         """
         self._refuse_if_closed()
-        return self._state(self.control_step)
+        return self._earlier.added_to(self._state(self.control_step))
 
     def reset(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
         """Begin a new episode in some environments (default: all), in the simulator and in the module.
@@ -169,6 +185,7 @@ class Simulation(ABC):
         """
         self._refuse_if_closed()
         self._begin_episodes(env_ids, self._table.rows(values, env_ids))
+        self._earlier.restart(env_mask(env_ids, self.num_envs, self._faults.mask.device))
 
     def set_state(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
         """Put some environments (default: all) into a state; their time and the module's memory go on.

@@ -212,17 +212,25 @@ class WarpSimulation(Simulation):
 
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
-        held = (self._touch.calls.compiled, self._touch._dt, *self._touch.buffers())
+        held = (self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
         if len(held) != len(self._held) or any(now is not then for now, then in zip(held, self._held, strict=True)):
             self._step_and_read.forget()
             self._held = held
 
     def _physics_and_touch(self) -> dict[str, Tensor]:
-        self._worlds.step(self.substeps)
+        if not self._earlier.are_wanted:
+            self._worlds.step(self.substeps)
+        else:
+            self._earlier.begin(self.substeps)
+            for i in range(self.substeps):
+                if i:
+                    self._earlier.note(self._read(float(self.model.opt.timestep)))
+                self._worlds.step(1)
+            self._earlier.restart(self._faults.restarted)
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted)
             self._worlds.evaluate_stale()
-        return self._touch(self._read(self.control_step))
+        return self._touch(self._earlier.added_to(self._read(self.control_step)))
 
     def _state(self, dt: float) -> SceneState:
         self._worlds.refresh()
