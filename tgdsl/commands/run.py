@@ -106,15 +106,16 @@ class Run:
     def _draw(self, touch: TactileModule, sim: Simulator, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
         from tgdsl.view.overview import overview
         from tgdsl.view.picture import picture
+        from tgdsl.view.table import outputs_on_taxels
 
         drawn = []
         with StatusLine() as progress:
-            rows = [output.rows for output in touch.outputs if output.rows in ("taxel", "body")]
+            rows = [output.rows for output in outputs_on_taxels(touch)]
             if "taxel" in rows:
                 progress("drawing the picture")
                 drawn.append(f"picture:  {picture(touch, sim, readings, files['picture'], view=self.view)}")
-            if len(rows) > 1 or "taxel" not in rows:
+            if len(rows) > 1 or (rows and "taxel" not in rows):
                 progress("drawing the overview")
                 path = overview(touch, sim, readings, files["overview"], title=self.document.stem, view=self.view)
                 drawn.append(f"overview: {path}")
-        print("\n".join(drawn))
+        print("\n".join(drawn or ["nothing is drawn: no reading is of taxels or of the bodies that carry them"]))

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Shaped
 
 from tgdsl.module.example import example_state
-from tgdsl.module.memory import Memory
+from tgdsl.module.memory.memory import Memory
 from tgdsl.module.outputs import outputs_of
 from tgdsl.observations.proprioception import PROPRIOCEPTION
 from tgdsl.plan.plan import Plan

@@ -9,12 +9,14 @@ import math
 import warnings
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.errors import StateError
 from tgdsl.module.slot_watch import SlotWatch
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
+from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 
 class Incoming:
@@ -56,6 +58,20 @@ class Incoming:
         if inputs.substeps > 1:
             tensors |= self._substeps(state, device, len(tensors["body_pos"]))
         return tensors
+
+    @staticmethod
+    def chosen(mask: Tensor | None, env_ids: EnvIds | None, num_envs: int, device: torch.device) -> Bool[Tensor, " env"]:
+        """Return a mask of the environments that a caller chose, by a mask or by indices.
+
+        Raises:
+            StateError: If both are given, the mask is none, or there are no such environments.
+        """
+        if mask is not None and env_ids is not None:
+            raise StateError("found both `mask` and `env_ids`, expected one of them")
+        if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
+            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
+            raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
+        return env_mask(mask if mask is not None else env_ids, num_envs, device, StateError, waits=False)
 
     def _substeps(self, state: SceneState, device: torch.device, num_envs: int) -> dict[str, Tensor]:
         """Return the fields of earlier substeps."""

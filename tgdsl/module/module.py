@@ -16,24 +16,23 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
-from tgdsl.errors import StateError, TgdslError, did_you_mean
+from tgdsl.errors import StateError, TgdslError
 from tgdsl.module.calls import Calls, has_cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
-from tgdsl.module.history import reduced
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.module.memory.history import reduced
+from tgdsl.module.memory.memory import KEPT, WINDOW, Memory, chosen_only, store
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
 from tgdsl.module.sensing import Sensing, sense
-from tgdsl.module.slot_watch import SlotWatch
 from tgdsl.module.state import SceneState
 from tgdsl.module.taxels import images_of, row_tables, taxel_table
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
-from tgdsl.sensors.known import quantities_of
+from tgdsl.sensors.known import kinds_by_sensor, quantities_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
 from tgdsl.tensors.env_ids import EnvIds, env_mask
@@ -65,14 +64,8 @@ class TactileModule(HookedModule):
         """
         super().__init__()
         self.plan = plan
-        known = {kind.name: kind for kind in kinds}
-        for sensor in plan.sensors:
-            if sensor.kind not in known:
-                hint = did_you_mean(sensor.kind, known, "kinds")
-                raise TgdslError(f'sensor "{sensor.name}" is of kind "{sensor.kind}", which is not given; {hint}')
-        self._kinds = {sensor.name: known[sensor.kind] for sensor in plan.sensors}
-        own = quantities_of(kinds)
-        self._quantities = tuple(quantity for quantity in own if quantity.name in plan.quantities)
+        self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
+        self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
         self.memory = Memory(plan.sensors)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
@@ -125,11 +118,6 @@ class TactileModule(HookedModule):
     def has_state(self) -> bool:
         """Whether any sensor carries something from one call to the next."""
         return self.memory.is_wanted
-
-    @property
-    def slot_watch(self) -> SlotWatch:
-        """Notices contacts beyond the slots."""
-        return self.incoming.slot_watch
 
     @property
     def num_envs(self) -> int | None:
@@ -205,19 +193,15 @@ class TactileModule(HookedModule):
         tensors = self.incoming.tensors(state, self.dtype, self.device)
         num_envs, held = tensors["body_pos"].shape[0], self.num_envs
         if held not in (None, num_envs):
-            held_by = f"this module holds the state of {held} environments, the scene has {num_envs}"
-            raise StateError(f"{held_by}; `free()` lets go of it")
+            what = f"this module holds the state of {held} environments, the scene has {num_envs}"
+            raise StateError(f"{what}; `free()` lets go of it")
         return tensors, num_envs
 
     def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
         """Return which environments are read, and see to it that there is something to read of the others."""
-        if mask is not None and env_ids is not None:
-            raise StateError("found both `mask` and `env_ids`, expected one of them")
-        if mask is not None and not (isinstance(mask, Tensor) and mask.dtype == torch.bool and mask.shape == (num_envs,)):
-            found = f"{mask.dtype} {tuple(mask.shape)}" if isinstance(mask, Tensor) else type(mask).__name__
-            raise StateError(f"mask: found {found}, expected a boolean tensor ({num_envs},); indices go to `env_ids`")
+        chosen = self.incoming.chosen(mask, env_ids, num_envs, self.device)
         self.memory.keep_last(num_envs, {r.name for sensor in self.plan.sensors for r in sensor.windows if r.steps})
-        return env_mask(mask if mask is not None else env_ids, num_envs, self.device, StateError, waits=False)
+        return chosen
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""

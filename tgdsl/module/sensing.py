@@ -11,10 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tgdsl.module.clock import Clock
 from tgdsl.module.gathering import Tree, gather, gathered_of, scene_of
-from tgdsl.module.history import pushed, reduced
-from tgdsl.module.memory import WINDOW
+from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory.history import pushed, reduced
+from tgdsl.module.memory.memory import WINDOW
 from tgdsl.module.reading import block, joined_signal, read
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor

@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.console.tables import TaxelTable
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.layout.layout import Layout
-from tgdsl.module.history import last_step
+from tgdsl.module.memory.history import last_step
 from tgdsl.plan.plan import Plan
 
 

@@ -139,7 +139,7 @@ class Recorder:
     The file holds `time` (step,) [s], `ctrl` (step, …, actuator), each reading by its name (step, env, taxel, channel) as
     float32, and its channels' names and units under `<name>:channels` and `<name>:units`. Where its taxels are is under
     `<name>:link`, `<name>:body`, `<name>:pos` and `<name>:normal` (frame of the body [m]) and `<name>:area` [m²]; of readings
-    of bodies there is `<name>:body` alone.
+    of bodies there is `<name>:body` alone, of those with rows of their own the columns of `touch.rows[<name>]`.
     """
 
     def __init__(self, touch: TactileModule, num_steps: int, num_envs: int):
@@ -148,7 +148,7 @@ class Recorder:
         Raises:
             SimulationError: If this computer has too little memory.
         """
-        self._outputs, self._taxels = touch.outputs, touch.taxels
+        self._outputs, self._taxels, self._rows = touch.outputs, touch.taxels, touch.rows
         size = 4 * num_steps * num_envs * sum(math.prod(output.shape) for output in self._outputs)
         refuse_beyond_memory(f"readings of {num_envs} environments at {num_steps} steps", size)
         self._readings = {
@@ -172,5 +172,8 @@ class Recorder:
                 arrays[f"{output.name}:body"] = np.array(output.bodies)
             elif output.rows == "taxel":
                 arrays |= {f"{output.name}:{column}": self._taxels[output.sensor][column] for column in PLACES}
+            elif output.name in self._rows:
+                own = self._rows[output.name]
+                arrays |= {f"{output.name}:{column}": own[column] for column in own.dtype.names or ()}
         with atomic_open(path) as file:
             np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

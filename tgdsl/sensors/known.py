@@ -8,9 +8,9 @@ A package brings a kind by an entry point, in its pyproject.toml:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from tgdsl.errors import LowerError, TgdslError
+from tgdsl.errors import LowerError, TgdslError, did_you_mean
 from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import known_quantities
@@ -33,6 +33,24 @@ def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
         TgdslError: If two kinds have one name, or a kind that is given is none.
     """
     return known(GROUP, "sensor kind", "kinds", KINDS, given, _wrong)
+
+
+def kinds_by_sensor(kinds: Sequence[Kind], wanted: Mapping[str, str]) -> dict[str, Kind]:
+    """Return the kind of each sensor.
+
+    Args:
+        kinds: The kinds that there are.
+        wanted: Names of the sensors' kinds, by those of the sensors.
+
+    Raises:
+        TgdslError: If there is no such kind.
+    """
+    known = {kind.name: kind for kind in kinds}
+    for sensor, name in wanted.items():
+        if name not in known:
+            hint = did_you_mean(name, known, "kinds")
+            raise TgdslError(f'sensor "{sensor}" is of kind "{name}", which is not given; {hint}')
+    return {sensor: known[name] for sensor, name in wanted.items()}
 
 
 def quantities_of(kinds: Sequence[Kind]) -> tuple[Quantity, ...]:

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.module.history import last_step
-from tgdsl.module.memory import Memory
+from tgdsl.module.memory.history import last_step
+from tgdsl.module.memory.memory import Memory
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator

@@ -21,6 +21,7 @@ from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.picture import chosen_output
 from tgdsl.view.scene import RenderedScene, draw_markers, render_scene
 from tgdsl.view.style import DPI, FAINT, INK, SUPERSAMPLING
+from tgdsl.view.table import outputs_on_taxels
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
@@ -75,7 +76,7 @@ def drawing(
     view: str | None = None,
 ) -> Figure:
     """Return what `overview` writes; its axes are the panels, one for each reading of taxels or bodies."""
-    outputs = [output for output in touch.outputs if output.name in readings and output.rows in ("taxel", "body")]
+    outputs = [output for output in outputs_on_taxels(touch) if output.name in readings]
     if not outputs:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:

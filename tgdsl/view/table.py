@@ -8,9 +8,15 @@ import numpy as np
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
-from tgdsl.module.history import last_step
+from tgdsl.module.memory.history import last_step
 from tgdsl.module.module import TactileModule
 from tgdsl.module.outputs import Output
+
+
+def outputs_on_taxels(touch: TactileModule) -> list[Output]:
+    """Return the readings of taxels, and of the bodies that carry them: those that have a place on the robot."""
+    sensors = {sensor.sensor for sensor in touch.plan.sensors if len(sensor.taxels)}
+    return [output for output in touch.outputs if output.rows in ("taxel", "body") and output.sensor in sensors]
 
 
 def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) -> list[str]:
@@ -18,13 +24,30 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
 
     Each reading has one column: force as the magnitude of the link's summed force, depth as its largest, contact as the number
     of taxels in contact; any other vector, and any other channel, as the largest magnitude. Readings of bodies show the
-    link's body; those of joints and actuators are of no link, and are left out.
+    link's body. Readings with rows of their own, such as one per inertial sensor, follow with a line for each row; those of
+    joints and actuators are left out.
     """
     taxels = touch.taxels
-    outputs = [output for output in touch.outputs if output.rows in ("taxel", "body")]
+    outputs = outputs_on_taxels(touch)
     links = list(dict.fromkeys(link for sensor in taxels.values() for link in sensor["link"]))
     header = ["link"] + [f"{output.name} [{_summary_unit(output)}]" for output in outputs]
     rows = [[link] + [_cell(taxels[output.sensor], output, readings, link, env) for output in outputs] for link in links]
+    lines = _aligned(header, rows) if outputs else []
+    for output in (own for own in touch.outputs if own not in outputs and own.rows not in ("joint", "actuator")):
+        lines += ([""] if lines else []) + _own_rows(touch.rows[output.name], output, readings, env)
+    return lines
+
+
+def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
+    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample."""
+    first, *_ = table.dtype.names or ("row",)
+    values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
+    header = [output.rows] + [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]
+    rows = [[str(row[first]), *(f"{number:.3g}" for number in own)] for row, own in zip(table, values, strict=True)]
+    return [output.name, *_aligned(header, rows)]
+
+
+def _aligned(header: list[str], rows: list[list[str]]) -> list[str]:
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = [
         "  ".join(text.ljust(w) if i == 0 else text.rjust(w) for i, (text, w) in enumerate(zip(row, widths, strict=True)))

@@ -6,6 +6,7 @@ Shapes: `env` environments.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -46,7 +47,7 @@ class SubstepStates:
     def note(self, state: SceneState) -> None:
         """Keep a copy of the state after a physics step."""
         values = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-        copies = {name: value.clone() if isinstance(value, Tensor) else value for name, value in values.items()}
+        copies: dict[str, Any] = {name: v.clone() if isinstance(v, Tensor) else v for name, v in values.items()}
         self._earlier.append(SceneState(**copies))
 
     def restart(self, chosen: Bool[Tensor, " env"]) -> None:
@@ -67,7 +68,7 @@ class SubstepStates:
 
 def _mixed(chosen: Bool[Tensor, " env"], now: SceneState, then: SceneState) -> SceneState:
     """Return the state of now in some environments, and that of then in the others."""
-    mixed = {}
+    mixed: dict[str, Any] = {}
     for field in dataclasses.fields(SceneState):
         new, old = getattr(now, field.name), getattr(then, field.name)
         if isinstance(new, Tensor):

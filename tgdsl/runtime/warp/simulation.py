@@ -265,7 +265,7 @@ class WarpSimulation(Simulation):
         self._worlds.note_step(is_evaluated)
         if self._stream.is_capturing:
             return
-        self._touch.slot_watch.warn()
+        self._touch.incoming.slot_watch.warn()
         to_raise, totals = self._worlds.faults.polled()
         if to_raise:
             self.check()

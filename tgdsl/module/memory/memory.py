@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.errors import StateError, listed
-from tgdsl.module.clock import Clock
+from tgdsl.module.memory.clock import Clock
 from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, num_writes
