@@ -22,6 +22,7 @@ from tgdsl.fields.models import PositiveLength, Usual
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities import Gathered, Planning, Quantity, References, ReferenceScene, Request, Scene, Use
+from tgdsl.quantities.base import pairs_for
 from tgdsl.quantities.pairs import Pair, at_probes
 from tgdsl.quantities.pairs import gathered as of_pairs
 from tgdsl.sensors import Kind
@@ -81,7 +82,7 @@ def gather(part: FieldPart[Tensor], scene: Scene) -> tuple[Vec, ...]:
 
 
 def _field(use: FieldUse[Tensor], scene: Scene) -> Vec:
-    pairs, pos = scene.pairs_for(is_gated=False), planes.vec(use.pos.unbind())
+    pairs, pos = pairs_for(scene, is_gated=False), planes.vec(use.pos.unbind())
     zero = pos[0].new_zeros((len(pairs.offset[0]), len(pos[0])))
     total = (zero, zero, zero)
     for i, pair, is_met in zip(use.objects, use.pair, use.is_met, strict=True):

@@ -173,7 +173,7 @@ _KNOBS: dict[str, tuple[tuple[str, str, str], ...]] = {
     "gain": (("gain_low", "from ", ""), ("gain_high", "to ", "")),
     "hysteresis": (("hysteresis_strength", "strength ", ""), ("hysteresis_time", "time constant ", " s")),
     "crosstalk": (("crosstalk_strength", "strength ", ""),),
-    "delay": (("delay", "", " s"), ("jitter", "jitter ", " s")),
+    "delay": (("read_delay", "", " s"), ("jitter", "jitter ", " s")),
     "bias": (("bias", "", _OF_READING),),
     "white_noise": (("white_noise", "", _OF_READING),),
     "drift": (("drift", "", _OF_READING),),

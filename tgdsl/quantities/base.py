@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -168,14 +168,16 @@ class Scene(NamedTuple):
     radius_shifts: Mapping[str, Tensor]
     dtype: torch.dtype
 
-    def pairs_for(self, is_gated: bool) -> Pairs:
-        """Return the pairs, with their gate or without."""
-        assert self.pairs is not None
-        return self.pairs if is_gated else self.pairs._replace(gate=None)
 
-    def variant(self, target: PairedObject) -> Int[Tensor, " env"] | None:
-        """Return which variant of an object each environment has; None if all are alike."""
-        return self.tensors["variant"][:, target.varied].long() if target.num_variants > 1 else None
+def pairs_for(scene: Scene, is_gated: bool) -> Pairs:
+    """Return a scene's pairs, with their gate or without."""
+    assert scene.pairs is not None
+    return scene.pairs if is_gated else scene.pairs._replace(gate=None)
+
+
+def variant_of(scene: Scene, target: PairedObject) -> Int[Tensor, " env"] | None:
+    """Return which variant of an object each environment has; None if all are alike."""
+    return scene.tensors["variant"][:, target.varied].long() if target.num_variants > 1 else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,21 +214,13 @@ class Quantity:
     account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = lambda part, objects: {}
 
 
-class Gathered:
+class Gathered(dict[type[Request], Any]):
     """What a sensor asked for, by the type of the request: `gathered[ContactDepth].depth`."""
 
-    def __init__(self, values: Mapping[type[Request], Any]):
-        """Hold values by the types of their requests."""
-        self._values = dict(values)
+    if TYPE_CHECKING:
 
-    def __getitem__(self, request: type[Request[Value]]) -> Value:
-        """Return what came of the sensor's request of a type."""
-        return self._values[request]
-
-    def __contains__(self, request: type[Request]) -> bool:
-        """Return whether the sensor made such a request."""
-        return request in self._values
+        def __getitem__(self, request: type[Request[Value]]) -> Value: ...
 
     def replaced(self, request: type[Request[Value]], value: Value) -> Gathered:
         """Return the same with another value for a request."""
-        return Gathered({**self._values, request: value})
+        return Gathered({**self, request: value})

@@ -27,6 +27,7 @@ from tgdsl.plan.plan import Plan
 from tgdsl.quantities.contacts import SLOT_FIELDS
 from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
+from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.torch_internals import num_compiled_graphs
 from tgdsl.testing.reference import ReferenceModule, assert_agrees
 from tgdsl.testing.states import moved, only
@@ -224,10 +225,12 @@ class KindConformance:
                 if (value := getattr(state, name)) is not None:
                     setattr(state, name, torch.zeros_like(value))
             if state.contact_found is None:
-                assert state.body_pos is not None and state.body_quat is not None
-                state.body_quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(state.body_quat)
-                state.body_pos = torch.zeros_like(state.body_pos)
-                state.body_pos[:, [module.inputs.bodies.index(link) for link in ("palm", "tip")], 2] = 5.0
+                for part in (state, *state.substeps):
+                    assert part.body_pos is not None and part.body_quat is not None
+                    part.body_quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand_as(part.body_quat)
+                    part.body_pos = torch.zeros_like(part.body_pos)
+                    part.body_pos[:, [module.inputs.bodies.index(link) for link in ("palm", "tip")], 2] = 5.0
+                state.substeps = (state,) * len(state.substeps)
             module.reset()
             assert (module(state)["s"] == rest).all()
 
@@ -306,7 +309,7 @@ class KindConformance:
         """Plan to file to plan is the identity, and the same plan is the same bytes."""
         module, _ = self.build(self.document(scene), torch.float32)
         save_plan(module.plan, tmp_path / "a.safetensors")
-        again = load_plan(tmp_path / "a.safetensors")
+        again = load_plan(tmp_path / "a.safetensors", quantities_of(self._known()))
         save_plan(again, tmp_path / "b.safetensors")
         assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
         assert again.to_json() == module.plan.to_json()

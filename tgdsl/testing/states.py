@@ -27,11 +27,11 @@ def moved(state: SceneState, offset: np.ndarray, turn: Rotation) -> SceneState:
     quats = Rotation.from_quat(values["body_quat"].reshape(-1, 4).numpy(), scalar_first=True)
     turned = torch.from_numpy((turn * quats).as_quat(scalar_first=True))
     values["body_quat"] = turned.reshape(values["body_quat"].shape)
-    return SceneState(**values)
+    return SceneState(**values, substeps=tuple(moved(part, offset, turn) for part in state.substeps))
 
 
 def only(state: SceneState, envs: Any) -> SceneState:
     """Return some of the environments of a state."""
     values: dict[str, Any] = {name: getattr(state, name) for name in (*SHAPES, "dt")}
     chosen: dict[str, Any] = {name: value[envs] if isinstance(value, Tensor) else value for name, value in values.items()}
-    return SceneState(**chosen)
+    return SceneState(**chosen, substeps=tuple(only(part, envs) for part in state.substeps))

@@ -243,7 +243,7 @@ def test_profiles_upon_profiles(tmp_path):
     _, found = planned(tmp_path, "contact_depth", {"like": "old", "hysteresis": None, "read_delay": "5 ms"}, profiles)
     assert rows(found["bias"]) == [1e-3, 1e-3, 2e-3]
     assert found["gain_low"].item() == 0.4 and found["gain_high"].item() == 1
-    assert found["delay"].item() == 5e-3 and "hysteresis_strength" not in found
+    assert found["read_delay"].item() == 5e-3 and "hysteresis_strength" not in found
     rest = {name: NOISY["contact_depth", "depth"][name] for name in ("white_noise", "quantization", "radius_noise", *DEAD)}
     assert {name: found[name].item() for name in rest} == rest
 

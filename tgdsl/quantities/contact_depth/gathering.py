@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.base import Scene
+from tgdsl.quantities.base import Scene, pairs_for
 from tgdsl.quantities.contact_depth.part import ContactDepthPart, DepthUse
 from tgdsl.quantities.contact_depth.query import ObjectDistance, Probes, Target, measure, penetration
 from tgdsl.quantities.contact_depth.request import Penetration
@@ -29,9 +29,9 @@ def gather(part: ContactDepthPart[Tensor], scene: Scene) -> tuple[Penetration, .
         answer = _searched(use, probes, own, scene)
         if answer is None:
             if use.query not in measured:
-                measured[use.query] = measure(scene.pairs_for(True), probes, own)
+                measured[use.query] = measure(pairs_for(scene, True), probes, own)
             near = [measured[use.query][o] for o in use.objects]
-            answer = penetration(scene.pairs_for(use.is_gated), probes, near, _reach(use, scene), use.wants)
+            answer = penetration(pairs_for(scene, use.is_gated), probes, near, _reach(use, scene), use.wants)
         found.append(answer)
     return tuple(found)
 
@@ -42,7 +42,7 @@ def _searched(use: DepthUse[Tensor], probes: Probes, targets: list[Target], scen
         return None
     tables = {name: value for name in ("pair", "spheres", "geoms") if (value := getattr(use.search, name)) is not None}
     own = [targets[o] for o in use.objects]
-    return search(scene.pairs_for(use.is_gated), probes, own, tables, _reach(use, scene), use.wants)
+    return search(pairs_for(scene, use.is_gated), probes, own, tables, _reach(use, scene), use.wants)
 
 
 def _reach(use: DepthUse[Tensor], scene: Scene) -> Tensor:

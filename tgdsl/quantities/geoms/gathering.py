@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import split
-from tgdsl.quantities.base import Scene
+from tgdsl.quantities.base import Scene, variant_of
 from tgdsl.quantities.geoms.distance import Geoms, RaycastSurface
 from tgdsl.quantities.geoms.tables import GeomTable, GridTable, TriangleTable
 from tgdsl.quantities.pairs import PairedObject
@@ -15,7 +15,7 @@ from tgdsl.quantities.pairs import PairedObject
 
 def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -> Geoms:
     """Return an object's geoms as each environment has them: its variant, its size."""
-    variant = scene.variant(target)
+    variant = variant_of(scene, target)
     size, is_absent = _chosen(table.size, variant), None
     if variant is not None and table.is_absent is not None:
         is_absent = _chosen(table.is_absent, variant) > 0

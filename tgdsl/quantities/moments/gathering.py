@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tgdsl.geometry.grid import Count
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.base import Scene
+from tgdsl.quantities.base import Scene, pairs_for, variant_of
 from tgdsl.quantities.moments.moments import MomentField, PointCloud
 from tgdsl.quantities.moments.nearby import MomentSource, Plane, surface_moments
 from tgdsl.quantities.moments.part import FieldTable, MomentsPart, MomentTable, MomentUse
@@ -19,7 +19,7 @@ def gather(part: MomentsPart[Tensor], scene: Scene) -> tuple[SurfaceMoments, ...
     found = []
     for use in part.uses:
         sources = [_source(part.tables[i], use, k, scene) for k, i in enumerate(use.tables)]
-        pairs = scene.pairs_for(is_gated=False)
+        pairs = pairs_for(scene, is_gated=False)
         found.append(surface_moments(pairs if use.motion else pairs._replace(motion=None), vec(use.pos.unbind()), sources))
     return tuple(found)
 
@@ -28,7 +28,7 @@ def _source(table: MomentTable[Tensor], use: MomentUse[Tensor], k: int, scene: S
     """Return an object of a use, and what its moments are found from."""
     target = scene.objects[table.object]
     shift = scene.radius_shifts[use.radius_noise] if use.radius_noise else None
-    variant, reach = scene.variant(target), use.reach[k]
+    variant, reach = variant_of(scene, target), use.reach[k]
     return MomentSource(
         target=target,
         pair=use.pair[k],

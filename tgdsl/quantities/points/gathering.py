@@ -6,7 +6,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.base import Scene
+from tgdsl.quantities.base import Scene, pairs_for, variant_of
 from tgdsl.quantities.geoms.gathering import link_geoms
 from tgdsl.quantities.pairs import Pairs
 from tgdsl.quantities.points.part import MetObject, PointsPart
@@ -17,7 +17,7 @@ def gather(part: PointsPart[Tensor], scene: Scene) -> tuple[dict[str, ObjectPoin
     """Return what each use asks for."""
     found = []
     for use in part.uses:
-        pairs = _with_lost(scene.pairs_for(use.is_gated))
+        pairs = _with_lost(pairs_for(scene, use.is_gated))
         sources = [_source(part, met, scene) for met in use.objects]
         found.append({source.object: ObjectPoints(pairs, source) for source in sources})
     return tuple(found)
@@ -27,7 +27,7 @@ def _source(part: PointsPart[Tensor], met: MetObject[Tensor], scene: Scene) -> P
     """Return the points of an object, and the links that they may meet."""
     cloud = part.clouds[met.cloud]
     target = scene.objects[cloud.object]
-    points, area, variant = cloud.points, cloud.area, scene.variant(target)
+    points, area, variant = cloud.points, cloud.area, variant_of(scene, target)
     if variant is not None:
         points, area = points[:, variant], area[variant]
     assert part.surfaces is not None

@@ -50,7 +50,7 @@ def _product(signal: Signal, kernels: Sequence[Tensor]) -> Signal:
 def delayed(signal: Signal, values: Mapping[str, Tensor], ring: Tensor, now: Now) -> Signal:
     """Return the signal as it was, linear between calls; before the first call it counts as constant."""
     assert now.ages is not None
-    late = values["delay"][:, 0]
+    late = values["read_delay"][:, 0]
     if "jitter" in values:
         index = torch.zeros_like(now.streams[random.JITTER].first[:1, 0])
         late = late + values["jitter"][:, 0] * random.uniform(random.words(now.streams[random.JITTER], index), late.dtype)

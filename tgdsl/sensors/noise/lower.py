@@ -72,7 +72,7 @@ def lower_noise(
         if constants["crosstalk_strength"].ndim == 2 and "crosstalk_mixture" not in constants:
             del constants["crosstalk_strength"]  # it is part of the kernels
     memory = tuple(name for term, names in _REMEMBERS.items() if term in terms for name in names)
-    past = float((values["delay"][1] + values["jitter"][1]).max())
+    past = float((values["read_delay"][1] + values["jitter"][1]).max())
     return LoweredNoise(terms, constants, memory, past, float(values["radius_noise"].max()), _streams(terms, constants))
 
 
@@ -97,7 +97,7 @@ _READS = {
     "gain": ("gain_low", "gain_high"),
     "hysteresis": ("hysteresis_strength", "hysteresis_time"),
     "crosstalk": ("crosstalk_strength",),
-    "delay": ("delay", "jitter"),
+    "delay": ("read_delay", "jitter"),
     "bias": ("bias",),
     "white_noise": ("white_noise",),
     "drift": ("drift",),
@@ -116,7 +116,7 @@ def _stages(values: Mapping[str, np.ndarray]) -> dict[str, bool]:
         "gain": bool((values["gain_low"] != 1).any() or (values["gain_high"] != 1).any()),
         "hysteresis": on["hysteresis_strength"],
         "crosstalk": on["crosstalk_strength"],
-        "delay": on["delay"] or on["jitter"],
+        "delay": on["read_delay"] or on["jitter"],
         "bias": on["bias"],
         "white_noise": on["white_noise"],
         "drift": on["drift"],
@@ -138,7 +138,7 @@ def _parameters(knobs: Knobs, channels: Sequence[str]) -> dict[str, Float[np.nda
         "hysteresis_time": hysteresis.time_constant,
         "crosstalk_strength": crosstalk.strength,
         "crosstalk_sigma": crosstalk.sigma,
-        "delay": knobs.read_delay,
+        "read_delay": knobs.read_delay,
         "jitter": knobs.jitter,
         "dead_probability": knobs.dead_probability,
         "release_threshold": knobs.release_threshold or (-1.0, -1.0),

@@ -149,7 +149,7 @@ class ReferenceNoise:
 
     def _delayed(self) -> Signal:
         """Return the signal as it was: between two calls it is linear, before the first one it is constant."""
-        late = self._knob("delay") + self._uniform(random.JITTER)[0, 0] * self._knob("jitter")
+        late = self._knob("read_delay") + self._uniform(random.JITTER)[0, 0] * self._knob("jitter")
         past, found = np.array(self._signals), np.empty(self._shape)
         for place in np.ndindex(self._shape):
             found[place] = np.interp(self._times[-1] - late[place], self._times, past[:, *place])
@@ -192,7 +192,7 @@ def _range(knobs: Knobs, name: str, channel: str) -> Range:
             field = "time_constant" if part == "time" else part
             found = getattr(own, field) if own else ZERO if part == "strength" else (1.0, 1.0)
         case _:
-            found = knobs.read_delay if name == "delay" else getattr(knobs, name)
+            found = getattr(knobs, name)
     if isinstance(found, tuple):
         return found
     return found.get(quantity(channel), found.get(ALL, ZERO))

@@ -51,7 +51,7 @@ PARAMETERS = (
     "hysteresis_time",
     "crosstalk_strength",
     "crosstalk_mixture",
-    "delay",
+    "read_delay",
     "jitter",
     "bias",
     "white_noise",

@@ -1,0 +1,206 @@
+"""The example package: a kind with rows of its own, memory and no objects, and a quantity, both from outside tgdsl."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import tgdsl
+from tgdsl.errors import ArtifactError, SimulationError, SpecError, StateError
+from tgdsl.files.plugins import installed
+from tgdsl.testing import KindConformance
+
+PLUGINS = Path(__file__).parents[2] / "examples" / "plugins"
+sys.path.append(str(PLUGINS))  # as its own package has it
+
+from accelerometer import ACCELEROMETER  # noqa: E402
+from dipoles import HALL, MU  # noqa: E402
+
+SCENE = """<mujoco><option timestep=".002" gravity="0 0 -9.81"/><worldbody>
+  <body name="pad" pos="0 0 1" quat=".6 0 .8 0"><geom type="box" size=".03 .03 .01"/></body>
+  <body name="item" pos="0 0 3"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+</worldbody></mujoco>"""
+GRAVITY = 9.81
+
+
+class TestAccelerometer(KindConformance):
+    kind = ACCELEROMETER
+    parameters = {"cutoff": 20.0, "gravity": [0, 0, 0]}  # with gravity a turned scene reads otherwise, as it must
+    gates = ()
+
+
+class TestAccelerometerBlock(KindConformance):
+    kind = ACCELEROMETER
+    parameters = {"cutoff": 20.0, "gravity": [0, 0, 0], "substeps": 3}
+    gates = ()
+
+
+class TestHall(KindConformance):
+    kind = HALL
+    parameters = {"moment": [0.1, -0.2, 0.4], "range": 0.2}
+    gates = ()
+
+
+@pytest.fixture
+def build(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+
+    def compiled(**sensors):
+        points = [{"pos": [0.01, 0.002, 0.01], "normal": [0, 0, 1], "radius": 0.004}]
+        layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}
+        document = {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": layout},
+            "objects": {"item": {"body": "item"}},
+            "sensors": sensors,
+        }
+        return tgdsl.compile(document, kinds=[ACCELEROMETER, HALL], dtype="float64")
+
+    return compiled
+
+
+def test_at_rest_it_reads_minus_gravity_in_the_link(build):
+    touch = build(imu={"kind": "accelerometer", "links": "pad"})
+    sim = tgdsl.simulate(touch, num_envs=2)
+    sim.step()
+    expected = Rotation.from_quat([0.6, 0, 0.8, 0], scalar_first=True).inv().apply([0, 0, GRAVITY])
+    np.testing.assert_allclose(touch(sim.state())["imu"], np.broadcast_to(expected, (2, 1, 3)), rtol=1e-12, atol=1e-12)
+
+
+def test_in_free_fall_it_reads_nothing(build):
+    touch = build(imu={"kind": "accelerometer", "links": "item", "cutoff": 1e4})
+    sim = tgdsl.simulate(touch, num_envs=1)
+    for _ in range(5):
+        sim.step()
+        read = touch(sim.state())["imu"]
+    np.testing.assert_allclose(read, np.zeros((1, 1, 3)), atol=1e-9)
+
+
+def test_the_low_pass_answers_a_step_exponentially(build):
+    """A velocity that grows evenly from the second call on: y = a (1 − e^(−2π f_c t)) beside −g, at any step."""
+    touch = build(imu={"kind": "accelerometer", "links": "pad", "cutoff": 5.0})
+    state = touch.example_state(1)
+    state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
+    for k in range(8):
+        state.dt, state.body_linvel = 0.01, torch.full_like(state.body_linvel, 0.02 * k)
+        read = touch(state)["imu"][0, 0].numpy()
+        expected = 2.0 * (1 - np.exp(-2 * np.pi * 5.0 * 0.01 * k))
+        np.testing.assert_allclose(read, [expected, expected, GRAVITY + expected], rtol=1e-12, atol=1e-12)
+
+
+def test_a_block_holds_what_single_readings_at_each_physics_step_are(build):
+    spec = {"kind": "accelerometer", "links": ["item", "pad"], "cutoff": 40.0}
+    block, single = build(imu={**spec, "substeps": 4}), build(imu=spec)
+    both = tgdsl.simulate(block, num_envs=2, substeps=4), tgdsl.simulate(single, num_envs=2, substeps=4)
+    start = block(both[0].state())["imu"]
+    torch.testing.assert_close(start, single(both[1].state())["imu"][:, None].expand(-1, 4, -1, -1), rtol=0, atol=0)
+    for _ in range(3):
+        both[0].step()
+        each = [single(state)["imu"] for state in both[1].substates()]
+        torch.testing.assert_close(block(both[0].state())["imu"], torch.stack(each, dim=1), rtol=0, atol=1e-12)
+    assert block.outputs[0].shape == (4, 2, 3) and block.outputs[0].rows == "imu"
+    assert block.rows["imu"]["link"].tolist() == ["pad", "item"]  # in the robot's order
+
+
+def test_after_a_reset_a_block_holds_nothing_of_the_episode_before(build):
+    touch = build(imu={"kind": "accelerometer", "links": "item", "substeps": 3})
+    sim = tgdsl.simulate(touch, num_envs=3, substeps=3)
+    for _ in range(4):
+        sim.step()
+        before = touch(sim.state())["imu"]
+    sim.reset([1])
+    state = sim.state()
+    now = touch(state, env_ids=[1])["imu"]
+    torch.testing.assert_close(now[[0, 2]], before[[0, 2]], rtol=0, atol=0)
+    assert all(torch.equal(part.body_linvel[1], state.body_linvel[1]) for part in state.substeps)
+    np.testing.assert_allclose(now[1], np.broadcast_to([0, 0, GRAVITY], (3, 1, 3)), atol=1e-12)
+
+
+def test_a_block_wants_the_states_of_all_its_physics_steps(build):
+    touch = build(imu={"kind": "accelerometer", "links": "item", "substeps": 3})
+    state = touch.example_state(2)
+    with pytest.raises(StateError, match="substeps holds 1 states, expected 2"):
+        touch(dataclasses.replace(state, substeps=state.substeps[:1]))
+    sim = tgdsl.simulate(touch, num_envs=1)
+    with pytest.raises(SimulationError, match="advanced at 3 physics steps per call, and this simulation makes 1"):
+        sim.step()
+
+
+def test_a_block_has_no_history(build):
+    with pytest.raises(SpecError, match="block of samples"):
+        build(imu={"kind": "accelerometer", "links": "item", "substeps": 3, "history": 2})
+
+
+def test_a_peek_and_a_loaded_state_go_on_alike(build, tmp_path):
+    touch = build(imu={"kind": "accelerometer", "links": "item", "cutoff": 30.0})
+    first, second = (touch.example_state(2, seed=seed) for seed in (0, 1))
+    touch(first)
+    seen = touch.peek(second)["imu"]
+    tgdsl.save(touch, tmp_path / "a.safetensors")
+    again = tgdsl.load(tmp_path / "a.safetensors", kinds=[ACCELEROMETER], dtype="float64")
+    again.load_state_dict(touch.state_dict())
+    for found in (touch(second)["imu"], again(second)["imu"]):
+        torch.testing.assert_close(found, seen, rtol=0, atol=0)
+
+
+def test_a_dipole_on_its_axis_and_beside_it(build):
+    """B = μ₀/4π 2m/r³ along the axis, −μ₀/4π m/r³ across it, and nothing beyond the range."""
+    touch = build(hall={"kind": "hall", "links": "pad", "feels": ["item"], "moment": [0, 0, 0.3], "range": 1.0})
+    state = touch.example_state(3)
+    state.body_quat[:] = torch.tensor([1.0, 0, 0, 0])
+    taxel, item = torch.tensor([0.01, 0.002, 0.01], dtype=torch.float64), touch.inputs.bodies.index("item")
+    state.body_pos[:] = 0.0
+    state.body_pos[:, item] = taxel - torch.tensor([[0, 0, 0.05], [0.05, 0, 0], [0, 0, 1.1]], dtype=torch.float64)
+    expected = MU * 0.3 / 0.05**3 * np.array([[0, 0, 2], [0, 0, -1], [0, 0, 0]])
+    np.testing.assert_allclose(touch(state)["hall"][:, 0], expected, rtol=1e-12, atol=1e-18)
+
+
+def test_an_artefact_without_its_quantity_says_so(build, tmp_path):
+    tgdsl.save(build(hall={"kind": "hall", "links": "pad", "feels": ["item"]}), tmp_path / "a.safetensors")
+    with pytest.raises(ArtifactError, match='asks for the quantity "magnetic_field", which is not known'):
+        tgdsl.load(tmp_path / "a.safetensors")
+
+
+def test_installed_they_are_there_in_documents_commands_and_the_schema(tmp_path, monkeypatch, here):
+    info = tmp_path / "tgdsl_plugins_example-0.1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: tgdsl-plugins-example\nVersion: 0.1.0\n")
+    points = (PLUGINS / "pyproject.toml").read_text().split("[project.entry-points.")[1:]
+    text = "\n".join(part.split("\n\n")[0].replace('"', "") for part in points).replace("tgdsl.kinds]", "[tgdsl.kinds]")
+    (info / "entry_points.txt").write_text(text.replace("tgdsl.quantities]", "[tgdsl.quantities]") + "\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    installed.cache_clear()
+    try:
+        code, out, errors = here(tmp_path, "compile", str(PLUGINS / "plugins.yaml"), "-o", "a.safetensors")
+        assert (code, errors) == (0, "") and "imu (accelerometer, 5)" in out
+        code, out, errors = here(tmp_path, "explain", "a.safetensors")
+        assert code == 0 and "poses and velocities of its links" in out
+        assert here(tmp_path, "schema")[0] == 0
+        known = json.loads((tmp_path / "tgdsl.schema.json").read_text())["$defs"]
+        assert {"AccelerometerSpec", "HallSpec"} <= known.keys()
+    finally:
+        installed.cache_clear()
+
+
+@pytest.mark.slow
+def test_both_simulators_read_the_same(build):
+    from tgdsl.runtime.warp import WarpSimulation
+
+    sensors = {
+        "imu": {"kind": "accelerometer", "links": "item", "substeps": 3},
+        "hall": {"kind": "hall", "links": "pad", "feels": ["item"], "range": 5.0},
+    }
+    batch, warp = build(**sensors), build(**sensors)
+    sims = tgdsl.simulate(batch, num_envs=2, substeps=3), WarpSimulation(warp, 2, substeps=3, device="cpu")
+    for _ in range(3):
+        for sim in sims:
+            sim.step()
+        found, expected = warp(sims[1].state()), batch(sims[0].state())
+        for name in expected:
+            scale = float(expected[name].abs().max())
+            torch.testing.assert_close(found[name], expected[name], rtol=0, atol=2e-3 * scale)
