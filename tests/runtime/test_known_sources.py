@@ -11,7 +11,8 @@ from warp_cases import SCENE, module
 
 import tgdsl
 from tgdsl.errors import ObservationError, SimulationError, TgdslError
-from tgdsl.runtime.known import SOURCES, _installed, known_sources
+from tgdsl.files.plugins import installed
+from tgdsl.runtime.known import SOURCES, known_sources
 from tgdsl.runtime.source import Simulator, Source
 
 MODULE = '''
@@ -82,13 +83,13 @@ def install(tmp_path, monkeypatch):
         (info / "entry_points.txt").write_text("[tgdsl.sources]\n" + "\n".join(lines) + "\n")
         (site / f"{package}.py").write_text(MODULE)
         monkeypatch.syspath_prepend(site)
-        _installed.cache_clear()
+        installed.cache_clear()
 
-    _installed.cache_clear()
+    installed.cache_clear()
     yield add
     for name in ("grippy", "handy"):
         sys.modules.pop(name, None)
-    _installed.cache_clear()
+    installed.cache_clear()
 
 
 def observed(folder):
