@@ -34,7 +34,7 @@ from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.sensors.elastomer import blocks, operators
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance_reference
 from tgdsl.sensors.elastomer.kernels import LinkTaxels
-from tgdsl.sensors.elastomer.operators import Wish
+from tgdsl.sensors.elastomer.operators import OperatorForm
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -88,7 +88,7 @@ def constants_of(taxels: LinkTaxels, surface: Surface, fields: dict[str, Any]) -
     found = {}
     for name, response in blocks.responses(spec, taxels, pad).items():
         is_alike = not (name == "spread" and pad is not None)
-        folded = operators.fold(response, blocks.PLANES[name], taxels, Wish(spec.operator, spec.tolerance), is_alike)
+        folded = operators.fold(response, blocks.PLANES[name], taxels, OperatorForm(spec.operator, spec.tolerance), is_alike)
         found |= {f"{name}/0/{key}": value for key, value in folded.items()}
     return found
 
@@ -237,7 +237,7 @@ def responses_of(taxels: LinkTaxels) -> np.ndarray:
 def in_float32(taxels: LinkTaxels, h: np.ndarray) -> np.ndarray:
     """Return what a module's dense operator makes of depths (press, taxel), in float32."""
     response = blocks.responses(spec_of(), taxels, None)["spread"]
-    made = operators.fold(response, blocks.PLANES["spread"], taxels, Wish("dense", None))
+    made = operators.fold(response, blocks.PLANES["spread"], taxels, OperatorForm("dense", None))
     constants = on({f"spread/0/{key}": value for key, value in made.items()}, "cpu", torch.float32)
     return torch.stack(operators.apply(constants, "spread", [torch.from_numpy(h).float()]), dim=1).double().numpy()
 

@@ -18,6 +18,8 @@ from tgdsl.errors import RobotError
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
+LEAST_INERTIA = 1e-9
+"""Least principal moment of a body whose inertia, as its file has it, is that of no real body [kg·m²]."""
 SHAPE_NAMES: dict[int, str] = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
     mujoco.mjtGeom.mjGEOM_HFIELD: "hfield",

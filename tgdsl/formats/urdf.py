@@ -11,10 +11,7 @@ import numpy as np
 
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mjcf import rewrite_meshes
-from tgdsl.formats.model import Model
-
-LEAST_INERTIA = 1e-9
-"""Least principal moment of a link whose inertia was not physical [kg·m²]."""
+from tgdsl.formats.model import LEAST_INERTIA, Model
 
 
 def read_urdf(path: Path) -> Model:

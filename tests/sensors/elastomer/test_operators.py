@@ -10,7 +10,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.sensors.elastomer import ElastomerSpec
 from tgdsl.sensors.elastomer.blocks import PLANES, clamping, gaussian, responses
 from tgdsl.sensors.elastomer.kernels import LinkTaxels
-from tgdsl.sensors.elastomer.operators import COST, Wish, apply, fold, grid
+from tgdsl.sensors.elastomer.operators import COST, OperatorForm, apply, fold, grid
 from tgdsl.surfaces.surface import Surface
 
 ELASTIC = {"kernel": "half_space", "youngs_modulus": 2e5, "poissons_ratio": 0.4, "normal_stiffness": 1e8}
@@ -31,7 +31,7 @@ def regular(rows, columns, pitch=(1.5e-3, 2e-3), shuffle=None):
 
 
 def applied(response, planes, part, form, tolerance=None, seed=0, dtype=torch.float64):
-    folded = fold(response, planes, part, Wish(form, tolerance))
+    folded = fold(response, planes, part, OperatorForm(form, tolerance))
     constants = {f"x/0/{key}": torch.from_numpy(value) for key, value in folded.items()}
     given = [torch.from_numpy(np.random.default_rng(seed + i).normal(size=(5, len(part.pos)))) for i in range(planes[1])]
     return torch.stack(apply(constants, "x", given)), folded
@@ -80,7 +80,7 @@ def test_links_do_not_couple():
     first, second = regular(3, 4), regular(5, 2)
     constants = {}
     for i, part in enumerate((first, second)):
-        folded = fold(responses(spec(), part, None)["spread"], (3, 1), part, Wish(("fft", "svd")[i], 1e-9))
+        folded = fold(responses(spec(), part, None)["spread"], (3, 1), part, OperatorForm(("fft", "svd")[i], 1e-9))
         constants |= {f"x/{i}/{key}": torch.from_numpy(value) for key, value in folded.items()}
     given = torch.zeros(2, 22, dtype=torch.float64)
     given[0, 3], given[1, 15] = 1.0, 1.0
@@ -95,7 +95,7 @@ def test_the_choice_follows_the_table(monkeypatch):
     response = responses(spec(), part, None)["drag"]
 
     def chosen(tolerance=None, form="auto", taxels=part):
-        return sorted(fold(response, (1, 1), taxels, Wish(form, tolerance)))
+        return sorted(fold(response, (1, 1), taxels, OperatorForm(form, tolerance)))
 
     assert chosen() == ["matrix"]
     assert chosen(1e-2) == ["left", "right"]
@@ -116,7 +116,7 @@ def test_a_large_grid_is_convolved_without_its_matrix():
         sizes.append(len(source))
         return response(source)
 
-    folded = fold(watched, (1, 1), part, Wish("auto", None))
+    folded = fold(watched, (1, 1), part, OperatorForm("auto", None))
     assert "spectrum" in folded and sum(sizes) == 4
 
 
@@ -134,9 +134,9 @@ def test_a_convolution_elsewhere_is_refused_by_name(what):
     part = IRREGULAR[what](regular(3, 4))
     assert what in str(grid(part))
     with pytest.raises(LowerError, match=what) as caught:
-        fold(responses(spec(), part, None)["drag"], (1, 1), part, Wish("fft", None))
+        fold(responses(spec(), part, None)["drag"], (1, 1), part, OperatorForm("fft", None))
     assert caught.value.field == "operator"
-    assert "matrix" in fold(responses(spec(), part, None)["drag"], (1, 1), part, Wish("auto", None))
+    assert "matrix" in fold(responses(spec(), part, None)["drag"], (1, 1), part, OperatorForm("auto", None))
 
 
 def test_a_hole_in_the_grid_is_refused():
@@ -259,7 +259,7 @@ def test_clamping_is_linear_and_by_the_edges_own_displacement():
 def test_a_clamped_pad_is_never_convolved():
     """Not even if asked for a tolerance: near its edge a response is not that of the middle."""
     part = regular(5, 5, pitch=(2e-3, 2e-3))
-    folded = fold(responses(spec(), part, None)["spread"], (3, 1), part, Wish("auto", None), is_alike=False)
+    folded = fold(responses(spec(), part, None)["spread"], (3, 1), part, OperatorForm("auto", None), is_alike=False)
     assert list(folded) == ["matrix"]
 
 

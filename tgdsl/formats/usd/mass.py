@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from tgdsl.formats.model import LEAST_INERTIA
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
@@ -17,8 +18,6 @@ DENSITY = 1000.0
 """What a collider weighs if nothing says so: UsdPhysics takes water [kg/m³]."""
 FALLBACK_RADIUS = 0.1
 """Radius of the ball whose inertia a body with a mass, but neither inertia nor geometry, gets [m]."""
-LEAST_INERTIA = 1e-9
-"""Least principal moment of a body whose inertia is that of no real body [kg·m²]."""
 Vector = Float[np.ndarray, "3"]
 Tensor = Float[np.ndarray, "3 3"]
 

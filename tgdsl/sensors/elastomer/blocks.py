@@ -13,7 +13,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.sensors.base import SurfaceOf
 from tgdsl.sensors.elastomer.bonded_layer import Layer
 from tgdsl.sensors.elastomer.kernels import Elastic, Gaussian, LinkTaxels
-from tgdsl.sensors.elastomer.operators import Response, Wish, fold
+from tgdsl.sensors.elastomer.operators import OperatorForm, Response, fold
 from tgdsl.sensors.elastomer.spec import ElastomerSpec
 from tgdsl.surfaces.surface import Surface
 
@@ -69,10 +69,10 @@ def _fold_link(spec: ElastomerSpec, layout: Layout, link: int, surface_of: Surfa
     """Return the constants of one link's operators, `<operator>/<link>/<constant>`."""
     part = link_taxels(layout, link)
     pad = None if spec.boundary is None else surface_of(layout.links[link].name, spec.boundary.pad)
-    wish, constants = Wish(spec.operator, spec.tolerance), {}
+    wanted, constants = OperatorForm(spec.operator, spec.tolerance), {}
     for name, response in responses(spec, part, pad).items():
         is_alike = not (name == "spread" and pad is not None)
-        folded = fold(response, PLANES[name], part, wish, is_alike)
+        folded = fold(response, PLANES[name], part, wanted, is_alike)
         constants |= {f"{name}/{link}/{key}": value for key, value in folded.items()}
     return constants
 

@@ -37,7 +37,7 @@ Response = Callable[[Int[np.ndarray, " source"]], Float[np.ndarray, "out in targ
 """Returns what some source taxels do to all taxels of the link."""
 
 
-class Wish(NamedTuple):
+class OperatorForm(NamedTuple):
     """What the user asked for: a form or "auto", and the relative error that is allowed; None: none, if there is a choice."""
 
     form: str
@@ -50,7 +50,7 @@ class Wish(NamedTuple):
 
 
 def fold(
-    response: Response, planes: tuple[int, int], taxels: LinkTaxels, wish: Wish, is_alike: bool = True
+    response: Response, planes: tuple[int, int], taxels: LinkTaxels, wanted: OperatorForm, is_alike: bool = True
 ) -> dict[str, np.ndarray]:
     """Return the constants of one link's operator.
 
@@ -58,24 +58,24 @@ def fold(
         response: Its matrix.
         planes: Numbers of planes that go out and in.
         taxels: The link's taxels.
-        wish: The form.
+        wanted: The form and its error.
         is_alike: Whether the response depends on nothing but the way from source to target where the taxels are alike.
 
     Raises:
         LowerError: If a convolution is asked for where the taxels are no regular grid.
     """
     num = len(taxels.pos)
-    cells = grid(taxels) if is_alike and wish.form in ("auto", "fft") else None
-    if wish.form == "fft" and isinstance(cells, str):
+    cells = grid(taxels) if is_alike and wanted.form in ("auto", "fft") else None
+    if wanted.form == "fft" and isinstance(cells, str):
         raise LowerError(f"`fft` needs taxels on a regular planar grid: {cells}", "operator", "use dense, svd or auto")
     on_grid = cells if isinstance(cells, np.ndarray) else None
     dense = COST["dense"] * np.prod(planes) * num**2
-    if on_grid is not None and (wish.form == "fft" or _fft_cost(planes, on_grid.shape) < dense):
+    if on_grid is not None and (wanted.form == "fft" or _fft_cost(planes, on_grid.shape) < dense):
         return _spectrum(response, on_grid)
     matrix = np.ascontiguousarray(response(np.arange(num)).transpose(1, 3, 0, 2))
-    if wish.form == "svd" or (wish.form == "auto" and wish.tolerance is not None):
-        left, right = _truncated(matrix, wish.error)
-        if wish.form == "svd" or COST["svd"] * (left.size + right.size) < dense:
+    if wanted.form == "svd" or (wanted.form == "auto" and wanted.tolerance is not None):
+        left, right = _truncated(matrix, wanted.error)
+        if wanted.form == "svd" or COST["svd"] * (left.size + right.size) < dense:
             return {"left": left, "right": right}
     return {"matrix": matrix}
 
