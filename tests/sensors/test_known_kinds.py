@@ -12,9 +12,10 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SpecError, TgdslError
+from tgdsl.files.plugins import installed
 from tgdsl.schema.document import json_schema
 from tgdsl.sensors import CONTACT, KINDS
-from tgdsl.sensors.known import _installed, known_kinds
+from tgdsl.sensors.known import known_kinds
 
 MODULE = '''
 from typing import Literal
@@ -80,15 +81,15 @@ def install(tmp_path, monkeypatch):
         (info / "entry_points.txt").write_text("[tgdsl.kinds]\n" + "\n".join(lines) + "\n")
         (site / f"{package}.py").write_text(MODULE)
         monkeypatch.syspath_prepend(site)
-        _installed.cache_clear()
+        installed.cache_clear()
 
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
-    _installed.cache_clear()
+    installed.cache_clear()
     yield add
     for name in ("touchy", "feely"):
         sys.modules.pop(name, None)
-    _installed.cache_clear()
+    installed.cache_clear()
 
 
 def test_a_kind_that_nobody_brings(install, tmp_path):
