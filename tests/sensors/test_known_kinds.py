@@ -20,6 +20,7 @@ from tgdsl.sensors.known import known_kinds
 MODULE = '''
 from typing import Literal
 
+from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel, Lowered, ProbeSpec
 
@@ -34,15 +35,15 @@ class InverseSpec(ProbeSpec):
 
 
 def lower(spec, layout, surface_of):
-    return Lowered((Channel("inverse", "1"),), reports={}, constants={})
+    return Lowered((Channel("inverse", "1"),), reports={}, requests=(ContactDepth(spec.objects, spec.is_gated),))
 
 
-def forward(felt, probes, constants, state):
-    return {"inverse": 1 / (1 + felt.depth)}, {}
+def forward(gathered, context, constants, state):
+    return {"inverse": 1 / (1 + gathered[ContactDepth].depth)}, {}
 
 
-def reference(spec, layout, touch, state):
-    return 1 / (1 + touch.depth[:, None]), {}
+def reference(spec, layout, gathered, context, state):
+    return 1 / (1 + gathered[ContactDepth].depth[:, None]), {}
 
 
 INVERSE = Kind(InverseSpec, lower, forward, reference)
