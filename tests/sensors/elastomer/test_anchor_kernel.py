@@ -11,7 +11,7 @@ from meetings import NUM_ENVS, made
 import tgdsl
 from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.points.points import met_points
+from tgdsl.quantities.points.points import link_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, SHEAR_LOADS, advance, shear_loads
@@ -79,7 +79,7 @@ def check(case, stick_slip):
     state, seen = nothing_held(meeting), torch.zeros(4)
     for step in range(STEPS):
         before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
-        (load,), expected = advance([met_points(moved(exact, step))], of(stick_slip, torch.float64), before)
+        (load,), expected = advance([link_points(moved(exact, step))], of(stick_slip, torch.float64), before)
         found, count = by_kernel(moved(meeting, step), of(stick_slip, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
@@ -128,7 +128,7 @@ def check_sums():
     numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
     for step in range(3):
         before = {name: plane.double() for name, plane in state.items()}
-        loads, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
+        loads, _ = advance([link_points(moved(exact, step))], of(SLIDES, torch.float64), before)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
         expected = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
         loads, after = SHEAR_LOADS([moved(meeting, step)], of(SLIDES, torch.float32), state)
@@ -176,7 +176,7 @@ def test_without_a_kernel_all_objects_are_advanced_by_torch(stick_slip):
         meeting = made(case, torch.float64)
         state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
         (load,), after = shear_loads([meeting], of(CONTACT_LAWS[stick_slip], torch.float64), state)
-        (expected,), wanted = advance([met_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
+        (expected,), wanted = advance([link_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
         assert load.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
         assert torch.equal(torch.stack(load.strength), torch.stack(expected.strength))
 
