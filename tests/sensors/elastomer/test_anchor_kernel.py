@@ -157,9 +157,11 @@ def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
     """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
     sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
     touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
-    (shape,), below = touch.plan.skin.shapes, []
+    (shape,), below = touch.plan.quantities["points"].surfaces.shapes, []
     random = torch.Generator().manual_seed(0)
-    nums, firsts, cells, values = (touch.constants[f"links/0/{name}"] for name in ("num", "first", "cell", "values"))
+    nums, firsts, cells, values = (
+        touch.constants[f"quantities/points/surfaces/surfaces/0/{name}"] for name in ("num", "first", "cell", "values")
+    )
     for num, first, cell in zip(nums, firsts, cells.double(), strict=True):
         nodes = values[first : first + num.prod()].double().view(*num)
         at = torch.rand((100_000, 3), generator=random, dtype=torch.float64) * (num - 1)
