@@ -94,7 +94,8 @@ class VectorTaxels(torch.nn.Module):
         self.cube = bodies.index("cube")
         self.pos = torch.tensor(layout.pos, dtype=torch.float32, device=device)
         self.radius = torch.tensor(layout.radius, dtype=torch.float32, device=device)
-        self.half_size = torch.tensor(plan.arrays["objects/cube/size"][0, 0], dtype=torch.float32, device=device)
+        (geoms,) = plan.quantities["contact_depth"].geoms
+        self.half_size = torch.tensor(geoms.size[0, 0], dtype=torch.float32, device=device)
 
     def forward(self, pos: Tensor, quat: Tensor, linvel: Tensor, angvel: Tensor, found: Tensor) -> Tensor:
         """Return force and torque (env, taxel, 6)."""

@@ -63,7 +63,7 @@ def main(options: Options) -> None:
     with TemporaryDirectory() as folder:
         names = {"force": ("force",), "depth": ("depth",), "both": ("force", "depth")}
         modules = {name: module(Path(folder), sensors, options.device) for name, sensors in names.items()}
-    assert len(modules["both"].plan.quantities["contact_depth"].uses) == 1
+    assert len(modules["both"].plan.quantities["contact_depth"].queries) == 1
     operations = {name: touch.operations_per_env() for name, touch in modules.items()}
     state = modules["both"].example_state(options.num_envs, dtype=torch.float32, spread=0.01)
     if options.compiled:

@@ -9,6 +9,15 @@ from jaxtyping import install_import_hook
 
 install_import_hook("tgdsl", "beartype.beartype")
 
+from tgdsl.quantities.base import Gathered, Scene  # noqa: E402
+
+for traced in (Gathered, Scene):
+    # A call that torch.compile traces makes objects of these, and Dynamo cannot look into checks of such objects' methods,
+    # not even with `jaxtyping_disable`.
+    for name, method in list(vars(traced).items()):
+        if hasattr(method, "__wrapped__"):
+            setattr(traced, name, method.__wrapped__)
+
 
 @pytest.fixture
 def here(monkeypatch, capsys):

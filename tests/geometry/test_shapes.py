@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from tgdsl.geometry.reference import signed_distance
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.quantities.reference import signed_distance
 
 SIZES = {
     "plane": [(1.0, 1.0, 0.1)],

@@ -7,8 +7,9 @@ import torch
 from tgdsl.geometry import planes
 from tgdsl.geometry.grid import Grid
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.contact_depth.query import FeltObject, Pairs
-from tgdsl.quantities.points.points import Meeting, PointSource, point_tiles
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import Pairs
+from tgdsl.quantities.points.points import ObjectPoints, PointSource, point_tiles
 
 NUM_ENVS, CELL = 4, 0.002
 CASES = {
@@ -58,7 +59,7 @@ def made(case, dtype):
         is_absent = torch.zeros((num_links, len(shapes)), dtype=torch.bool)
         is_absent[0, 1] = is_absent[2, 0] = True
     every = torch.arange(num_links)
-    links = FeltObject("links", 0, 0, tuple(shapes), (False,) * len(shapes), place, place, turns, is_absent, every, grids)
+    links = Geoms(tuple(shapes), (False,) * len(shapes), place, place, turns, is_absent, every, grids)
     num_pairs = num_links + 2
     parts = [*planes.rotation(draw(NUM_ENVS, num_pairs, 4)), *(0.003 * draw(3, NUM_ENVS, num_pairs))]
     parts = torch.stack(list(parts), dim=1).to(dtype)
@@ -68,4 +69,4 @@ def made(case, dtype):
     points = vec((0.006 * draw(3, NUM_ENVS if differs else 1, 1, num_points)).to(dtype))
     pair, taxels = 1 + torch.randperm(num_links, generator=rng), tuple((k, k + 1) for k in range(num_links))
     tiles = torch.tensor(point_tiles(taxels, num_links), dtype=torch.int32)
-    return Meeting(pairs, PointSource("cube", pair, taxels, tiles, points, torch.ones(1, 1, dtype=dtype), links))
+    return ObjectPoints(pairs, PointSource("cube", pair, taxels, tiles, points, torch.ones(1, 1, dtype=dtype), links))

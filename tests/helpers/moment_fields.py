@@ -1,12 +1,13 @@
 """Probes in random fields of moments: what tests of the moments are given."""
 
 import torch
+from searches import paired
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.contact_depth.query import Pairs, Probes
 from tgdsl.quantities.moments.moments import MomentField
 from tgdsl.quantities.moments.nearby import MomentSource
+from tgdsl.quantities.pairs import Pairs
 
 NUM = ((7, 6, 8), (5, 8, 6))
 
@@ -29,7 +30,7 @@ CASES = {
 
 
 def made(case, dtype, spread=0.03):
-    """Return pairs, probes and source of a case, random but for its shapes: places around and beyond the lattice."""
+    """Return pairs, the probes' places and the source of a case, random but for its shapes: places around and beyond the lattice."""
     num_envs, num_taxels, num_pairs, depends_on, is_noisy = CASES[case]
     rng = torch.Generator().manual_seed(len(case))
 
@@ -50,11 +51,11 @@ def made(case, dtype, spread=0.03):
     shift = (0.001 * draw(num_envs, num_taxels)).to(dtype) if is_noisy else None
     field = fields(depends_on, num_envs, num_taxels, 8 if is_noisy else 4, draw, rng, dtype)
     radius = radius if shift is None else torch.where(radius > 0, radius + shift, radius)
-    source = MomentSource("can", 1, num_pairs, pair, radius, shift, field, (), torch.ones(1, 1, dtype=dtype))
+    source = MomentSource(paired("can", 1, num_pairs), pair, radius, shift, field, (), torch.ones(1, 1, dtype=dtype))
     padded = Pairs(
         *(tuple(torch.nn.functional.pad(part, (1, 2), value=torch.nan) for part in own) for own in pairs[:2]), None, None
     )
-    return padded, Probes(pos, pair[None]), source
+    return padded, pos, source
 
 
 def fields(depends_on, num_envs, num_taxels, num_channels, draw, rng, dtype) -> MomentField:

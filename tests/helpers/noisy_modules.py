@@ -1,13 +1,16 @@
 """Modules with noise of every sort, and how tests read them."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import tgdsl
 from tgdsl.module.module import TactileModule
+from tgdsl.sensors.noise import stages
 from tgdsl.testing import only
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "every_sensor.yaml"
@@ -104,3 +107,10 @@ def read_of_rank(rank: int, file: str, made: dict, folder: str) -> None:
     part = slice(4 * rank, 4 * rank + 4)
     torch.save(read(touch, range(4), envs=part), f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
+
+
+def circumstances(touch: TactileModule, memory: Mapping[str, Tensor], dt: Tensor | None = None):
+    """Return when each sensor is read next, and the values of its noise's knobs then, by sensor."""
+    nows = touch.memory.clock.nows(memory, dt)
+    knobs = {name: stages.knob_values(own, nows.get(name)) for name, own in touch.constants.tree["noise"].items()}
+    return nows, knobs

@@ -31,15 +31,15 @@ class Example(NamedTuple):
 
 
 def deepest(dtype: torch.dtype) -> tuple:
-    pairs, probes, which, objects, reach = searches.made("boxes", dtype)
-    felt = [objects[index] for index in which]
-    pair = torch.stack([probes.pair[index] + objects[index].first_pair for index in which]).int()
+    pairs, probes, which, targets, reach = searches.made("boxes", dtype)
+    felt = [targets[index] for index in which]
+    pair = torch.stack([probes.pair[index] + targets[index].object.first_pair for index in which]).int()
     return pairs, probes, felt, {"pair": pair}, reach
 
 
 def felt_moments(dtype: torch.dtype) -> tuple:
-    pairs, probes, source = moment_fields.made("several links", dtype)
-    return pairs, slice(source.first_pair, source.first_pair + source.num_pairs), probes, source
+    pairs, pos, source = moment_fields.made("several links", dtype)
+    return pairs, source.target.pairs, pos, source
 
 
 def advance_anchors(dtype: torch.dtype) -> tuple:

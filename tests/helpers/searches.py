@@ -6,7 +6,9 @@ import torch
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth.query import FeltObject, Motion, Pairs, Probes
+from tgdsl.quantities.contact_depth.query import Probes, Target
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import Motion, PairedObject, Pairs
 
 SHAPES = ("plane", "sphere", "capsule", "cylinder", "box")
 
@@ -25,8 +27,13 @@ CASES = {
 }  # fmt: skip
 
 
+def paired(name, first_pair, num_pairs):
+    """Return an object that has so many pairs; what it is in the state does not matter to a search."""
+    return PairedObject(name, name, first_pair, num_pairs, 1, False, -1)
+
+
 def made(case, dtype):
-    """Return pairs, probes, the felt objects' indices, the objects and the reach of a case, random but for its shapes."""
+    """Return pairs, probes, the felt targets' indices, the targets and the reach of a case, random but for its shapes."""
     num_envs, num_taxels, num_links, shapes, differs, is_gated, is_noisy = CASES[case]
     rng = torch.Generator().manual_seed(len(case))
     draw = partial(torch.randn, generator=rng, dtype=torch.float64)
@@ -36,7 +43,7 @@ def made(case, dtype):
         return planes.rotation(draw(*shape, 4))
 
     spread = 0.04 if case == "far apart" else 0.02
-    objects, first_pair = [], 1  # of a pair before and two after them nobody asks
+    targets, first_pair = [], 1  # of a pair before and two after them nobody asks
     for i, own in enumerate(shapes):
         own = [own] if isinstance(own, str) else own
         shape = (num_envs if differs == "variant" and i % 2 == 0 else 1, len(own))
@@ -48,7 +55,8 @@ def made(case, dtype):
         absent = any_of(3, shape) == 0 if shape[0] != 1 else None
         geoms = [part.to(dtype) for part in (size, pos, rotation)]
         alike = (None,) * len(own)
-        objects.append(FeltObject(f"{i}", first_pair, num_links, tuple(own), is_centred, *geoms, absent, None, alike))
+        held = Geoms(tuple(own), is_centred, *geoms, absent, None, alike)
+        targets.append(Target(paired(f"{i}", first_pair, num_links), held))
         first_pair += num_links
     num_pairs = first_pair + 2
     rotation = turns(num_envs, num_pairs)
@@ -58,10 +66,10 @@ def made(case, dtype):
     parts = stacked.unbind(1)
     motion = Motion(vec(parts[12:15]), vec(parts[15:18]), vec(parts[18:21]))
     gate = torch.where(any_of(3, (num_envs, num_pairs)) == 0, -torch.inf, 0.0).to(dtype) if is_gated else None
-    probes = Probes(vec((0.01 * draw(3, num_taxels)).to(dtype)), any_of(num_links, (len(objects), num_taxels)))
-    which = list(range(len(objects)))
+    probes = Probes(vec((0.01 * draw(3, num_taxels)).to(dtype)), any_of(num_links, (len(targets), num_taxels)))
+    which = list(range(len(targets)))
     which = which[1:] if len(which) > 3 else which
     radius = 0.004 + 0.001 * draw(*((num_envs,) if is_noisy else ()), num_taxels)
     is_active = any_of(8, (len(which), *([1] if is_noisy else []), num_taxels)) > 0
     reach = torch.where(is_active, radius.abs(), -torch.inf).to(dtype)
-    return Pairs(rot(parts[:9]), vec(parts[9:12]), motion, gate), probes, which, objects, reach
+    return Pairs(rot(parts[:9]), vec(parts[9:12]), motion, gate), probes, which, targets, reach

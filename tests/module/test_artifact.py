@@ -15,6 +15,7 @@ import tgdsl
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.module.artifact import load_plan, save_plan
+from tgdsl.plan import tree
 from tgdsl.plan.plan import FORMAT
 
 SCENE = """
@@ -41,6 +42,8 @@ sensors:
 observations:
   policy: [{type: force, of: touch}, {type: agg_bool, of: bit}]
 """
+REACH = "quantities/contact_depth/uses/0/reach"
+"""An array of the plan: how far each probe feels each object."""
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def test_the_same_bytes_twice(document, artifact, tmp_path):
 
 
 def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
-    program = "import sys; from tgdsl.module.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_plan(sys.argv[1]), sys.argv[2])"
+    program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_plan(sys.argv[1]), sys.argv[2])"
     for seed in ("1", "4242"):
         out = tmp_path / f"{seed}.safetensors"
         command = [sys.executable, "-c", program, str(document), str(out)]
@@ -76,8 +79,10 @@ def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
 def test_a_plan_comes_back_whole(document, artifact):
     plan, found = compile_plan(document), load_plan(artifact)
     for field in dataclasses.fields(plan):
-        if field.name != "arrays":
-            assert getattr(found, field.name) == getattr(plan, field.name), field.name
+        (own, _), (other, _) = (tree.flatten(getattr(of, field.name), field.name) for of in (plan, found))
+        assert other == own and type(getattr(found, field.name)) is type(getattr(plan, field.name)), field.name
+    assert found.inputs == plan.inputs and found.origin == plan.origin and found.objects == plan.objects
+    assert [type(part) for part in found.quantities.values()] == [type(part) for part in plan.quantities.values()]
     assert list(found.arrays) == list(plan.arrays)
     for name, array in plan.arrays.items():
         assert found.arrays[name].dtype == array.dtype
@@ -138,9 +143,9 @@ def test_other_versions_and_other_contents(artifact, tmp_path):
     assert refused(path) == f"plan format {FORMAT + 1} is not {FORMAT}, which this version of tgdsl reads; compile again"
     rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "format"}))
     assert refused(path) == f"plan format None is not {FORMAT}, which this version of tgdsl reads; compile again"
-    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "links"}))
+    rewritten(artifact, path, json.dumps({k: v for k, v in plain.items() if k != "layout"}))
     assert refused(path).startswith("a plan has the parts ")
-    rewritten(artifact, path, json.dumps(plain | {"links": 3}))
+    rewritten(artifact, path, json.dumps(plain | {"layout": 3}))
     assert refused(path).startswith("not a plan: ")
     for text in ("", "{", "3", "null"):
         rewritten(artifact, path, text)
@@ -183,8 +188,8 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
     content = artifact.read_bytes()
     arrays = load(content)
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
-    changed = {**arrays, "queries/0/0/reach": arrays["queries/0/0/reach"] * 2}
-    lacking = {name: value for name, value in arrays.items() if name != "queries/0/0/reach"}
+    changed = {**arrays, REACH: arrays[REACH] * 2}
+    lacking = {name: value for name, value in arrays.items() if name != REACH}
     for bad in (changed, lacking):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
         with pytest.raises(ArtifactError, match="the arrays are not those that the plan was written with"):

@@ -11,6 +11,7 @@ import tgdsl
 from tgdsl.errors import SpecError, StateError, TgdslError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import Channel, ContactProbeSpec, Kind, Lowered
 
@@ -120,7 +121,8 @@ def test_both_readouts_are_the_same_without_noise(touch):
 def test_only_what_is_needed_is_planned(touch):
     """Links without a sensor and objects that none feels reach neither inputs nor arrays; one query serves both sensors."""
     assert touch.inputs.bodies == ("item", "pad")
-    assert len(touch.plan.queries) == 1
+    depth = touch.plan.quantities["contact_depth"]
+    assert list(touch.plan.quantities) == ["contact_depth"] and len(depth.queries) == len(depth.uses) == 1
     assert not any("far" in name or "tip" in name for name in touch.plan.arrays)
     assert dict(touch.plan.dropped) == {"link tip": "no sensor is on it", "object far": "no sensor feels it"}
 
@@ -138,7 +140,9 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
         "12 taxels",
         "link tip: no sensor is on it",
         "pad – item",
-        "touch, contact: depth",
+        "asks for depth of 12 probes (query 0) with motion and normal in item (box), where MuJoCo has the pair in contact "
+        "(found once for contact too)",
+        "(found once for touch too)",
         "remembers bit",
         "contact_found",
     ):
@@ -209,6 +213,27 @@ def test_a_module_can_be_copied_and_pickled(touch):
         torch.testing.assert_close(other(state)["touch"], expected, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda touch: pickle.loads(pickle.dumps(touch))], ids=["deepcopy", "pickle"])
+def test_a_copy_has_constants_of_its_own(document, copied):
+    """A copy that is written into, or moved to another dtype, reads its own constants; the original is left alone."""
+    touch, stiffness = tgdsl.compile(document), "sensors/touch/normal_stiffness"
+    state = touch.example_state(64)
+    expected = touch.peek(state)["touch"]
+    assert expected.any()
+    exact, other, twice = copied(touch).double(), copied(touch), copied(touch)
+    twice.constants[stiffness].mul_(2)
+    pointers = [buffer.data_ptr() for own in (touch, exact, other, twice) for buffer in own.constants.buffers()]
+    assert len(set(pointers)) == len(pointers)
+    assert torch.equal(touch.peek(state)["touch"], expected)
+    assert torch.equal(exact.peek(state)["touch"], tgdsl.compile(document, dtype=torch.float64).peek(state)["touch"])
+    document["sensors"]["touch"]["normal_stiffness"] = touch.constants[stiffness].item() * 2
+    assert torch.equal(twice.peek(state)["touch"], tgdsl.compile(document).peek(state)["touch"])
+    assert not torch.equal(twice.peek(state)["touch"], expected)
+    touch.constants[stiffness].zero_()
+    assert torch.equal(other.peek(state)["touch"], expected)
+    assert not torch.equal(touch.peek(state)["touch"], expected)
+
+
 def test_example_states_are_reproducible(touch):
     a, b, c = touch.example_state(2), touch.example_state(2), touch.example_state(2, seed=1)
     assert torch.equal(a.body_pos, b.body_pos) and not torch.equal(a.body_pos, c.body_pos)
@@ -228,9 +253,11 @@ class InverseSpec(ContactProbeSpec):
 
 INVERSE = Kind(
     InverseSpec,
-    lower=lambda spec, layout, surface_of: Lowered((Channel("inverse", "1"),)),
-    forward=lambda felt, probes, constants, state: ({"inverse": 1 / (1 + felt.depth)}, {}),
-    reference=lambda spec, layout, touch, state: (1 / (1 + touch.depth[:, None]), {}),
+    lower=lambda spec, layout, surface_of: Lowered(
+        (Channel("inverse", "1"),), requests=(ContactDepth(spec.objects, spec.is_gated),)
+    ),
+    forward=lambda gathered, context, constants, state: ({"inverse": 1 / (1 + gathered[ContactDepth].depth)}, {}),
+    reference=lambda spec, layout, gathered, context, state: (1 / (1 + gathered[ContactDepth].depth[:, None]), {}),
 )
 
 

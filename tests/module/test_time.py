@@ -1,67 +1,28 @@
-"""Time: the rate of a sensor, its history, its delay, and the time step that a scene gives."""
+"""Time: the rate of a sensor, its delay, and the time step that a scene gives."""
 
-import itertools
 import warnings
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from pressed_probes import pad, pressed, ramp
 
-import tgdsl
-from tgdsl.errors import SpecError, StateError
+from tgdsl.errors import StateError
 from tgdsl.module.reading import _phase
-from tgdsl.module.state import SceneState
 
-BALL, RADIUS, UP = 0.03, 0.004, 0.01
-"""Radius of the ball, of the probe, and the probe's height over its body [m]."""
-SCENE = """
-<mujoco><worldbody>
-  <body name="pad"><geom type="box" size=".02 .02 .01"/></body>
-  <body name="item" pos="0 0 .05"><freejoint/><geom type="sphere" size=".03"/></body>
-</worldbody></mujoco>
-"""
 LATE = {"read_delay": "25 ms"}
 
 
 @pytest.fixture
 def build(tmp_path):
-    def compiled(dtype=torch.float64, observations=None, **sensors):
-        (tmp_path / "scene.xml").write_text(SCENE)
-        points = [{"pos": [0, 0, UP], "normal": [0, 0, 1]}, {"pos": [0.002, 0, UP], "normal": [0, 0, 1]}]
-        layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points, "radius": RADIUS}}}}
-        own = {"kind": "contact_depth", "links": "pad", "feels": ["item"], "gate": "geometric"}
-        return tgdsl.compile(
-            {
-                "tgdsl": 1,
-                "robot": {"model": str(tmp_path / "scene.xml"), "layout": layout},
-                "objects": {"item": {"body": "item"}},
-                "sensors": {name: {**own, **sensor} for name, sensor in sensors.items()},
-                "observations": observations or {},
-            },
-            dtype=dtype,
-        )
-
-    return compiled
-
-
-def pressed(touch, depth, dt=None) -> SceneState:
-    """A state in which the first probe is `depth` deep, in each environment its own [m]."""
-    depth = torch.as_tensor(np.atleast_1d(depth), dtype=torch.float64)
-    pos, quat = torch.zeros(len(depth), 2, 3, dtype=torch.float64), torch.zeros(len(depth), 2, 4, dtype=torch.float64)
-    quat[..., 0] = 1
-    pos[:, touch.inputs.bodies.index("item"), 2] = UP + RADIUS + BALL - depth
-    return SceneState(body_pos=pos, body_quat=quat, dt=dt)
+    return partial(pad, tmp_path)
 
 
 def run(touch, depths, dts, name="s") -> np.ndarray:
     """Return the first probe's reading at each call (call, env)."""
     return np.array([touch(pressed(touch, depth, dt))[name][..., 0, 0].numpy() for depth, dt in zip(depths, dts, strict=True)])
-
-
-def ramp(num: int, num_envs=1) -> np.ndarray:
-    """Depths (call, env) that are all different [m]."""
-    return 1e-3 + 2e-3 * (np.arange(num * num_envs).reshape(num, num_envs) / (num * num_envs))
 
 
 def sampled(dts, rate) -> list[int]:
@@ -177,146 +138,6 @@ def test_noise_is_drawn_once_per_sample(build):
     np.testing.assert_allclose(steps.var(axis=1), 1, atol=5 * np.sqrt(2 / steps.shape[1]))  # five standard deviations
     spread = np.var(walk[-1] / sigma)
     assert spread == pytest.approx(11, abs=5 * 11 * np.sqrt(2 / steps.shape[1]))
-
-
-# history
-
-
-@pytest.mark.parametrize("rate", [None, 50])
-@pytest.mark.parametrize("length", [1, 2, 3, 6])
-def test_history_is_a_window_over_the_last_calls(build, length, rate):
-    """Against NumPy; before there are enough calls, and after a reset, the first reading stands for the missing."""
-    own = {} if rate is None else {"rate": rate}
-    reduced = {name: {**own, "history": {"length": length, "reduce": name}} for name in ("last", "mean", "median")}
-    touch, plain = build(**reduced, stack={**own, "history": length}), build(plain=own)
-    depths = 1e-3 + 2e-3 * np.random.default_rng(0).random((20, 3))
-    past: list[list[np.ndarray]] = [[], [], []]
-    for call, depth in enumerate(depths):
-        if call == 11:
-            touch.reset([1])
-            plain.reset([1])
-            past[1] = []
-        dt = None if rate is None else 0.005
-        readings, reading = touch(pressed(touch, depth, dt)), plain(pressed(plain, depth, dt))["plain"].numpy()
-        windows = []
-        for env in range(3):
-            past[env].append(reading[env])
-            windows.append(([past[env][0]] * length + past[env])[-length:])
-        window = np.array(windows)
-        np.testing.assert_array_equal(readings["stack"].numpy(), window)
-        np.testing.assert_array_equal(readings["last"].numpy(), window[:, -1])
-        np.testing.assert_allclose(readings["mean"].numpy(), window.mean(axis=1), atol=1e-15)
-        np.testing.assert_allclose(readings["median"].numpy(), np.median(window, axis=1), atol=1e-15)
-
-
-def test_a_stack_is_a_copy_that_later_calls_leave_alone(build):
-    touch, depths = build(s={"history": 5}), ramp(12, 4)
-    kept = [touch(pressed(touch, depth))["s"] for depth in depths]
-    for call, stack in enumerate(kept):
-        window = depths[np.maximum(np.arange(call - 4, call + 1), 0)].T
-        np.testing.assert_allclose(stack[..., 0, 0].numpy(), window, atol=1e-15)
-
-
-def test_a_stack_may_be_a_view_of_the_memory(build):
-    """Each call writes over it, in the same place, and it reads what a copy reads."""
-    touch, plain, depths = build(s={"history": {"length": 5, "view": True}}), build(s={"history": 5}), ramp(12, 4)
-    views = []
-    for depth in depths:
-        views.append(touch(pressed(touch, depth))["s"])
-        copy = plain(pressed(plain, depth))["s"]
-        assert all(torch.equal(view, copy) for view in views)
-    window = touch.memory.get_buffer("history/s")
-    assert {view.untyped_storage().data_ptr() for view in views} == {window.untyped_storage().data_ptr()}
-
-
-def test_only_a_stack_can_be_a_view(build):
-    with pytest.raises(SpecError, match=r"`view` is used by `reduce: stack` alone, expected it to be left out"):
-        build(s={"history": {"length": 5, "reduce": "mean", "view": True}})
-
-
-@pytest.mark.parametrize("reduce", ["stack", "mean", "median"])
-def test_a_history_keeps_the_gradient_of_its_last_call(build, reduce):
-    """Against finite differences: what was read before is constant, so a mean of three has a third of the slope."""
-    touch, depths = build(s={"history": {"length": 3, "reduce": reduce}}), torch.tensor([[1e-3], [3e-3], [2e-3]])
-    touch(pressed(touch, depths[0]))
-    touch(pressed(touch, depths[1]))
-    state = pressed(touch, depths[2])
-    assert state.body_pos is not None
-    state.body_pos.requires_grad_()
-    read = touch.peek(state)["s"][..., 0, 0].sum()
-    (slope,) = torch.autograd.grad(read, state.body_pos)
-    step, place = 1e-6, (0, touch.inputs.bodies.index("item"), 2)
-    values = []
-    for sign in (1, -1):
-        moved = state.body_pos.detach().clone()
-        moved[place] += sign * step
-        values.append(touch.peek(SceneState(body_pos=moved, body_quat=state.body_quat))["s"][..., 0, 0].sum().item())
-    assert slope[place].item() == pytest.approx((values[0] - values[1]) / (2 * step), rel=1e-6)
-    assert slope[place].item() == pytest.approx({"stack": -1, "mean": -1 / 3, "median": -1}[reduce], rel=1e-6)
-
-
-def test_a_stack_is_channel_major_per_call(build):
-    touch = build(s={"kind": "kinematic_taxel", "history": 3})
-    reading = touch(touch.example_state(4))["s"]
-    assert reading.shape == (4, 3, 2, 6)
-    assert reading.transpose(2, 3)[0].is_contiguous()
-
-
-def test_observations_of_a_stack_are_those_of_its_calls_oldest_first(build):
-    terms = {"policy": [{"type": "depth", "of": "s"}], "both": [{"type": "depth", "of": "p"}, {"type": "agg_force", "of": "s"}]}
-    touch = build(observations=terms, s={"history": 3}, p={})
-    depths = ramp(5, 2)
-    for depth in depths:
-        readings = touch(pressed(touch, depth))
-    found = touch.observe(readings)
-    probes = readings["s"].numpy()[..., 0]  # (env, step, taxel)
-    np.testing.assert_allclose(probes[:, :, 0], depths[2:].T, atol=1e-12)
-    np.testing.assert_array_equal(found["policy"].numpy(), probes.reshape(2, 6))
-    force = np.zeros((2, 3, 3))
-    force[:, :, 0] = 1e4 * probes.sum(axis=2)  # axes zyx
-    expected = np.concatenate([readings["p"].numpy()[..., 0], force.reshape(2, 9)], axis=1)
-    np.testing.assert_allclose(found["both"].numpy(), expected, rtol=1e-12)
-    planned: dict[str, int] = {}
-    for term in touch.plan.observations:
-        planned[term.group] = planned.get(term.group, 0) + term.num_features
-    assert planned == {"policy": 6, "both": 11}
-
-
-def test_history_of_a_noisy_sensor_with_a_rate(build):
-    """Calls are remembered, not samples: a stack of 8 calls at 200 Hz of a sensor at 50 Hz holds each sample four times."""
-    sensor = {"rate": 50, "noise": {"white_noise": 1e-3, "gain": [0.9, 1.1]}}
-    touch, plain = build(s={**sensor, "history": 8, "readout": "both"}), build(s=sensor)
-    singles = []
-    for depth in ramp(21, 3):
-        readings = touch(pressed(touch, depth, 0.005))
-        singles.append(plain(pressed(plain, depth, 0.005))["s"].numpy())
-    np.testing.assert_array_equal(readings["s"].numpy(), np.stack(singles[-8:], axis=1))
-    values = readings["s"][0, :, 0, 0].tolist()
-    assert [len(list(group)) for _, group in itertools.groupby(values)] == [3, 4, 1]
-    assert readings["s/clean"].shape == readings["s"].shape and not torch.equal(readings["s"], readings["s/clean"])
-
-
-def test_history_under_inference_mode_and_after_it(build):
-    touch = build(s={"history": 3})
-    with torch.inference_mode():
-        touch(pressed(touch, 1e-3))
-    touch.reset()
-    touch(pressed(touch, 2e-3))
-    assert touch(pressed(touch, 3e-3))["s"][0, :, 0, 0].tolist() == pytest.approx([2e-3, 2e-3, 3e-3])
-
-
-def test_history_fixes_the_batch(build):
-    touch = build(s={"history": {"length": 3, "reduce": "mean"}})
-    assert touch.has_state
-    touch(pressed(touch, [1e-3, 2e-3]))
-    assert touch.num_envs == 2
-    with pytest.raises(
-        StateError, match=r"^this module holds the state of 2 environments, the scene has 3; `free\(\)` lets go of it$"
-    ):
-        touch(pressed(touch, [1e-3] * 3))
-
-
-# dt
 
 
 @pytest.mark.parametrize(

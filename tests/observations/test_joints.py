@@ -9,6 +9,7 @@ from joint_scenes import ACTUATED, ACTUATORS, ALL, joint_document, joint_module
 
 import tgdsl
 from tgdsl.errors import SpecError, StateError
+from tgdsl.plan.plan import FORMAT
 
 
 def rows_of(touch, names, kind="joints"):
@@ -145,7 +146,7 @@ def test_saved_and_loaded_and_explained(tmp_path):
     assert (again.observe(again(state))["policy"] == touch.observe(touch(state))["policy"]).all()
     assert again.observations == touch.observations
     plain = json.loads(touch.plan.to_json())
-    assert plain["format"] == 10
+    assert plain["format"] == FORMAT
     assert plain["inputs"]["joints"] == list(ACTUATED)
     text = touch.explain()
     assert f"  joints  {', '.join(ACTUATED)}\n  actuators  {', '.join(ACTUATORS)}\n" in text

@@ -136,11 +136,11 @@ def test_depth_follows_sizes(tmp_path, geom):
     """Derivatives with respect to an object's sizes are those of the readings, where the nearest point is unique."""
     rng = np.random.default_rng(4)
     touch = module(tmp_path, rng.normal(scale=0.012, size=(20, 3)) + 0.003, geom, kind="contact_depth")
-    size = touch.constants["objects/item/size"].clone()
+    size = touch.constants["quantities/contact_depth/geoms/0/size"].clone()
     scene = state(touch)
 
     def depth(values: torch.Tensor) -> torch.Tensor:
-        touch.constants._buffers["objects/item/size"] = values
+        touch.constants._buffers["quantities/contact_depth/geoms/0/size"] = values
         return touch(scene)["s"]
 
     assert torch.autograd.gradcheck(depth, size.requires_grad_(), eps=1e-7, atol=1e-5)

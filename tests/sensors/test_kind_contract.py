@@ -1,5 +1,6 @@
 """What a kind may ask for and give: frames, contacts, surfaces, a reach of its own, reports per body, memory of any shape."""
 
+import dataclasses
 from typing import Literal
 
 import numpy as np
@@ -8,8 +9,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.errors import LowerError, SpecError
+from tgdsl.errors import LowerError, SpecError, TgdslError
 from tgdsl.geometry import planes
+from tgdsl.quantities.base import Request
+from tgdsl.quantities.contact_depth import ContactDepth
+from tgdsl.quantities.contacts import Contacts
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel, ContactProbeSpec, Lowered, Memory
 
@@ -42,32 +46,34 @@ def lower(spec, layout, surface_of):
         channels=(Channel("seen_x", "m"), Channel("depth", "m"), Channel("calls", "1")),
         constants={"area": area},
         state={"calls": Memory(rest=2.0, shape=(2, 3))},
-        needs=frozenset({"frame", "contacts"}),
-        radius=np.full(layout.num_taxels, spec.reach),
-        slots=3,
+        requests=(
+            ContactDepth(spec.objects, spec.is_gated, radius=np.full(layout.num_taxels, spec.reach), frame=True),
+            Contacts(spec.objects, slots=3),
+        ),
         reports={"net": report, "area": (Channel("area", "m²"),)},
     )
 
 
-def forward(felt, probes, constants, state):
-    frame = felt.frames["ball"]
-    seen, *_ = planes.add(planes.rotate(frame.rotation, probes.pos), frame.offset)
+def forward(gathered, context, constants, state):
+    met, contacts = gathered[ContactDepth], gathered[Contacts]
+    frame = met.frames["ball"]
+    seen, *_ = planes.add(planes.rotate(frame.rotation, met.pos), frame.offset)
     calls = state["calls"] + 1
-    net = {f"net_{axis}": part for axis, part in zip("xyz", felt.contacts.net, strict=True)}
+    net = {f"net_{axis}": part for axis, part in zip("xyz", contacts.net, strict=True)}
     area = constants["area"].expand_as(net["net_x"])
-    planes_out = {"seen_x": seen, "depth": felt.depth, "calls": calls[:, 0, :1].expand_as(seen), **net, "area": area}
-    assert felt.contacts.force[0].shape[1:] == (2, 6)  # bodies, slots of two objects
+    planes_out = {"seen_x": seen, "depth": met.depth, "calls": calls[:, 0, :1].expand_as(seen), **net, "area": area}
+    assert contacts.force[0].shape[1:] == (2, 6)  # bodies, slots of two objects
     return planes_out, {"calls": calls}
 
 
-KIND = Kind(ProbeAllSpec, lower, forward, reference=lambda spec, layout, touch, state: (np.zeros((2, 3)), {}))
+KIND = Kind(ProbeAllSpec, lower, forward, reference=lambda spec, layout, gathered, context, state: (np.zeros((2, 3)), {}))
 
 
 @pytest.fixture
 def build(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
 
-    def compiled(**sensor):
+    def compiled(asking=KIND, **sensor):
         layout = {"resolutions": {"r": {"a": POINTS, "b": POINTS}}}
         document = {
             "tgdsl": 1,
@@ -75,7 +81,7 @@ def build(tmp_path):
             "objects": {"floor": {"body": "floor"}, "ball": {"body": "ball"}},
             "sensors": {"s": {"kind": "probe_all", "links": "*", "feels": ["ball", "floor"], **sensor}},
         }
-        return tgdsl.compile(document, kinds=[KIND], dtype=torch.float64)
+        return tgdsl.compile(document, kinds=[asking], dtype=torch.float64)
 
     return compiled
 
@@ -126,3 +132,14 @@ def test_the_reach_is_the_kinds_own(build):
 def test_what_a_kind_refuses_is_a_located_mistake(build):
     with pytest.raises(SpecError, match=r"sensors\.s\.reach: reach -1 m is negative; expected at least 0"):
         build(reach=-1.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Temperature(Request[torch.Tensor]):
+    """A request that no quantity answers."""
+
+
+def test_a_request_that_no_quantity_answers_is_named(build):
+    asking = dataclasses.replace(KIND, lower=lambda *given: dataclasses.replace(lower(*given), requests=(Temperature(),)))
+    with pytest.raises(TgdslError, match=r'^no known quantity answers the request "Temperature"; give its kind the quantity'):
+        build(asking)

@@ -5,8 +5,11 @@ from cube_on_pad import in_link, pad, wrench
 from scenes import module, state
 
 import tgdsl
-from tgdsl.quantities.contact_depth.query import Felt, Probes
-from tgdsl.quantities.contacts.contacts import Contacts
+from tgdsl.geometry.planes import vec
+from tgdsl.quantities import ContactDepth, Contacts, Gathered
+from tgdsl.quantities.contact_depth import Penetration
+from tgdsl.quantities.contacts import ContactPoints
+from tgdsl.sensors.base import UNTIMED
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.testing import KindConformance
 
@@ -237,16 +240,16 @@ def test_taxels_that_pull_leave_the_others_their_share(tmp_path):
 def pressed_by_hand(tmp_path, depth, load, friction, dtype, **sensor):
     """Return the readings' planes of two taxels at given depths [m], sliding and spinning, under a load with friction [N]."""
     touch = module(tmp_path, [(0, 0, 0), (0.01, 0, 0)], BOX, dtype=dtype, kind="kinematic_taxel", balance="solver", **sensor)
-    (own,) = touch.plan.sensors
-    constants = touch.constants.under("sensors/s", own.constants)
+    constants = touch.constants.tree["sensors"]["s"]
     none, one = torch.zeros_like(depth), torch.ones_like(depth)
     at = torch.zeros(1, 1, 1, dtype=dtype)
     down, away = (at, at, at - 1), (at, at, at)
-    contacts = Contacts(away, (at + friction, at, at - load), away, down, (at[0], at[0], at[0]))
-    motion = {"velocity": (0.1 * one, -0.2 * one, none), "angular": (none, none, 5 * one)}
-    rest = {"distances": {}, "frames": {}, "contacts": contacts, "moments": {}, "motions": {}, "area": {}, "points": {}}
-    probes = Probes(tuple(touch.constants["queries/0/pos"]), touch.constants["queries/0/pair"])
-    return KINEMATIC_TAXEL.forward(Felt(depth, (none, none, -one), **motion, **rest), probes, constants, {})[0]
+    contacts = ContactPoints(away, (at + friction, at, at - load), away, down, (at[0], at[0], at[0]))
+    velocity, angular = (0.1 * one, -0.2 * one, none), (none, none, 5 * one)
+    pos = vec(touch.constants["quantities/contact_depth/queries/0/pos"])
+    felt = Penetration(pos, depth, (none, none, -one), velocity, angular, {}, {})
+    gathered = Gathered({ContactDepth: felt, Contacts: contacts})
+    return KINEMATIC_TAXEL.forward(gathered, UNTIMED, constants, {})[0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

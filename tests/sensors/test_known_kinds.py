@@ -12,13 +12,15 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SpecError, TgdslError
+from tgdsl.files.plugins import installed
 from tgdsl.schema.document import json_schema
 from tgdsl.sensors import CONTACT, KINDS
-from tgdsl.sensors.known import _installed, known_kinds
+from tgdsl.sensors.known import known_kinds
 
 MODULE = '''
 from typing import Literal
 
+from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Channel, Lowered, ProbeSpec
 
@@ -33,15 +35,15 @@ class InverseSpec(ProbeSpec):
 
 
 def lower(spec, layout, surface_of):
-    return Lowered((Channel("inverse", "1"),), reports={}, constants={})
+    return Lowered((Channel("inverse", "1"),), reports={}, requests=(ContactDepth(spec.objects, spec.is_gated),))
 
 
-def forward(felt, probes, constants, state):
-    return {"inverse": 1 / (1 + felt.depth)}, {}
+def forward(gathered, context, constants, state):
+    return {"inverse": 1 / (1 + gathered[ContactDepth].depth)}, {}
 
 
-def reference(spec, layout, touch, state):
-    return 1 / (1 + touch.depth[:, None]), {}
+def reference(spec, layout, gathered, context, state):
+    return 1 / (1 + gathered[ContactDepth].depth[:, None]), {}
 
 
 INVERSE = Kind(InverseSpec, lower, forward, reference)
@@ -80,15 +82,15 @@ def install(tmp_path, monkeypatch):
         (info / "entry_points.txt").write_text("[tgdsl.kinds]\n" + "\n".join(lines) + "\n")
         (site / f"{package}.py").write_text(MODULE)
         monkeypatch.syspath_prepend(site)
-        _installed.cache_clear()
+        installed.cache_clear()
 
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
-    _installed.cache_clear()
+    installed.cache_clear()
     yield add
     for name in ("touchy", "feely"):
         sys.modules.pop(name, None)
-    _installed.cache_clear()
+    installed.cache_clear()
 
 
 def test_a_kind_that_nobody_brings(install, tmp_path):

@@ -39,7 +39,7 @@ class TestLinkContactBit(TestLinkContact):
     def test_no_distance_is_measured(self, scene):
         """The solver knows already: no geometry reaches the plan, and velocities are not asked for."""
         plan = self.build(self.document(scene), torch.float32)[0].plan
-        assert plan.queries[0].objects == () and not any(name.startswith("objects/") for name in plan.arrays)
+        assert set(plan.quantities) == {"contacts"} and not any("/geoms/" in name for name in plan.arrays)
         assert plan.inputs.fields == ("body_pos", "body_quat", "contact_netforce")
 
 

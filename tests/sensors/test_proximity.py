@@ -228,7 +228,7 @@ def test_mistakes(tmp_path, changes, message):
 def test_only_moments_are_found(tmp_path):
     """No distances are baked or measured for it, and the account says what the field costs."""
     touch = tgdsl.compile(document(tmp_path, [POINT], outputs=["torque"]))
-    assert touch.inputs.fields == ("body_pos", "body_quat") and touch.plan.queries[0].objects == ()
+    assert touch.inputs.fields == ("body_pos", "body_quat") and "contact_depth" not in touch.plan.quantities
     text = touch.explain()
     assert "fields of moments" in text and "item, radius 10 mm: " in text
     force = tgdsl.compile(document(tmp_path, [POINT], feels=["item", "floor"]))
@@ -248,9 +248,9 @@ def test_density_is_shared_out_over_the_points(tmp_path, shape):
     geom, area = SOLIDS[shape]
     sensor = {"backend": "points", "points": 300, "outputs": ["force"], "reference_area": None, "normal_stiffness": 1.0}
     touch = module(tmp_path, [(0, 0, 0)], geom, radius=0.06, gate=None, kind="proximity", **sensor)
-    arrays = touch.plan.arrays
-    assert float(arrays["objects/item/moments/0/area"][0]) == pytest.approx(area, rel=1e-12)
-    points = arrays["objects/item/moments/0/points"].T[:300]
+    (table,) = touch.plan.quantities["moments"].tables
+    assert float(table.area[0]) == pytest.approx(area, rel=1e-12)
+    points = table.surface.points.T[:300]
     place = np.array([0.001, -0.002, 0.003])
     mean = np.mean(0.06 - np.linalg.norm(points + place, axis=1))
     found = touch(state(touch, pos=place.tolist()))["s"][0, 0, 2]
@@ -262,6 +262,6 @@ def test_explain_counts_the_bytes_of_all_channels(tmp_path):
     cases: list[tuple[dict[str, Any], int]] = [({}, 4), ({"noise": {"radius_noise": 1e-3}}, 8)]
     for noise, channels in cases:
         touch = module(tmp_path, [(0, 0, 0)], CUBE, gate=None, kind="proximity", tolerance=0.1, **noise)
-        x, y, z = touch.plan.arrays["objects/item/moments/0/num"][0]
+        x, y, z = touch.plan.quantities["moments"].tables[0].surface.num[0]
         assert f"{x} × {y} × {z} nodes every" in touch.explain()
         assert f" mm, {4 * channels * x * y * z} bytes\n" in touch.explain()

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tgdsl.compiler.lowered import LoweredSensor
+from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Quantity, Request, Use
@@ -148,7 +149,11 @@ def _of_group(requests: Sequence[Request]) -> Request:
 
 
 def _quantity_of(request: Request, quantities: Sequence[Quantity]) -> Quantity:
-    return next(quantity for quantity in quantities if quantity.request is type(request))
+    found = next((quantity for quantity in quantities if quantity.request is type(request)), None)
+    if found is None:
+        hint = "give its kind the quantity, `Kind(quantities=(…,))`, or install the package that brings it"
+        raise TgdslError(f'no known quantity answers the request "{type(request).__name__}"; {hint}')
+    return found
 
 
 def rows_of(sensor: LoweredSensor, joined: Joined) -> tuple[int, int]:

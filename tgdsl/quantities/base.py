@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -151,7 +151,8 @@ class Planning:
         return np.array(table, dtype=np.int64).reshape(len(names), len(bodies))
 
 
-class Scene(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Scene:
     """What quantities are gathered from, at one instant.
 
     Attributes:
@@ -180,9 +181,29 @@ def variant_of(scene: Scene, target: PairedObject) -> Int[Tensor, " env"] | None
     return scene.tensors["variant"][:, target.varied].long() if target.num_variants > 1 else None
 
 
+def _no_fields(part: Any) -> set[str]:
+    return set()
+
+
+def _no_bodies(use: Use) -> tuple[str, ...]:
+    return ()
+
+
+def _nothing_to_explain(part: Any, use: int, objects: Sequence[PairedObject]) -> list[str]:
+    return []
+
+
+def _not_light(part: Any) -> bool:
+    return False
+
+
+def _nothing_measured(part: Any, objects: Sequence[PairedObject]) -> dict[str, list[str]]:
+    return {}
+
+
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """A quantity.
+    """A quantity. A module holds it, and can be pickled where its functions can: a lambda cannot.
 
     Attributes:
         name: Its name: that of its folder, and of its part of the Plan.
@@ -206,12 +227,12 @@ class Quantity:
     plan: Callable[[Planning, Sequence[Use]], Any]
     gather: Callable[[Any, Scene], tuple[Any, ...]]
     reference: Callable[[Any, int, Any], Any]
-    fields: Callable[[Any], set[str]] = lambda part: set()
-    bodies: Callable[[Use], tuple[str, ...]] = lambda use: ()
+    fields: Callable[[Any], set[str]] = _no_fields
+    bodies: Callable[[Use], tuple[str, ...]] = _no_bodies
     num_rows: Callable[[Any, int], int] | None = None
-    explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = lambda part, use, objects: []
-    is_light: Callable[[Any], bool] = lambda part: False
-    account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = lambda part, objects: {}
+    explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = _nothing_to_explain
+    is_light: Callable[[Any], bool] = _not_light
+    account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = _nothing_measured
 
 
 class Gathered(dict[type[Request], Any]):

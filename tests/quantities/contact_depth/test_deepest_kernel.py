@@ -2,35 +2,37 @@
 
 import torch
 from kernels import interpreted, needs_triton, use_kernels
-from searches import CASES, SHAPES, made
+from searches import CASES, SHAPES, made, paired
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import rot, split, vec
-from tgdsl.quantities.contact_depth.query import FeltObject, Motion, Pairs, Probes, feel, measure
+from tgdsl.quantities.contact_depth.query import Probes, Target, measure, penetration
 from tgdsl.quantities.contact_depth.search import DEEPEST
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import Motion, Pairs
 
 TOLERANCE = 3e-7
 """Of places within half a metre in float32 [m]; directions are off by as much over the distance that makes them."""
 TURN = 2e-3
-NEEDS = frozenset({"normal", "motion"})
+WANTS = frozenset({"normal", "motion"})
 
 
-def by_torch(pairs, probes, which, objects, reach):
+def by_torch(pairs, probes, which, targets, reach):
     """Return depth, normal and the motion at the winner, stacked."""
-    near = measure(pairs, probes, objects)
-    felt = feel(pairs, probes, [near[index] for index in which], reach, NEEDS)
+    near = measure(pairs, probes, targets)
+    felt = penetration(pairs, probes, [near[index] for index in which], reach, WANTS)
     return felt.depth, torch.stack(felt.normal), torch.stack([*felt.velocity, *felt.angular])
 
 
-def deepest_of(pairs, probes, which, objects, reach):
+def deepest_of(pairs, probes, which, targets, reach):
     """Return what the kernel finds."""
-    felt = [objects[index] for index in which]
-    pair = torch.stack([probes.pair[index] + objects[index].first_pair for index in which]).int()
+    felt = [targets[index] for index in which]
+    pair = torch.stack([probes.pair[index] + targets[index].object.first_pair for index in which]).int()
     return DEEPEST.kernel(pairs, probes, felt, {"pair": pair}, reach)
 
 
-def by_kernel(pairs, probes, which, objects, reach):
-    found = deepest_of(pairs, probes, which, objects, reach)
+def by_kernel(pairs, probes, which, targets, reach):
+    found = deepest_of(pairs, probes, which, targets, reach)
     assert found.pair.dtype == torch.int32 and found.depth.dtype == torch.float32
 
     def won(part):
@@ -85,13 +87,11 @@ def scene(shapes, size, pos, depths):
     still = (zero, zero, zero)
     geoms = [torch.tensor(part, dtype=torch.float32)[None] for part in (size, pos)]
     rotation = torch.eye(3).flatten().expand(1, len(shapes), 9)
-    objects = [
-        FeltObject(str(i), i, 1, shapes, (False,) * len(shapes), *geoms, rotation, None, None, (None,) * len(shapes))
-        for i in range(num)
-    ]
+    held = Geoms(shapes, (False,) * len(shapes), *geoms, rotation, None, None, (None,) * len(shapes))
+    targets = [Target(paired(str(i), i, 1), held) for i in range(num)]
     pairs = Pairs(rot(part * one for part in turn), (zero, zero, height), Motion(still, still, still), None)
     probes = Probes(split(torch.zeros(1, 3)), torch.zeros((num, 1), dtype=torch.int64))
-    return pairs, probes, range(num), objects, torch.full((num, 1), 0.01)
+    return pairs, probes, range(num), targets, torch.full((num, 1), 0.01)
 
 
 def check_ties():

@@ -132,7 +132,7 @@ def test_explain_tells_what_a_grid_costs(tmp_path):
     touch, _ = compiled(tmp_path, trimesh.creation.icosphere(subdivisions=4, radius=HALF), [(0, 0, HALF)])
     text = touch.explain()
     assert "tri" in text and "99 % within" in text and "bytes" in text
-    accuracy = touch.plan.objects[0].accuracy[0][0]
+    accuracy = touch.plan.quantities["contact_depth"].geoms[0].accuracy[0][0]
     assert accuracy["p99"] <= accuracy["tolerance"] == TOLERANCE
 
 

@@ -1,15 +1,17 @@
-"""That `search` makes of a kernel's answer what `feel` makes of distances; the kernel itself is tested beside it."""
+"""That `search` makes of a kernel's answer what `penetration` makes of distances; the kernel itself is tested beside it."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from tgdsl.quantities.contacts.contacts import Contacts
+from searches import paired
 
 from tgdsl.quantities.contact_depth import search as searching
-from tgdsl.quantities.contact_depth.query import FeltObject, Probes, feel, measure, relate
+from tgdsl.quantities.contact_depth.query import Probes, Target, measure, penetration
 from tgdsl.quantities.contact_depth.search import DEEPEST, deepest, is_searchable, search
 from tgdsl.quantities.contact_depth.search_tables import Deepest, geom_tables
+from tgdsl.quantities.geoms.distance import Geoms
+from tgdsl.quantities.pairs import relate
 from tgdsl.tensors import operations
 
 NUM_LINKS, NUM_OBJECTS, NUM_ENVS, NUM_TAXELS = 2, 6, 5, 40
@@ -17,14 +19,15 @@ WHICH = (0, 1, 2, 4, 5)
 """The objects that are felt."""
 
 
-def brute_force(pairs, probes, objects, known, reach):
+def brute_force(pairs, probes, targets, known, reach):
     """Return what the kernel does of centred boxes, from the tables and the distances."""
-    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(objects)
+    own = [target.geoms for target in targets]
+    spheres, geoms = (known["spheres"], known["geoms"]) if "geoms" in known else geom_tables(own)
     ends = spheres[0, :, 1].cumsum(0).long()
     boxes = [box(geoms[:, end - 1 : end, :3], 0, pairs.offset[0].shape[1]) for end in ends]
     every = Probes(probes.pos, known["pair"])
     near = measure(pairs, every, boxes)
-    felt = feel(pairs, every, near, reach, ("normal",))
+    felt = penetration(pairs, every, near, reach, ("normal",))
     depths = torch.stack([r + pairs.gate[:, own.pair] - own.distance for r, own in zip(reach, near, strict=True)])
     deepest = depths.max(dim=0)
     pair = known["pair"].gather(0, deepest.indices)
@@ -38,11 +41,10 @@ def kernel(monkeypatch):
     monkeypatch.setattr(operations, "are_kernel_inputs", lambda *_: True)
 
 
-def box(size, first_pair, num_pairs):
+def box(size, first_pair, num_pairs, name="box"):
     identity = torch.eye(3, dtype=torch.float64).reshape(1, 1, 9)
-    return FeltObject(
-        "box", first_pair, num_pairs, ("box",), (True,), size, 0 * size, identity, None, None, (None,)
-    )  # fmt: skip
+    geoms = Geoms(("box",), (True,), size, 0 * size, identity, None, None, (None,))
+    return Target(paired(name, first_pair, num_pairs), geoms)
 
 
 @pytest.fixture
@@ -64,9 +66,7 @@ def scene():
     pairs = relate(*state, link, target, torch.float64, *motion, gate)
     owner = torch.arange(NUM_TAXELS) % NUM_LINKS
     probes = Probes((0.03 * random(3, NUM_TAXELS)).unbind(), owner.expand(NUM_OBJECTS, -1))
-    boxes = [
-        box(0.01 + 0.02 * random(1, 1, 3).abs(), NUM_LINKS * i, NUM_LINKS)._replace(name=f"{i}") for i in range(NUM_OBJECTS)
-    ]
+    boxes = [box(0.01 + 0.02 * random(1, 1, 3).abs(), NUM_LINKS * i, NUM_LINKS, f"{i}") for i in range(NUM_OBJECTS)]
     reach = torch.full((len(WHICH), NUM_TAXELS), 0.03, dtype=torch.float64)
     return pairs, probes, boxes, owner + NUM_LINKS * torch.tensor(WHICH)[:, None], reach
 
@@ -74,20 +74,19 @@ def scene():
 @pytest.mark.parametrize("is_known", [True, False])
 def test_motion_is_that_of_the_object_found(scene, kernel, is_known):
     pairs, probes, boxes, pair, reach = scene
-    needs, felt = ("motion", "normal", "contacts"), [boxes[i] for i in WHICH]
-    none = torch.zeros(NUM_ENVS, NUM_LINKS, 0, dtype=torch.float64)
-    contacts = Contacts(*[(none, none, none)] * 4, (none[..., 0:1].sum(-1),) * 3)
-    known = {"pair": pair} | (dict(zip(("spheres", "geoms"), geom_tables(felt), strict=True)) if is_known else {})
-    found = search(pairs, probes, felt, known, reach, needs, contacts)
+    wants, felt = ("motion", "normal"), [boxes[i] for i in WHICH]
+    known = {"pair": pair} | (
+        dict(zip(("spheres", "geoms"), geom_tables([own.geoms for own in felt]), strict=True)) if is_known else {}
+    )
+    found = search(pairs, probes, felt, known, reach, wants)
     near = measure(pairs, probes, boxes)
-    expected = feel(pairs, probes, [near[i] for i in WHICH], reach, needs, contacts)
+    expected = penetration(pairs, probes, [near[i] for i in WHICH], reach, wants)
     assert 0.2 < (expected.depth > 0).double().mean() < 0.9
     torch.testing.assert_close(found.depth, expected.depth)
     for part, other in zip(
         (*found.normal, *found.velocity, *found.angular), (*expected.normal, *expected.velocity, *expected.angular), strict=True
     ):
         torch.testing.assert_close(part, other)
-    assert found.contacts is contacts
 
 
 def test_the_definition_is_the_deepest_of_all_distances(scene):
@@ -106,7 +105,7 @@ def test_a_cpu_has_no_kernel_for_it(scene):
 
 def test_what_the_kernel_cannot_answer_is_left_to_torch():
     many = ["box"] * searching.THRESHOLD
-    assert is_searchable(many, {"normal", "motion", "contacts"}) and is_searchable(many, ())
+    assert is_searchable(many, {"normal", "motion"}) and is_searchable(many, ())
     assert not is_searchable(many, {"normal", "distance"})
     assert not is_searchable(many[1:], {"normal"})
     assert not is_searchable([*many, "ellipsoid"], {"normal"})

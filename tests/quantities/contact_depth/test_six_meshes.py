@@ -105,7 +105,7 @@ def readings(folder, mesh, scale, points, **target):
     rest = torch.zeros(1, 2, 3, dtype=torch.float64)
     quat = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, 2, 4)
     state = SceneState(body_pos=rest, body_quat=quat)
-    return touch(state)["s"][0, :, 0].numpy(), touch.plan.objects[0].accuracy[0][0]
+    return touch(state)["s"][0, :, 0].numpy(), touch.plan.quantities["contact_depth"].geoms[0].accuracy[0][0]
 
 
 def signed(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:

@@ -19,10 +19,9 @@ def compare() -> None:
     """Compare the kernel with the torch code in all cases: run where `TRITON_INTERPRET` is set."""
     use_kernels()
 
-    def moments(pairs, probes, source, is_kernel):
-        own = slice(source.first_pair, source.first_pair + source.num_pairs)
+    def moments(pairs, pos, source, is_kernel):
         way = FELT_MOMENTS.kernel if is_kernel else FELT_MOMENTS.definition
-        return stacked(*way(pairs, own, probes, source))
+        return stacked(*way(pairs, source.target.pairs, pos, source))
 
     for case in CASES:
         expected = moments(*made(case, torch.float64), False)
@@ -34,15 +33,15 @@ def compare() -> None:
         if expected.numel() > 100:
             assert (expected[0] == 0).sum() > 5 and (expected[0] != 0).sum() > 5, case
     for case, spoilt in (("several links", "rotation"), ("by both", "offset")):
-        pairs, probes, source = made(case, torch.float32)
+        pairs, pos, source = made(case, torch.float32)
         getattr(pairs, spoilt)[1][1, 1] = torch.nan
-        expected, found = (moments(pairs, probes, source, is_kernel) for is_kernel in (False, True))
+        expected, found = (moments(pairs, pos, source, is_kernel) for is_kernel in (False, True))
         assert expected.isnan().any()
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4, equal_nan=True)
     for far in (torch.inf, -1e30):
-        pairs, probes, source = made("several links", torch.float32)
+        pairs, pos, source = made("several links", torch.float32)
         pairs.offset[2][:] = far
-        assert (moments(pairs, probes, source, True) == 0).all()
+        assert (moments(pairs, pos, source, True) == 0).all()
 
 
 @needs_triton

@@ -6,7 +6,7 @@ from meetings import CASES, made, nums_of
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.points.points import MET_POINTS, Meeting, met_points
+from tgdsl.quantities.points.points import LINK_POINTS, ObjectPoints, link_points
 
 TOLERANCE = 3e-7
 """Of places within a decimetre in float32 [m]."""
@@ -15,7 +15,7 @@ TURN = 1e-3
 
 
 def by_kernel(pairs, source):
-    found = MET_POINTS.kernel(Meeting(pairs, source))
+    found = LINK_POINTS.kernel(ObjectPoints(pairs, source))
     return found.pos, found.distance, found.gradient
 
 
@@ -37,7 +37,7 @@ def is_within(case, pairs, source, pos, slack):
 def check(case):
     """Compare what the kernel finds with the torch code: all places, and distances within the grids."""
     exact, arguments = made(case, torch.float64), made(case, torch.float32)
-    expected, (pos, distance, gradient) = met_points(exact), by_kernel(*arguments)
+    expected, (pos, distance, gradient) = link_points(exact), by_kernel(*arguments)
     torch.testing.assert_close(torch.stack(pos).double(), torch.stack(expected.pos), rtol=0, atol=TOLERANCE)
     found = distance.isfinite()
     assert 0.02 < found.double().mean() < 0.98, case

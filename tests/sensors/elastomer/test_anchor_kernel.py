@@ -11,7 +11,7 @@ from meetings import NUM_ENVS, made
 import tgdsl
 from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.points.points import met_points
+from tgdsl.quantities.points.points import link_points
 from tgdsl.sensors.elastomer import point_anchors
 from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, SHEAR_LOADS, advance, shear_loads
@@ -79,7 +79,7 @@ def check(case, stick_slip):
     state, seen = nothing_held(meeting), torch.zeros(4)
     for step in range(STEPS):
         before = {name: plane[:, BEFORE:].double() for name, plane in state.items()}
-        (load,), expected = advance([met_points(moved(exact, step))], of(stick_slip, torch.float64), before)
+        (load,), expected = advance([link_points(moved(exact, step))], of(stick_slip, torch.float64), before)
         found, count = by_kernel(moved(meeting, step), of(stick_slip, torch.float32), state)
         for name, plane in state.items():
             assert (plane[:, :BEFORE] == 9).all()
@@ -128,7 +128,7 @@ def check_sums():
     numbers = torch.tensor([2000.0, 6e-6], dtype=torch.float64)
     for step in range(3):
         before = {name: plane.double() for name, plane in state.items()}
-        loads, _ = advance([met_points(moved(exact, step))], of(SLIDES, torch.float64), before)
+        loads, _ = advance([link_points(moved(exact, step))], of(SLIDES, torch.float64), before)
         markers = point_anchors.Markers(vec(0.003 * places.T), vec(places.T), *numbers)
         expected = torch.stack(point_anchors.drag(loads, markers, NUM_ENVS))
         loads, after = SHEAR_LOADS([moved(meeting, step)], of(SLIDES, torch.float32), state)
@@ -157,9 +157,11 @@ def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
     """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
     sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}
     touch = tgdsl.compile(PALM, resolution="low", overrides={"sensors": json.dumps({"s": sensor}), "observations": "{}"})
-    (shape,), below = touch.plan.skin.shapes, []
+    (shape,), below = touch.plan.quantities["points"].surfaces.shapes, []
     random = torch.Generator().manual_seed(0)
-    nums, firsts, cells, values = (touch.constants[f"links/0/{name}"] for name in ("num", "first", "cell", "values"))
+    nums, firsts, cells, values = (
+        touch.constants[f"quantities/points/surfaces/surfaces/0/{name}"] for name in ("num", "first", "cell", "values")
+    )
     for num, first, cell in zip(nums, firsts, cells.double(), strict=True):
         nodes = values[first : first + num.prod()].double().view(*num)
         at = torch.rand((100_000, 3), generator=random, dtype=torch.float64) * (num - 1)
@@ -176,7 +178,7 @@ def test_without_a_kernel_all_objects_are_advanced_by_torch(stick_slip):
         meeting = made(case, torch.float64)
         state = {name: plane[:, BEFORE:].double() for name, plane in nothing_held(meeting).items()}
         (load,), after = shear_loads([meeting], of(CONTACT_LAWS[stick_slip], torch.float64), state)
-        (expected,), wanted = advance([met_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
+        (expected,), wanted = advance([link_points(meeting)], of(CONTACT_LAWS[stick_slip], torch.float64), state)
         assert load.count is None and all(torch.equal(after[name], wanted[name]) for name in PLANES)
         assert torch.equal(torch.stack(load.strength), torch.stack(expected.strength))
 

@@ -6,8 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.planes import rot, vec
-from tgdsl.quantities.contact_depth.query import Distance, Felt, Frame
-from tgdsl.quantities.reference import Touch
+from tgdsl.quantities.contact_depth import Distance, Penetration
+from tgdsl.quantities.contact_depth.reference import ReferencePenetration
+from tgdsl.quantities.geoms.distance import Frame
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
 STICK_SLIP = StickSlip(0.0, 1e-5, 1e-4, None)
@@ -34,10 +35,10 @@ class Skin:
         )
         depth = np.maximum(0.0, (self.stick_slip.standoff - phi).max(axis=1))
         none = np.zeros((num, 3))
-        touch = Touch(depth, none, none, none, phi, np.zeros((*phi.shape, 3)), rotation, offset)
+        touch = ReferencePenetration(depth, none, none, none, phi, np.zeros((*phi.shape, 3)), rotation, offset)
         before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
         expected, self.memory = advance_reference(touch, self.pos, self.normal, self.stick_slip, self.memory)
-        felt = self.felt(phi, rotation, offset, depth)
+        felt = self.felt(self.pos, phi, rotation, offset, depth)
         found, after = advance(felt, self.planes(self.pos), self.planes(self.normal), self.stick_slip, before)
         np.testing.assert_allclose(torch.stack(found, dim=-1)[0], expected, rtol=1e-12, atol=1e-16)
         for name in PLANES:
@@ -49,7 +50,7 @@ class Skin:
         return vec(torch.from_numpy(vectors.T.copy()))
 
     @staticmethod
-    def felt(phi, rotation, offset, depth):
+    def felt(pos, phi, rotation, offset, depth):
         def plane(values):
             return torch.tensor(np.ascontiguousarray(values))[None]
 
@@ -61,7 +62,7 @@ class Skin:
             )
             for k in range(phi.shape[1])
         }
-        return Felt(plane(depth), None, None, None, distances, frames, None, {}, {}, {}, {})
+        return Penetration(Skin.planes(pos), plane(depth), None, None, None, distances, frames)
 
 
 HERE = ([0.0, 0, 0], [0.0, 0, 0])
@@ -214,9 +215,9 @@ def test_gradients_are_finite_at_every_corner(dtype):
     along = torch.tensor([[0.0, 0.0, 0.0, 1e-3, 5e-4]], dtype=dtype, requires_grad=True)
     zero, one = torch.zeros(1, num, dtype=dtype), torch.ones(1, num, dtype=dtype)
     frame = Frame((one, zero, zero, zero, one, zero, zero, zero, one), (-along, zero, zero))
-    felt = Felt(depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame}, None, {}, {}, {}, {})
     state = dict.fromkeys(PLANES[:3], zero) | {"object": torch.tensor([[0.0, 1, 1, 1, 1]], dtype=dtype)}
     flat = (zero[0], zero[0], zero[0])
+    felt = Penetration(flat, depth, None, None, None, {"o": Distance(phi, (zero, zero, zero))}, {"o": frame})
     slip = torch.tensor(0.5, dtype=dtype, requires_grad=True)
     found, after = advance(felt, flat, (zero[0], zero[0], one[0]), STICK_SLIP._replace(slip=slip), state)
     total = sum(part.sum() for part in (*found, *after.values()))
@@ -230,7 +231,7 @@ def test_not_a_number_comes_out_and_is_not_remembered():
     skin.step((np.array([-1e-3, 1.0]), *HERE))
     before = {name: torch.from_numpy(value.copy())[None] for name, value in skin.memory.items()}
     nan = np.full((2, 1, 3, 3), np.nan)
-    felt = Skin.felt(nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
+    felt = Skin.felt(skin.pos, nan[:, :, 0, 0], nan, nan[:, :, 0], nan[:, 0, 0, 0])
     stick_slip = STICK_SLIP._replace(slip=0.5)
     found, after = advance(felt, Skin.planes(skin.pos), Skin.planes(np.array(skin.normal)), stick_slip, before)
     assert found[0][0, 0].isnan()

@@ -186,7 +186,7 @@ def test_an_elastic_skin_is_not_pulled_where_nothing_presses(tmp_path):
 
 def test_without_shear_there_is_neither_state_nor_frame(tmp_path):
     touch = module(tmp_path, PROBES, BALL, kind="elastomer", shear_strength=0)
-    assert not touch.has_state and touch.plan.queries[0].answers[0].needs == ()
+    assert not touch.has_state and touch.plan.quantities["contact_depth"].uses[0].wants == ()
     assert touch.outputs[0].channels == ("displacement_x", "displacement_y", "displacement_z")
     assert not any(name.startswith("drag") for name in touch.plan.sensors[0].constants)
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tgdsl.geometry.planes import vec
-from tgdsl.quantities.points.points import MetPoints, point_tiles
-from tgdsl.quantities.reference import ReferencePoints
+from tgdsl.quantities.points.points import LinkPoints, point_tiles
+from tgdsl.quantities.points.reference import ReferencePoints
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.elastomer.anchors import StickSlip
 from tgdsl.sensors.elastomer.point_anchors import PLANES, Markers, advance, drag, reference_drag
@@ -86,7 +86,7 @@ class Skin:
             return vec(torch.from_numpy(np.array(part))[None, None] for part in vectors.T)
 
         phi, area = torch.tensor(distance)[None, None], torch.tensor([[3e-6]], dtype=torch.float64)
-        met = MetPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
+        met = LinkPoints(((0, 2),), TILES, rows(pos), phi, rows(self.gradient), area)
         before = {name: torch.from_numpy(value)[None] for name, value in self.memory.items()}
         loads, found = advance([met], self.stick_slip, before)
         marker, normal = (vec(part[0, 0] for part in rows(vectors)) for vectors in (self.POS, self.NORMAL))
@@ -161,7 +161,7 @@ def test_not_a_number_comes_out_and_is_not_remembered():
     skin.step(START, [0.5e-3, 5.0])
     before = {name: torch.from_numpy(value)[None] for name, value in skin.memory.items()}
     nan = torch.full((1, 1, 2), torch.nan, dtype=torch.float64)
-    broken = MetPoints(((0, 2),), TILES, (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
+    broken = LinkPoints(((0, 2),), TILES, (nan, nan, nan), nan, (nan, nan, nan), nan[0, :, :1])
     loads, after = advance([broken], skin.stick_slip, before)
     assert loads[0].strength[0][0, 0, 0].isnan()
     for name in PLANES:

@@ -46,7 +46,9 @@ def cube_on(folder, markers=MARKERS, pad=PAD, item=f'<geom type="box" size="{HAL
 
 
 def sampled(touch, num=NUM):
-    return touch.plan.arrays[f"objects/item/points/{num}/points"][:, 0].T.copy()
+    (cloud,) = touch.plan.quantities["points"].clouds
+    assert cloud.points.shape == (3, 1, num)
+    return cloud.points[:, 0].T.copy()
 
 
 def closed_form(before, after, weight, markers=MARKERS, falloff=2000.0):
@@ -182,7 +184,7 @@ def test_variants_on_a_compound_link_equal_the_reference(tmp_path):
         given.body_pos[:, touch.inputs.bodies.index("item"), 2] += 0.01
         given.variant[:] = torch.arange(6)[:, None] % 2
         assert_agrees(touch(given)["s"], reference, given, 1e-12)
-    area = plan.arrays["objects/item/points/60/area"] * 60
+    area = plan.quantities["points"].clouds[0].area * 60
     assert area[0] == pytest.approx(8 * (HALF * 0.015 + HALF * 0.01 + 0.015 * 0.01), rel=1e-9)
     assert (touch.memory.get_buffer("s:held").sum(dim=1) > 0).all()
 

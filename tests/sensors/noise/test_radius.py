@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from noisy_modules import SCENE, document, felt_state, read
+from noisy_modules import SCENE, circumstances, document, felt_state, read
 
 import tgdsl
 from tgdsl.module.module import TactileModule
@@ -21,7 +21,7 @@ def test_a_disturbed_radius_is_another_radius(build, tmp_path):
     for call in range(4):
         state = felt_state(touch, 2, call)
         memory = touch.memory.tensors(2, None, touch.dtype, touch.device)
-        nows, knobs = touch._circumstances({}, memory)
+        nows, knobs = circumstances(touch, memory)
         shift = stages.radius_shift(knobs["s"]["radius_noise"], nows["s"], torch.zeros(2, 17, dtype=torch.float64))
         readings = touch(state)["s"]
         drawn.append(shift)
@@ -70,8 +70,9 @@ def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
     for sign in (1, -1):
         exact = of_radius(0.01 + sign * 6e-4, {})
         if backend == "points":  # which points there are depends on the radius; the law is compared on the same ones
-            cloud = {name: value for name, value in touch.plan.arrays.items() if name.startswith("objects/item/moments/")}
-            exact = TactileModule(dataclasses.replace(exact.plan, arrays={**exact.plan.arrays, **cloud}), dtype=torch.float64)
+            moments = dataclasses.replace(exact.plan.quantities["moments"], tables=touch.plan.quantities["moments"].tables)
+            plan = dataclasses.replace(exact.plan, quantities={**exact.plan.quantities, "moments": moments})
+            exact = TactileModule(plan, dtype=torch.float64)
         monkeypatch.setattr(stages, "radius_shift", lambda half_width, *_, sign=sign: (sign * half_width[:, 0]).expand(100, 17))
         error = full_scale_error(touch(state)["s"], exact(state)["s"].numpy())
         print(f"{backend}, R {sign:+d} ρ: largest error {error.max():.2g} of full scale, RMS {np.sqrt(np.mean(error**2)):.2g}")

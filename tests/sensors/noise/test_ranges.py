@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from noise_documents import document, mistakes
+from noisy_modules import circumstances
 
 import tgdsl
 
@@ -41,8 +42,8 @@ def test_each_environment_draws_its_own_at_reset(tmp_path, knob):
     def drawn() -> dict[str, torch.Tensor]:
         state = touch.example_state(num_envs)
         memory = touch.memory.tensors(num_envs, state.dt, touch.dtype, touch.device)
-        dt = {} if state.dt is None else {"dt": torch.tensor(state.dt, dtype=torch.float64)}
-        values = touch._circumstances(dt, memory)[1]["s"]
+        dt = None if state.dt is None else torch.tensor(state.dt, dtype=torch.float64)
+        values = circumstances(touch, memory, dt)[1]["s"]
         touch(state)
         return {name: values[name][:, 0, 0] for name in expected}
 

@@ -6,7 +6,6 @@ from noisy_modules import EVERY_KNOB, EXAMPLE, RANGES, assert_same, read
 from ruamel.yaml import YAML
 
 import tgdsl
-from tgdsl.module.explain import operations_per_env
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.noise import PROFILES
 
@@ -52,7 +51,7 @@ def test_a_clean_sensor_has_no_state_and_costs_nothing(build, noise, readout):
     assert not clean.has_state
     read(clean, range(2))
     assert not clean.state_dict() and clean.num_envs is None
-    assert operations_per_env(clean) == operations_per_env(plain)
+    assert clean.operations_per_env() == plain.operations_per_env()
     assert clean.inputs == plain.inputs
     text = clean.explain()
     assert "no state" in text and "noise" not in text and "remembers             0 bytes" in text
@@ -60,7 +59,7 @@ def test_a_clean_sensor_has_no_state_and_costs_nothing(build, noise, readout):
 
 def test_a_clean_readout_computes_no_noise(build):
     plain, clean = build(s={}), build(s={"noise": EVERY_KNOB, "readout": "clean"})
-    assert operations_per_env(clean) == operations_per_env(plain)
+    assert clean.operations_per_env() == plain.operations_per_env()
     assert clean.plan.arrays.keys() == plain.plan.arrays.keys() and clean.inputs == plain.inputs
     assert_same(read(clean, range(2)), read(plain, range(2)))
     assert not clean.state_dict() and not clean.has_state

@@ -15,6 +15,7 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.quantities.base import Planning, Quantity, Scene, Use
 from tgdsl.quantities.motion.request import BodyMotion, LinkMotion
+from tgdsl.quantities.pairs import PairedObject
 from tgdsl.quantities.reference import ReferenceBody, ReferenceScene
 
 __all__ = ["MOTION", "BodyMotion", "LinkMotion"]
@@ -56,6 +57,14 @@ def reference(part: MotionPart[np.ndarray], use: int, scene: ReferenceScene) -> 
     return [scene.body(name) for name in scene.layout.bodies]
 
 
+def _fields(part: MotionPart) -> set[str]:
+    return set(FIELDS)
+
+
+def _explain(part: MotionPart, use: int, objects: Sequence[PairedObject]) -> list[str]:
+    return ["poses and velocities of its links"]
+
+
 MOTION = Quantity(
     name="motion",
     request=LinkMotion,
@@ -63,7 +72,7 @@ MOTION = Quantity(
     plan=plan,
     gather=gather,
     reference=reference,
-    fields=lambda part: set(FIELDS),
+    fields=_fields,
     bodies=bodies_of,
-    explain=lambda part, use, objects: ["poses and velocities of its links"],
+    explain=_explain,
 )

@@ -24,6 +24,10 @@ def _plan(planning: Planning, uses: Sequence[Use]) -> PointsPart[np.ndarray]:
     return plan(planning, uses)
 
 
+def _fields(part: PointsPart) -> set[str]:
+    return {"contact_found"} if any(use.is_gated for use in part.uses) else set()
+
+
 def _num_rows(part: PointsPart, use: int) -> int:
     """Return the number of points of all objects, as all links see them."""
     return sum(part.clouds[met.cloud].points.shape[2] * len(met.links) for met in part.uses[use].objects)
@@ -49,7 +53,7 @@ POINTS = Quantity(
     plan=_plan,
     gather=gather,
     reference=reference,
-    fields=lambda part: {"contact_found"} if any(use.is_gated for use in part.uses) else set(),
+    fields=_fields,
     num_rows=_num_rows,
     explain=_explain,
     account=_account,

@@ -17,6 +17,7 @@ from scipy.linalg import lu_factor, lu_solve
 
 import tgdsl
 from tgdsl.compiler.resolve import resolve
+from tgdsl.quantities import ContactDepth
 from tgdsl.schema.load import load
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.elastomer.clamped.boundary import element_size
@@ -58,11 +59,11 @@ class DenseReference:
     def __init__(self, surface_of):
         self.surface_of, self.pads = surface_of, {}
 
-    def __call__(self, spec, layout, touch, memory):
-        found, after = reference(spec.model_copy(update={"boundary": None}), layout, touch, memory)
+    def __call__(self, spec, layout, gathered, context, state):
+        found, after = reference(spec.model_copy(update={"boundary": None}), layout, gathered, context, state)
         for link in range(len(layout.links)):
             own = np.flatnonzero((layout.link_id == link) & (layout.radius > 0))
-            found[own] += self.moved_back(spec, layout, link, own, touch.depth[own])
+            found[own] += self.moved_back(spec, layout, link, own, gathered[ContactDepth].depth[own])
         return found, after
 
     def moved_back(self, spec, layout, link, own, depth):
@@ -123,7 +124,7 @@ class Clamped(KindConformance):
                     for i, at in enumerate(places.tolist())
                 ]
             )
-        return conformance_document(scene, {"kind": "elastomer", **self.parameters, **changes}, *taxels)
+        return conformance_document(scene, {**self.sensor(), **changes}, *taxels)
 
     def build(self, document, dtype):
         module, plain = super().build(document, dtype)

@@ -11,7 +11,7 @@ from surfaces import ball, box, plate, surface_of
 from tgdsl.files import cache as where
 from tgdsl.geometry.grid import one_grid
 from tgdsl.geometry.shapes import SHAPES
-from tgdsl.quantities.contact_depth.bake import METHODS, Baked, BakeError, bake
+from tgdsl.quantities.geoms.bake import METHODS, Baked, BakeError, bake
 from tgdsl.surfaces.surface import Surface
 
 MARGIN, TOLERANCE = 0.004, 2e-4
