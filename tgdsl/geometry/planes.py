@@ -6,7 +6,6 @@ operation is pointwise and a compiler fuses a whole sensor into one loop; a trai
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 import torch
@@ -34,7 +33,12 @@ def tiny() -> float:
 
 def log2_e() -> float:
     """Return log₂ e."""
-    return math.log2(math.e)
+    return 1.4426950408889634
+
+
+def pi() -> float:
+    """Return π; an attribute of `math` is a float of a module too."""
+    return 3.141592653589793
 
 
 def split(stacked: Tensor) -> Vec:

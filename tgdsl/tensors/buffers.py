@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.tensors.devices import check_dtype
-from tgdsl.tensors.torch_internals import HookedModule, buffers_of
+from tgdsl.tensors.torch_internals import HookedModule, buffers_of, mark_static
 
 
 class Constants(HookedModule):
@@ -66,6 +66,9 @@ class Constants(HookedModule):
 
     def _rebind(self) -> None:
         self._bound = dict(buffers_of(self))
+        for tensor in self._bound.values():
+            if tensor is not None:
+                mark_static(tensor)  # Dynamo sees them in the tree, where it does not know them for buffers
         self.tree = self._bind(self.__getitem__)
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:

@@ -61,6 +61,15 @@ def buffers_of(module: nn.Module) -> dict[str, Tensor | None]:
     return module._buffers
 
 
+def mark_static(tensor: Tensor) -> None:
+    """Let torch.compile take a tensor's shape for a constant under dynamic shapes, as it does with a module's buffers.
+
+    This is `torch._dynamo.mark_static` without importing `torch._dynamo`, which takes seconds.
+    """
+    tensor._dynamo_static_indices = set(range(tensor.ndim))  # type: ignore[attr-defined]
+    tensor._has_dynamo_dim_marking = True  # type: ignore[attr-defined]
+
+
 def num_writes(tensor: Tensor) -> int:
     """Return how often a tensor was written into, as autograd counts it; −1 of inference tensors, which do not count.
 

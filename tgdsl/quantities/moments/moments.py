@@ -13,7 +13,6 @@ of all clouds; `bin` cubes of all lattices; `slot` places of a list; `*point` br
 
 from __future__ import annotations
 
-import math
 from itertools import product
 from typing import NamedTuple
 
@@ -150,7 +149,7 @@ def plane_moments(point: Vec, radius: Tensor) -> Moments:
     """
     height = torch.maximum(torch.minimum(point[2], radius), -radius)
     depth = radius - height.abs()
-    mass = math.pi / 3 * depth * depth * (radius + 2 * height.abs())
+    mass = planes.pi() / 3 * depth * depth * (radius + 2 * height.abs())
     zero = torch.zeros_like(mass)
     return Moments(mass, (zero, zero, -height * mass))
 

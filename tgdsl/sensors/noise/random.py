@@ -22,7 +22,6 @@ Shapes: `env` environments, `taxel` taxels.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -31,6 +30,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from tgdsl.geometry.planes import pi
 from tgdsl.tensors.fusion import materialised
 
 READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
@@ -110,7 +110,7 @@ def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Te
     square = -2.0 * torch.log(share)
     radius = square * torch.rsqrt(torch.clamp(square, min=2.0**-30))  # in 8 bits a share may be 1
     part = ((word >> 2) & (2**ANGLE_BITS - 1)).to(dtype) - (2**ANGLE_BITS - 1) / 2
-    angle = part * (math.pi / 2 ** (ANGLE_BITS + 1))
+    angle = part * (pi() / 2 ** (ANGLE_BITS + 1))
     turn = angle * angle
     sine = angle * (1 + turn * (-1 / 6 + turn * (1 / 120 - turn * (1 / 5040))))
     cosine = 1 + turn * (-1 / 2 + turn * (1 / 24 + turn * (-1 / 720 + turn * (1 / 40320))))
