@@ -38,14 +38,24 @@ def parts(plan: Plan) -> dict[str, Any]:
 def constant_arrays(plan: Plan) -> dict[str, np.ndarray]:
     """Return the arrays of these parts, by the names that the plan gives them."""
     names, found = {id(array): name for name, array in plan.arrays.items()}, {}
-    tree.mapped(parts(plan), lambda array: found.setdefault(names[id(array)], array))
+    tree.mapped(parts(plan), lambda array: found.setdefault(names[id(array)], array), _stays_on_host)
     return found
 
 
 def bind(plan: Plan, tensor_of: Callable[[str], Tensor]) -> Tree:
     """Return these parts with a tensor in the place of each array."""
     names = {id(array): name for name, array in plan.arrays.items()}
-    return tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]))
+    return tree.mapped(parts(plan), lambda array: tensor_of(names[id(array)]), _is_prepared)
+
+
+def _stays_on_host(record: Any) -> bool:
+    """Return whether a part of the plan is no constant of a module: what is made of it is, and is kept there."""
+    return getattr(record, "stays_on_host", False)
+
+
+def _is_prepared(record: Any) -> bool:
+    """Return the same, after making now what is made of it: no compiler traces that."""
+    return _stays_on_host(record) and record.prepared is not None
 
 
 def scene_of(plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], knobs: Knobs, dtype: torch.dtype) -> Scene:

@@ -45,10 +45,13 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
     return plain(value, path), arrays
 
 
-def mapped(value: Any, change: Callable[[np.ndarray], Any]) -> Any:
+def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[Any], bool] = lambda record: False) -> Any:
     """Return a tree with other leaves; what has none stays as it is. An array that stands in several places is changed once.
 
-    What has an attribute `prepared` keeps its arrays: it is what is used of them, and is made here.
+    Args:
+        value: The tree.
+        change: Returns what stands for an array.
+        is_kept: Whether a dataclass keeps its arrays.
     """
     made: dict[int, Any] = {}
 
@@ -58,7 +61,7 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any]) -> Any:
                 made[id(value)] = change(value)
             return made[id(value)]
         if _is_record(value):
-            if hasattr(value, "prepared"):
+            if is_kept(value):
                 return value
             parts = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             new = {name: walk(part) for name, part in parts.items()}

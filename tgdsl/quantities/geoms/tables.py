@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -49,6 +49,7 @@ class TriangleTable:
         max_distance: How far a query looks [m].
     """
 
+    stays_on_host: ClassVar[bool] = True
     vertices: tuple[np.ndarray, ...]
     faces: tuple[np.ndarray, ...]
     max_distance: float
