@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import tgdsl
-from tgdsl.errors import ArtifactError, SimulationError, SpecError, StateError
+from tgdsl.errors import ArtifactError, BakeError, LowerError, SimulationError, SpecError, StateError, TgdslError
 from tgdsl.files.plugins import installed
 from tgdsl.testing import KindConformance
 
@@ -19,7 +19,7 @@ PLUGINS = Path(__file__).parents[2] / "examples" / "plugins"
 sys.path.append(str(PLUGINS))  # as its own package has it
 
 from accelerometer import ACCELEROMETER  # noqa: E402
-from dipoles import HALL, MU  # noqa: E402
+from dipoles import HALL, MAGNETIC_FIELD, MU  # noqa: E402
 
 SCENE = """<mujoco><option timestep=".002" gravity="0 0 -9.81"/><worldbody>
   <body name="pad" pos="0 0 1" quat=".6 0 .8 0"><geom type="box" size=".03 .03 .01"/></body>
@@ -50,7 +50,7 @@ class TestHall(KindConformance):
 def build(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
 
-    def compiled(**sensors):
+    def compiled(kinds=(ACCELEROMETER, HALL), **sensors):
         points = [{"pos": [0.01, 0.002, 0.01], "normal": [0, 0, 1], "radius": 0.004}]
         layout = {"resolutions": {"r": {"pad": {"method": "points", "points": points}}}}
         document = {
@@ -59,7 +59,7 @@ def build(tmp_path):
             "objects": {"item": {"body": "item"}},
             "sensors": sensors,
         }
-        return tgdsl.compile(document, kinds=[ACCELEROMETER, HALL], dtype="float64")
+        return tgdsl.compile(document, kinds=list(kinds), dtype="float64")
 
     return compiled
 
@@ -134,6 +134,86 @@ def test_a_block_wants_the_states_of_all_its_physics_steps(build):
 def test_a_block_has_no_history(build):
     with pytest.raises(SpecError, match="block of samples"):
         build(imu={"kind": "accelerometer", "links": "item", "substeps": 3, "history": 2})
+
+
+def test_blocks_of_a_document_are_of_one_length_and_have_no_clean_reading(build):
+    block = {"kind": "accelerometer", "links": "item", "substeps": 3}
+    with pytest.raises(SpecError, match=r'sensors\.b: it is advanced at 2 physics steps of a call, "a" at 3'):
+        build(a=block, b={**block, "substeps": 2})
+    with pytest.raises(SpecError, match=r"sensors\.a\.readout: this sensor reads a block of samples, which has no noise"):
+        build(a={**block, "readout": "both"})
+
+
+def test_after_substates_the_earlier_states_are_theirs(build):
+    sims = [tgdsl.simulate(build(a={"kind": "accelerometer", "links": "item", "substeps": 3}), 2, substeps=3) for _ in range(2)]
+    for sim in sims:
+        sim.step()
+    sims[0].step()
+    states = list(sims[1].substates())
+    found, expected = (sim.state() for sim in sims[::-1])
+    for one, other in zip((*found.substeps, found), (*expected.substeps, expected), strict=True):
+        assert torch.equal(one.body_pos, other.body_pos)
+    assert all(torch.equal(one.body_pos, other.body_pos) for one, other in zip(found.substeps, states, strict=False))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_of_a_fault_the_other_environments_make_their_whole_step(build):
+    places = []
+    for substeps in (0, 3):
+        sim = tgdsl.simulate(build(a={"kind": "accelerometer", "links": "item", "substeps": substeps}), 3, substeps=3)
+        sim.step()
+        sim.qvel[1] = 1e30
+        with pytest.raises(SimulationError, match="environments 1 diverged"):
+            sim.step()
+        places.append(sim.qpos[[0, 2]].clone())
+    assert torch.equal(*places)
+
+
+def test_substeps_that_are_no_states_are_refused(build):
+    touch = build(a={"kind": "accelerometer", "links": "item", "substeps": 3})
+    state = touch.example_state(1)
+    for wrong in (None, (1, 2)):
+        state.substeps = wrong
+        with pytest.raises(StateError, match=r"SceneState\.substeps: expected a tuple of tgdsl\.SceneState"):
+            touch(state)
+
+
+def magnets(**change):
+    return dataclasses.replace(HALL, quantities=(dataclasses.replace(MAGNETIC_FIELD, **change),))
+
+
+def refusing(error):
+    def plan(planning, uses):
+        raise error
+
+    return plan
+
+
+WRONG_QUANTITIES = {
+    "sensors.hall: cannot bake": magnets(plan=refusing(BakeError("cannot bake"))),
+    "sensors.hall.moment: too weak; wind more": magnets(plan=refusing(LowerError("too weak", "moment", "wind more"))),
+    'quantity "magnetic_field": `plan` returns NoneType, expected its part, FieldPart': magnets(
+        plan=lambda planning, uses: None
+    ),
+    'quantity "magnetic_field" reads the field temperature; known fields: body_angvel': magnets(
+        fields=lambda _: {"temperature"}
+    ),
+    '`gather` of the quantity "magnetic_field" returns 0 values': magnets(gather=lambda part, scene: ()),
+    '`gather` of the quantity "magnetic_field": expected a tuple': magnets(gather=lambda part, scene: None),
+    'quantity "magnetic_field": its `part` is no frozen dataclass': magnets(part=dict),
+    'quantity "a.b": its name has "/" or "."': magnets(name="a.b"),
+}
+
+
+@pytest.mark.parametrize("message", WRONG_QUANTITIES)
+def test_what_is_wrong_with_a_quantity_is_named(build, message):
+    def read():
+        touch = build(kinds=[WRONG_QUANTITIES[message]], hall={"kind": "hall", "links": "pad", "feels": ["item"]})
+        return touch(touch.example_state(2))
+
+    with pytest.raises(TgdslError) as error:
+        read()
+    assert message in str(error.value)
 
 
 def test_a_peek_and_a_loaded_state_go_on_alike(build, tmp_path):

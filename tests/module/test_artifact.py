@@ -190,7 +190,15 @@ def test_arrays_that_were_tampered_with(artifact, tmp_path):
     header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
     changed = {**arrays, REACH: arrays[REACH] * 2}
     lacking = {name: value for name, value in arrays.items() if name != REACH}
-    for bad in (changed, lacking):
+    half = {**arrays, REACH: arrays[REACH].astype(np.float16)}
+    for bad, message in (
+        (changed, "the arrays are not those that the plan was written with"),
+        (lacking, f'the array "{REACH}" of the plan is missing'),
+        ({**lacking, "quantities/reach": arrays[REACH]}, f'the array "{REACH}" of the plan is missing'),
+        ({**arrays, "quantities/reach": arrays[REACH]}, 'the plan has no array "quantities/reach"'),
+        (half, f'the array "{REACH}" is float16, expected float64, float32, int64, int32'),
+    ):
         (tmp_path / "bad.safetensors").write_bytes(save(bad, header))
-        with pytest.raises(ArtifactError, match="the arrays are not those that the plan was written with"):
+        with pytest.raises(ArtifactError) as error:
             load_plan(tmp_path / "bad.safetensors")
+        assert str(error.value) == f"{tmp_path / 'bad.safetensors'}: {message}"

@@ -91,3 +91,8 @@ def test_what_is_not_of_the_type_is_named_with_its_place(place, value, message):
 def test_frozen_arrays_are_of_the_plans_dtypes(given, kind):
     array = tree.frozen(np.array([[0, 1], [1, 0]], dtype=given).T)
     assert array.dtype == kind and array.flags.c_contiguous and not array.flags.writeable
+
+
+def test_numbers_of_numpy_are_plain_and_lists_are_walked():
+    assert tree.flatten({"a": np.int64(3), "b": [np.float64(0.5), np.bool_(True)]})[0] == {"a": 3, "b": [0.5, True]}
+    assert tree.mapped([np.zeros(2)], lambda array: "leaf") == ("leaf",)

@@ -1,5 +1,6 @@
 """What a kind may ask for and give: frames, contacts, surfaces, a reach of its own, reports per body, memory of any shape."""
 
+import copy
 import dataclasses
 from typing import Literal
 
@@ -15,7 +16,7 @@ from tgdsl.quantities.base import Request
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Channel, ContactProbeSpec, Lowered, Memory
+from tgdsl.sensors.base import Axis, Channel, ContactProbeSpec, LinkSpec, Lowered, Memory
 
 SCENE = """
 <mujoco><worldbody>
@@ -142,4 +143,134 @@ class Temperature(Request[torch.Tensor]):
 def test_a_request_that_no_quantity_answers_is_named(build):
     asking = dataclasses.replace(KIND, lower=lambda *given: dataclasses.replace(lower(*given), requests=(Temperature(),)))
     with pytest.raises(TgdslError, match=r'^no known quantity answers the request "Temperature"; give its kind the quantity'):
+        build(asking)
+
+
+def former(felt, probes, constants, state):
+    return {}, {}
+
+
+def unchecked(record, **change):
+    """Return a record with other values, of whatever types: as its author makes it where nobody checks them."""
+    record = copy.copy(record)
+    for name, value in change.items():
+        object.__setattr__(record, name, value)
+    return record
+
+
+WRONG_KINDS = {
+    "`forward(felt, probes, constants, state)`, expected `forward(gathered, context, constants, state)`": {"forward": former},
+    "`lower(spec, layout)`, expected `lower(spec, layout, surface_of)`": {"lower": lambda spec, layout: None},
+    "`reference(spec, layout, touch, state)`, expected `reference(spec, layout, gathered, context, state)`": {
+        "reference": lambda spec, layout, touch, state: None
+    },
+    "`quantities` is a NoneType, expected a tuple": {"quantities": None},
+}
+
+
+@pytest.mark.parametrize("message", WRONG_KINDS)
+def test_a_kind_that_cannot_be_called_as_kinds_are_is_refused_by_name(build, message):
+    with pytest.raises(TgdslError) as error:
+        build(unchecked(KIND, **WRONG_KINDS[message]))
+    assert 'kind "probe_all": ' in str(error.value) and message in str(error.value)
+
+
+WRONG_PARTS = {
+    "rows: found 'body', expected an Axis": {"rows": "body"},
+    "state \"a\": found 'points', expected `Memory`": {"state": {"a": unchecked(Memory(), shape="points")}},
+    'shape of the state "a": found Temperature, expected the type of a request that the kind makes': "temperature",
+    'shape of the state "a": found Contacts, expected a request whose quantity has `num_rows`': {
+        "state": {"a": Memory(shape=Contacts)}
+    },
+    "requests: found ContactDepth, expected a tuple": {"requests": ContactDepth(("ball",))},
+    "requests: found ContactDepth, expected requests, such as": {"requests": (ContactDepth,)},
+    'constant "k": found float, expected a NumPy array': {"constants": {"k": 2.0}},
+    'the constant "k.x" has a dot': {"constants": {"k.x": np.zeros(2)}},
+    'ContactDepth is asked of "nobody", which is none of the objects': {"requests": (ContactDepth(("nobody",)),)},
+    'the column "n" of its rows has 1 entries, expected one for each of 3': {"rows": Axis("voxel", 3, {"n": ["a"]})},
+    "its rows are 7, each called a taxel, but the sensor has 2": {"rows": Axis("taxel", 7)},
+    "`link_id` of its rows has shape (1,), expected (3,)": {"rows": Axis("voxel", 3, {}, np.zeros(1, dtype=np.int64))},
+}
+
+
+@pytest.mark.parametrize("message", WRONG_PARTS)
+def test_what_a_kind_may_not_say_of_a_sensor_is_named(build, message):
+    change = WRONG_PARTS[message]
+    change = {"state": {"a": Memory(shape=Temperature)}} if change == "temperature" else change
+
+    def lowered(*given):
+        return unchecked(lower(*given), **change)
+
+    with pytest.raises(TgdslError) as error:
+        build(dataclasses.replace(KIND, lower=lowered))
+    assert 'kind "probe_all"' in str(error.value) and message in str(error.value)
+
+
+WRONG_ANSWERS = {
+    "NoneType, expected planes by channel": lambda planes, state: None,
+    "without the channel calls": lambda planes, state: ({n: p for n, p in planes.items() if n != "calls"}, state),
+    "depth of shape (3, 1), expected 2 rows": lambda planes, state: (planes | {"depth": planes["depth"][:, :1]}, state),
+    'the state "other", which `Lowered.state` does not have: calls': lambda planes, state: (planes, {"other": state["calls"]}),
+    'the state "calls" of shape (3, 3), expected (3, 2, 3)': lambda planes, state: (planes, {"calls": state["calls"][:, 0]}),
+}
+
+
+@pytest.mark.parametrize("message", WRONG_ANSWERS)
+def test_what_forward_may_not_return_is_named(build, message):
+    touch = build(dataclasses.replace(KIND, forward=lambda *given: WRONG_ANSWERS[message](*forward(*given))))
+    with pytest.raises(TgdslError) as error:
+        touch(touch.example_state(3))
+    assert 'sensor "s": `forward` of the kind "probe_all" returns' in str(error.value) and message in str(error.value)
+
+
+def test_what_was_not_asked_for_is_named(build):
+    def asking(*given):
+        return dataclasses.replace(lower(*given), requests=(Contacts(given[0].objects, slots=3),))
+
+    touch = build(dataclasses.replace(KIND, lower=asking))
+    with pytest.raises(TgdslError, match=r"gathered\[ContactDepth\] was not asked for.*which hold Contacts"):
+        touch(touch.example_state(2))
+
+
+def test_a_kind_without_numbers_is_of_the_modules_dtype(tmp_path):
+    class NothingSpec(LinkSpec):
+        """Reads nothing."""
+
+        kind: Literal["nothing"]
+        """The kind."""
+
+    def nothing(gathered, context, constants, state):
+        return {"x": state["x"] + 1}, {"x": state["x"] + 1}
+
+    def rows(spec, layout, surface_of):
+        return Lowered((Channel("x", "1"),), rows=Axis("part", 2, {"name": np.array(["a", "b"])}), state={"x": Memory()})
+
+    (tmp_path / "scene.xml").write_text(SCENE)
+    robot = {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"a": POINTS}}}}
+    document = {"tgdsl": 1, "robot": robot, "sensors": {"s": {"kind": "nothing", "links": "a"}}}
+    kind = Kind(NothingSpec, rows, nothing, reference=lambda spec, layout, gathered, context, state: (np.zeros((2, 1)), {}))
+    touch = tgdsl.compile(document, kinds=[kind], dtype="float64")
+    state = touch.example_state(2)
+    assert touch.rows["s"]["name"].tolist() == ["a", "b"]
+    assert touch.dtype == touch(state)["s"].dtype == torch.float64
+    assert touch.float().dtype == touch(state)["s"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        ({"crosstalk": {"strength": 0.1, "sigma": "3 mm"}}, "crosstalk mixes neighbouring taxels"),
+        ({"release_threshold": "1 mm"}, "release_threshold is of a sensor with a threshold"),
+    ],
+)
+def test_noise_that_a_kinds_rows_cannot_have_is_a_located_mistake(build, noise, message):
+    knobs = frozenset({"crosstalk", "release_threshold"})
+    asking = unchecked(KIND, knobs=knobs, lower=lambda *given: dataclasses.replace(lower(*given), rows=Axis("voxel", 2)))
+    with pytest.raises(SpecError, match=rf"sensors\.s\.noise: {message}"):
+        build(asking, noise=noise)
+
+
+def test_contacts_with_nothing_are_refused(build):
+    asking = unchecked(KIND, lower=lambda *given: dataclasses.replace(lower(*given), requests=(Contacts((), slots=3),)))
+    with pytest.raises(TgdslError, match="Contacts is asked of no objects"):
         build(asking)

@@ -29,7 +29,9 @@ def measured_spec(spec: SensorSpec, knobs: Sequence[Knobs]) -> SensorSpec:
     if not released:
         return spec
     lowest, highest = min(low for low, _ in released), max(high for _, high in released)
-    threshold = spec.threshold  # type: ignore[attr-defined]
+    threshold = getattr(spec, "threshold", None)
+    if threshold is None:
+        raise LowerError("release_threshold is of a sensor with a threshold, and this one has none", "noise", "leave it out")
     if highest > threshold:
         what = f"release_threshold {highest:g} m is above the sensor's threshold {threshold:g} m"
         raise LowerError(what, field="noise", hint="expected at most that")
@@ -109,6 +111,9 @@ def imperfections(
         what = f"its rows are on no link (they are of a {rows.name} each), so noise cannot differ between links"
         raise LowerError(what, field="noise", hint="leave `links` of the noise out")
     which = of_link[rows.link_id] if rows.link_id is not None else np.zeros(rows.size, dtype=np.int64)
+    if rows.name != "taxel" and any(own.crosstalk is not None for own in knobs):
+        what = f"crosstalk mixes neighbouring taxels, and what this sensor reads is of a {rows.name} each"
+        raise LowerError(what, field="noise", hint="leave `crosstalk` out")
     channels = [channel.name for channel in lowered.signal or lowered.channels]
     sets = [_without_idle(name, kind, own) for own in sets]
     noise = lower_noise(sets, which, channels, layout, rows.name == "taxel")

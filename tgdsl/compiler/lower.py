@@ -15,7 +15,7 @@ from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.compiler.sensed import contact_parts
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError
+from tgdsl.errors import BakeError, LowerError, TgdslError, did_you_mean
 from tgdsl.plan import tree
 from tgdsl.plan.inputs import ContactPart, Inputs
 from tgdsl.plan.plan import Origin, Plan
@@ -160,7 +160,27 @@ def _quantities(
         except LowerError as error:
             sensor = shared.uses[quantity.name][0].sensors[0]
             report(("sensors", sensor, *([error.field] if error.field else [])), error.what, error.hint)
+        except BakeError as error:
+            report(("sensors", shared.uses[quantity.name][0].sensors[0]), str(error), "")
+    if not loaded.problems:
+        _check_parts(parts, asked)
     return parts
+
+
+def _check_parts(parts: Parts, asked: Sequence[Quantity]) -> None:
+    """Refuse what is no part of its quantity, or reads fields that a state does not have.
+
+    Raises:
+        TgdslError: With the quantity.
+    """
+    for quantity in asked:
+        part = parts[quantity.name]
+        if not isinstance(part, quantity.part):
+            what = f"`plan` returns {type(part).__name__}, expected its part, {quantity.part.__name__}"
+            raise TgdslError(f'quantity "{quantity.name}": {what}')
+        if unknown := sorted(set(quantity.fields(part)) - set(FIELDS)):
+            hint = did_you_mean(unknown[0], FIELDS, "fields")
+            raise TgdslError(f'quantity "{quantity.name}" reads the field {unknown[0]}; {hint}')
 
 
 def _inputs(
@@ -246,7 +266,8 @@ def _reading(name: str, rows: Axis, channels: Sequence[Channel], steps: int) -> 
 
 
 def _axis(rows: Axis) -> PlannedAxis:
-    numbers = {name: np.asarray(column) for name, column in rows.table.items() if isinstance(column, np.ndarray)}
+    arrays = {name: column for name, column in rows.table.items() if isinstance(column, np.ndarray)}
+    numbers = {name: column for name, column in arrays.items() if column.dtype.kind in "biuf"}
     texts = {name: tuple(map(str, column)) for name, column in rows.table.items() if name not in numbers}
     return PlannedAxis(rows.name, rows.size, texts, numbers)
 

@@ -11,7 +11,7 @@ import numpy as np
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
-from tgdsl.errors import LowerError
+from tgdsl.errors import LowerError, TgdslError
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
 from tgdsl.schema.loaded import Loaded
@@ -89,8 +89,42 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
         except LowerError as error:
             path: Path = ("sensors", name, *([error.field] if error.field else []))
             loaded.problems.append(loaded.problem(path, error.what, error.hint))
+    _check_blocks(loaded, sensors)
     loaded.raise_problems()
     return tuple(sensors)
+
+
+def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: SensorSpec, resolved: Resolved) -> None:
+    """Refuse requests of objects that are not there, and rows that are not where they say.
+
+    Raises:
+        TgdslError: With the kind and what is wrong.
+    """
+    for request in lowered.requests:
+        if request.wants_contacts and not request.objects:
+            raise TgdslError(f'kind "{kind.name}": {type(request).__name__} is asked of no objects, expected at least one')
+        if unknown := [name for name in request.objects if name not in resolved.objects]:
+            what = f'{type(request).__name__} is asked of "{unknown[0]}", which is none of the objects that its spec has'
+            raise TgdslError(f'kind "{kind.name}": {what}; its `objects`: {", ".join(spec.objects) or "none"}')
+    rows = rows_of(lowered, layout, spec)
+    sizes = {"taxel": layout.num_taxels, "body": len(layout.bodies)}
+    if sizes.get(rows.name, rows.size) != rows.size:
+        what = f"its rows are {rows.size}, each called a {rows.name}, but the sensor has {sizes[rows.name]}"
+        raise TgdslError(f'kind "{kind.name}": {what}; give them another name, `Axis("…", {rows.size})`')
+    own = rows.link_id
+    if own is not None and (own.shape != (rows.size,) or ((own < 0) | (own >= len(layout.links))).any()):
+        what = f"`link_id` of its rows has shape {own.shape}, expected ({rows.size},) of numbers below {len(layout.links)}"
+        raise TgdslError(f'kind "{kind.name}": {what}')
+
+
+def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
+    """Note sensors that are advanced at another number of physics steps than those before them."""
+    blocks = [sensor for sensor in sensors if sensor.lowered.substeps]
+    for sensor in blocks[1:]:
+        first, own = blocks[0], sensor.lowered.substeps
+        if own != first.lowered.substeps:
+            what = f'it is advanced at {own} physics steps of a call, "{first.sensor}" at {first.lowered.substeps}'
+            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what, "expected as many of all"))
 
 
 def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
@@ -99,6 +133,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     taxels, layout = resolved.layout_on(name)
     clean = kind.lower(spec, layout, resolved.surface_of)
     check_lowered(kind, clean, spec)
+    _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
         return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
     knobs = knobs_of(loaded, resolved, name, layout, kind)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tgdsl.errors import TgdslError
 from tgdsl.plan import tree
 from tgdsl.plan.plan import Plan
 from tgdsl.plan.sensors import PlannedSensor
@@ -80,12 +81,21 @@ def scene_of(plan: Plan, own: Tree, tensors: Tensors, nows: Mapping[str, Now], k
 
 def gather(quantities: Sequence[Quantity], own: Tree, scene: Scene) -> dict[str, tuple[Any, ...]]:
     """Return the values of all uses of each quantity, by its name."""
-    return {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+    found = {quantity.name: quantity.gather(own["quantities"][quantity.name], scene) for quantity in quantities}
+    for name, values in found.items():
+        if not isinstance(values, (tuple, list)):
+            what = f"expected a tuple with a value for each use, found {type(values).__name__}"
+            raise TgdslError(f'`gather` of the quantity "{name}": {what}')
+    return found
 
 
 def gathered_of(sensor: PlannedSensor, quantities: Sequence[Quantity], values: Mapping[str, tuple[Any, ...]]) -> Gathered:
     """Return what a sensor asked for."""
     own = [quantity for quantity in quantities if quantity.name in sensor.uses]
+    for name in (quantity.name for quantity in own):
+        if sensor.uses[name] >= len(values[name]):
+            what = f'{len(values[name])} values, and sensor "{sensor.name}" has use {sensor.uses[name]} (from 0)'
+            raise TgdslError(f'`gather` of the quantity "{name}" returns {what}; expected one for each use')
     return Gathered({quantity.request: values[quantity.name][sensor.uses[quantity.name]] for quantity in own})
 
 

@@ -76,6 +76,8 @@ class Incoming:
     def _substeps(self, state: SceneState, device: torch.device, num_envs: int) -> dict[str, Tensor]:
         """Return the fields of earlier substeps."""
         inputs, found = self._plan.inputs, {}
+        if not (isinstance(state.substeps, (tuple, list)) and all(isinstance(part, SceneState) for part in state.substeps)):
+            raise StateError("SceneState.substeps: expected a tuple of tgdsl.SceneState")
         if len(state.substeps) != inputs.substeps - 1:
             what = f"SceneState.substeps holds {len(state.substeps)} states, expected {inputs.substeps - 1}"
             raise StateError(

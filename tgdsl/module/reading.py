@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.errors import TgdslError, listed
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
@@ -75,8 +76,7 @@ def read(
     if at is not None and kind.gains_depth:
         felt = gathered[ContactDepth]
         gathered = gathered.replaced(ContactDepth, felt._replace(depth=stages.gain(knobs, at, felt.depth) * felt.depth))
-    found, new = ({}, {}) if joined is not None else kind.forward(gathered, context, constants, _own(memory))
-    new = dict(new)
+    found, new = ({}, {}) if joined is not None else _answer(sensor, kind, gathered, context, constants, _own(memory))
     signal = clean = _stacked(found, "signal", sensor.signal) if joined is None else joined
     if at is not None and not kind.gains_depth:
         signal = stages.gain(knobs, at, clean[:, 0])[:, None] * clean
@@ -125,11 +125,47 @@ def block(
     """
     samples, state = [], _own(memory)
     for own, context in zip(gathered, contexts, strict=True):
-        found, new = kind.forward(own, context, constants, state)
+        found, new = _answer(sensor, kind, own, context, constants, state)
         state = {**state, **new}
         made = _stacked(found, "signal", sensor.signal)
         samples.append(made if made.ndim == 4 else made[:, None])
     return {sensor.name: torch.cat(samples, dim=1).transpose(2, 3)}, dict(state)
+
+
+def _answer(
+    sensor: PlannedSensor, kind: Kind, gathered: Gathered, context: Context, constants: Constants, state: Tensors
+) -> tuple[Tensors, Tensors]:
+    """Return what a kind's `forward` returns, after a look at it.
+
+    Raises:
+        TgdslError: If it is not what the kind said when it was lowered.
+    """
+    answer = kind.forward(gathered, context, constants, state)
+    if not torch.compiler.is_compiling():
+        _check_answer(sensor, answer, state)
+    found, new = answer
+    return dict(found), dict(new)
+
+
+def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None:
+    where = f'sensor "{sensor.name}": `forward` of the kind "{sensor.kind}" returns'
+    if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
+        raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
+    found, new = answer
+    if missing := [name for name in sensor.signal if name not in found and "signal" not in found]:
+        raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without the channel {missing[0]}")
+    num_rows = sensor.readings[0].num_rows
+    for name in ("signal",) if "signal" in found else sensor.signal:
+        if found[name].shape[-1] != num_rows:
+            shape = tuple(found[name].shape)
+            raise TgdslError(f"{where} {name} of shape {shape}, expected {num_rows} rows as its reading has, (env, {num_rows})")
+    for name, value in new.items():
+        if name not in state:
+            known = listed(list(state)) or "none"
+            raise TgdslError(f'{where} the state "{name}", which `Lowered.state` does not have: {known}')
+        if value.shape != state[name].shape:
+            shapes = f"{tuple(value.shape)}, expected {tuple(state[name].shape)}"
+            raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
 def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:

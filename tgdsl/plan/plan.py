@@ -117,16 +117,20 @@ class Plan:
         except (ValueError, TypeError, AttributeError) as error:
             raise ArtifactError(f"not a plan: {error}") from error
         if version != FORMAT:
-            raise ArtifactError(f"plan format {version} is not {FORMAT}, which this version of tgdsl reads; compile again")
-        if digest != _digest(arrays):
-            raise ArtifactError("the arrays are not those that the plan was written with")
+            raise ArtifactError(f"plan format {version!r} is not {FORMAT}, which this version of tgdsl reads; compile again")
         hints = get_type_hints(Plan)
         names = {field.name for field in dataclasses.fields(Plan)}
         if plain.keys() != names:
             raise ArtifactError(f"a plan has the parts {sorted(names)}, found {sorted(plain)}")
+        _check_arrays(plain, arrays)
         asked = plain.pop("quantities")
         values = {name: tree.restored(hints[name], part, arrays, name) for name, part in plain.items()}
-        return Plan(**values, quantities=_quantities(asked, arrays, quantities))
+        plan = Plan(**values, quantities=_quantities(asked, arrays, quantities))
+        if unknown := sorted(arrays.keys() - tree.named([plain, asked])):
+            raise ArtifactError(f'the plan has no array "{unknown[0]}"')
+        if digest != _digest(arrays):
+            raise ArtifactError("the arrays are not those that the plan was written with")
+        return plan
 
     def _parts(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
@@ -142,6 +146,20 @@ def _quantities(plain: Any, arrays: Mapping[str, np.ndarray], known: Sequence[Qu
         raise ArtifactError(f'the plan asks for the quantity "{missing[0]}", which is not known; {hint}')
     own = [(name, by_name[name].part) for name in by_name if name in plain]
     return {name: tree.restored(part, plain[name], arrays, f"quantities/{name}") for name, part in own}
+
+
+def _check_arrays(plain: Any, arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse a plan some of whose arrays are missing, or of dtypes that no plan has.
+
+    Raises:
+        ArtifactError: With the array's name.
+    """
+    if missing := sorted(tree.named(plain) - arrays.keys()):
+        raise ArtifactError(f'the array "{missing[0]}" of the plan is missing')
+    for name, array in sorted(arrays.items()):
+        if array.dtype not in tree.DTYPES:
+            allowed = ", ".join(str(np.dtype(dtype)) for dtype in tree.DTYPES)
+            raise ArtifactError(f'the array "{name}" is {array.dtype}, expected {allowed}')
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:

@@ -17,6 +17,8 @@ from tgdsl.errors import ArtifactError
 
 LEAF = "array"
 """Key of what stands for an array in JSON: its name."""
+DTYPES = (np.float64, np.float32, np.int64, np.int32)
+"""Dtypes that arrays of the Plan have."""
 
 
 def inline() -> Any:
@@ -40,9 +42,18 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
             return {str(key): plain(part, _joined(path, str(key))) for key, part in value.items()}
         if isinstance(value, (tuple, list)):
             return [plain(part, _joined(path, _key(part, i))) for i, part in enumerate(value)]
-        return value
+        return value.item() if isinstance(value, np.generic) else value
 
     return plain(value, path), arrays
+
+
+def named(plain: Any) -> set[str]:
+    """Return the names of the arrays that a tree which was made plain has."""
+    if isinstance(plain, dict):
+        if set(plain) == {LEAF} and isinstance(plain[LEAF], str):
+            return {plain[LEAF]}
+        return set().union(*map(named, plain.values()))
+    return set().union(*map(named, plain)) if isinstance(plain, list) else set()
 
 
 def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[Any], bool] = lambda record: False) -> Any:
@@ -69,7 +80,7 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
         if isinstance(value, Mapping):
             found = {key: walk(part) for key, part in value.items()}
             return value if all(found[key] is part for key, part in value.items()) else found
-        if isinstance(value, tuple):
+        if isinstance(value, (tuple, list)):
             parts = tuple(walk(part) for part in value)
             return value if all(a is b for a, b in zip(parts, value, strict=True)) else parts
         return value

@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
+from tgdsl.errors import TgdslError
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.quantities.pairs import Pair, PairedObject, Pairs
 from tgdsl.surfaces.geom import SurfaceGeom
@@ -241,6 +242,16 @@ class Gathered(dict[type[Request], Any]):
     if TYPE_CHECKING:
 
         def __getitem__(self, request: type[Request[Value]]) -> Value: ...
+
+    def __missing__(self, request: object) -> Any:
+        """Say what was not asked for.
+
+        Raises:
+            TgdslError: Always.
+        """
+        wanted = getattr(request, "__name__", repr(request))
+        asked = ", ".join(own.__name__ for own in self) or "none"
+        raise TgdslError(f"gathered[{wanted}] was not asked for: put it among `Lowered.requests`, which hold {asked}")
 
     def replaced(self, request: type[Request[Value]], value: Value) -> Gathered:
         """Return the same with another value for a request."""

@@ -8,6 +8,7 @@ A package brings a quantity by an entry point, in its pyproject.toml:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 from tgdsl.files.plugins import known
@@ -44,4 +45,8 @@ def _wrong(quantity: object) -> str:
         return f"found {type(quantity).__name__}, expected a tgdsl.quantities.Quantity"
     if not (isinstance(quantity.request, type) and issubclass(quantity.request, Request)):
         return "its `request` is no type of tgdsl.quantities.Request"
+    if not (isinstance(quantity.part, type) and dataclasses.is_dataclass(quantity.part)):
+        return f'quantity "{quantity.name}": its `part` is no frozen dataclass'
+    if any(mark in quantity.name for mark in "/."):
+        return f'quantity "{quantity.name}": its name has "/" or ".", which part the names of arrays'
     return ""

@@ -85,7 +85,7 @@ def _noise_problems(loaded: Loaded, name: str, noise: str | NoiseSpec, kind: Kin
     for pattern, knobs in [("", base), *links]:
         for knob in (knob for knob in knobs.active() if knob not in kind.knobs):
             what = f'"{kind.name}" has no knob "{knob}"'
-            hint = f"it has {', '.join(sorted(kind.knobs))}"
+            hint = f"it has {', '.join(sorted(kind.knobs)) or 'none'}"
             place = (*path, "links", pattern, knob) if pattern else (*path, knob)
             is_own = own is not None and (pattern in own.links if pattern else knob in own.model_fields_set)
             where = "" if is_own else f" (in the profile {' → '.join(chain)})"

@@ -8,17 +8,30 @@ A package brings a kind by an entry point, in its pyproject.toml:
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from tgdsl.errors import LowerError, TgdslError, did_you_mean
 from tgdsl.files.plugins import known
-from tgdsl.quantities.base import Quantity
+from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
-from tgdsl.sensors.base import Kind, Lowered, SensorSpec
+from tgdsl.sensors.base import Axis, Kind, Lowered, Memory, SensorSpec
 
 GROUP = "tgdsl.kinds"
 """Group of the entry points by which packages bring kinds."""
+ARGUMENTS = {
+    "lower": ("spec", "layout", "surface_of"),
+    "forward": ("gathered", "context", "constants", "state"),
+    "reference": ("spec", "layout", "gathered", "context", "state"),
+    "decide": ("planes", "constants", "state"),
+}
+"""What a kind's functions are called with, in this order."""
+FORMER = {"probes"}
+"""Names of arguments that there were before kinds made requests."""
 
 
 def known_kinds(given: Sequence[Kind] = ()) -> tuple[Kind, ...]:
@@ -70,6 +83,7 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
         TgdslError: With the kind and what is wrong.
         LowerError: If the document asks of a block what a block has not.
     """
+    _check_parts(kind, lowered)
     channels = [*lowered.channels, *(lowered.signal or ()), *(c for report in lowered.reports.values() for c in report)]
     if any(channel.name == "signal" for channel in channels):
         what = 'what `forward` returns as "signal" is all channels in one tensor'
@@ -86,8 +100,54 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
     if lowered.substeps and (spec.rate is not None or spec.history is not None):
         field = "rate" if spec.rate is not None else "history"
         raise LowerError("this sensor reads a block of samples at each call", field, f"leave `{field}` out")
+    if lowered.substeps and spec.readout == "both":
+        raise LowerError("this sensor reads a block of samples, which has no noise", "readout", "leave `readout` out")
     if lowered.substeps and lowered.reports:
         raise TgdslError(f'kind "{kind.name}" has reports and reads blocks; a block has none')
+
+
+def _check_parts(kind: Kind, lowered: Any) -> None:
+    """Refuse parts of a lowered sensor that are not of their types.
+
+    Raises:
+        TgdslError: With the kind, what was found, and what would be right.
+    """
+
+    def refuse(what: str, found: object, expected: str) -> None:
+        shown = found.__name__ if isinstance(found, type) else repr(found) if isinstance(found, str) else type(found).__name__
+        raise TgdslError(f'kind "{kind.name}": {what}: found {shown}, expected {expected}')
+
+    if not isinstance(lowered, Lowered):
+        refuse("`lower` returns", lowered, "a tgdsl.sensors.base.Lowered")
+    if not isinstance(lowered.requests, (tuple, list)):
+        refuse("requests", lowered.requests, "a tuple of them, `requests=(…,)`")
+    for request in lowered.requests:
+        if not isinstance(request, Request):
+            refuse("requests", request, "requests, such as `ContactDepth(spec.objects)`")
+    for name, value in lowered.constants.items():
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf":
+            refuse(f'constant "{name}"', value, "a NumPy array of numbers; `scalar` makes one of a number")
+        if "." in name:
+            raise TgdslError(f'kind "{kind.name}": the name of the constant "{name}" has a dot; expected none')
+    for name, memory in lowered.state.items():
+        if not isinstance(memory, Memory) or not (memory.shape is None or isinstance(memory.shape, (tuple, type))):
+            shape = memory.shape if isinstance(memory, Memory) else memory
+            refuse(f'state "{name}"', shape, "`Memory` with a tuple for its shape, None, or the type of a request of the kind")
+        if isinstance(memory.shape, type):
+            brought = {quantity.request: quantity for quantity in quantities_of((kind,))}
+            quantity = brought.get(memory.shape)
+            if not any(type(request) is memory.shape for request in lowered.requests):
+                refuse(f'shape of the state "{name}"', memory.shape, "the type of a request that the kind makes")
+            if quantity is not None and quantity.num_rows is None:
+                refuse(f'shape of the state "{name}"', memory.shape, "a request whose quantity has `num_rows`")
+    if lowered.rows is None:
+        return
+    if not isinstance(lowered.rows, Axis):
+        refuse("rows", lowered.rows, "an Axis, such as `body_axis(layout)`")
+    for name, column in lowered.rows.table.items():
+        if len(column) != lowered.rows.size:
+            what = f'the column "{name}" of its rows has {len(column)} entries, expected one for each of {lowered.rows.size}'
+            raise TgdslError(f'kind "{kind.name}": {what}')
 
 
 def _wrong(kind: object) -> str:
@@ -98,4 +158,26 @@ def _wrong(kind: object) -> str:
     names = getattr(field and field.annotation, "__args__", ())
     if len(names) != 1 or not isinstance(names[0], str):
         return f'the spec {kind.spec.__name__} has no field `kind: Literal["its_name"]`'
-    return ""
+    if not isinstance(kind.quantities, (tuple, list)):
+        return f'kind "{names[0]}": `quantities` is a {type(kind.quantities).__name__}, expected a tuple of them'
+    calls = ((name, getattr(kind, name)) for name in ARGUMENTS)
+    return next((wrong for name, call in calls if call is not None and (wrong := _wrong_call(names[0], name, call))), "")
+
+
+def _wrong_call(kind: str, name: str, call: Any) -> str:
+    """Return why a kind's function cannot be called as kinds are, or nothing."""
+    wanted = ARGUMENTS[name]
+    try:
+        signature = inspect.signature(call)
+    except (TypeError, ValueError):  # of what is written in C there may be none
+        return "" if callable(call) else f'kind "{kind}": `{name}` is a {type(call).__name__}, expected a function'
+    try:
+        signature.bind(*wanted)
+        fits = True
+    except TypeError:
+        fits = False
+    if fits and not FORMER & set(list(signature.parameters)[: len(wanted)]):
+        return ""
+    found = ", ".join(signature.parameters)
+    hint = "the CHANGELOG says what was renamed when kinds began to make requests"
+    return f'kind "{kind}": found `{name}({found})`, expected `{name}({", ".join(wanted)})`; {hint}'

@@ -37,13 +37,15 @@ class Constants(HookedModule):
             self._exact = {name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
             for name, exact in self._exact.items():
                 self.register_buffer(name, exact.to(dtype) if exact.is_floating_point() else exact.clone(), persistent=False)
+        self._like = torch.empty(0, dtype=dtype)
         self._bind = bind
         self._rebind()
 
     @property
     def dtype(self) -> torch.dtype:
-        """Dtype of the floats."""
-        return next((b.dtype for b in buffers_of(self).values() if b is not None and b.is_floating_point()), torch.float32)
+        """Dtype of the floats, or what it would be if there are none."""
+        floats = (b.dtype for b in buffers_of(self).values() if b is not None and b.is_floating_point())
+        return next(floats, self._like.dtype)
 
     @property
     def device(self) -> torch.device:
@@ -75,6 +77,7 @@ class Constants(HookedModule):
         """Move or cast all buffers, from the Plan's float64 where nobody has changed them."""
         held = buffers_of(self)
         before = dict(held)
+        self._like = fn(self._like)
         move()
         for name, exact in self._exact.items():
             old, new = before[name], held[name]

@@ -129,11 +129,17 @@ class Simulation(ABC):
             self._advance(self.substeps)
             return
         self._earlier.begin(self.substeps)
+        fault = None
         for i in range(self.substeps):
             if i:
                 self._earlier.note(self._state(float(self.model.opt.timestep)))
-            self._advance(1)
+            try:
+                self._advance(1)
+            except SimulationError as error:  # the other environments make their step all the same
+                fault = error
         self._earlier.restart(self._faults.restarted)
+        if fault is not None:
+            raise fault
 
     def substates(self, control: Tensor | np.ndarray | None = None) -> Iterator[SceneState]:
         """Advance all environments by one control step, and hand out the state after each of its physics steps.
@@ -152,9 +158,16 @@ class Simulation(ABC):
             SimulationError: As `step` does, at the physics step where it happens.
         """
         self._begin_step(control)
-        for _ in range(self.substeps):
+        if self._earlier.are_wanted:
+            self._earlier.begin(self.substeps)
+        for i in range(self.substeps):
             self._advance(1)
-            yield self._state(float(self.model.opt.timestep))
+            state = self._state(float(self.model.opt.timestep))
+            if self._earlier.are_wanted:
+                if i < self.substeps - 1:
+                    self._earlier.note(state)
+                self._earlier.restart(self._faults.restarted)
+            yield state
 
     def state(self) -> SceneState:
         """Return what the module wants on its device, all of one instant; `dt` is that of a control step.

@@ -55,6 +55,14 @@ class SubstepStates:
         if self._earlier:
             self._restarted = chosen.clone() if self._restarted is None else self._restarted | chosen
 
+    def stepped(self, restarted: Bool[Tensor, " env"]) -> None:
+        """Note that a captured step has written the states anew, and which environments it has started anew.
+
+        A replayed graph runs no Python: neither `begin` nor `restart`.
+        """
+        if self._earlier:
+            self._restarted = restarted.clone()
+
     def added_to(self, state: SceneState) -> SceneState:
         """Return a state with the earlier ones; in environments that have just begun an episode they are as it is."""
         if not self.are_wanted:
