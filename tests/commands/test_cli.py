@@ -145,7 +145,8 @@ def test_explain_of_document_and_artefact(base, here):
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout == tgdsl.load(base / "pad.safetensors").explain() + "\n"
     assert here(base, "explain", "pad.yaml") == (0, ran.stdout, "")
-    assert "16 probes against cube (box)" in here(base, "explain", "pad.yaml", "--set", "resolution=high")[1]
+    said = here(base, "explain", "pad.yaml", "--set", "resolution=high")[1]
+    assert "asks for depth of 16 probes (query 0)" in said and " in cube (box), " in said
 
 
 def test_an_artefact_cannot_be_overridden(base, fails):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -62,8 +63,7 @@ class Constants(HookedModule):
 
     def refresh(self) -> None:
         """Bind again if some buffer is another tensor than before, as under `torch.func.functional_call`."""
-        held = buffers_of(self)
-        if any(held[name] is not tensor for name, tensor in self._bound.items()):
+        if not all(map(operator.is_, buffers_of(self).values(), self._bound.values())):  # at each call, so in C
             self._rebind()
 
     def _rebind(self) -> None:

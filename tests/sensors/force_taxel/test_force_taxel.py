@@ -33,7 +33,7 @@ class TestForceTaxel(KindConformance):
         for state in self.states(module):
             readings = module(state)
             for env in range(self.num_envs):
-                felt = reference._touch(state, env, np.zeros(3))
+                felt = reference.gathered(state, env, np.zeros(3))
                 _, missed, residual = reference_reports(reference.spec, reference.layout, felt)
                 np.testing.assert_allclose(readings["s/missed"][env], missed, atol=1e-11)
                 np.testing.assert_allclose(readings["s/residual"][env], residual, atol=1e-12)

@@ -1,0 +1,36 @@
+"""Gathered points: what kernels read of a pose lies in memory alike, whatever the gate."""
+
+import pytest
+import torch
+
+import tgdsl
+from tgdsl.module.gathering import scene_of
+from tgdsl.quantities.points import POINTS
+
+SCENE = """<mujoco><worldbody>
+  <body name="pad"><geom type="box" size=".03 .03 .01"/></body>
+  <body name="tip" pos=".2 0 0"><freejoint/><geom type="sphere" size=".01"/></body>
+  <body name="item" pos="0 0 .05"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
+def test_all_planes_of_a_pose_have_the_same_strides(tmp_path, gate):
+    """A kernel steps through the twelve planes by the strides of the first."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml"), "layout": {"resolutions": {"r": {"pad": points, "tip": points}}}},
+        "objects": {"item": {"body": "item"}},
+        "sensors": {
+            "s": {"kind": "elastomer", "links": "*", "feels": ["item"], "anchors": "points", "points": 20, "gate": gate}
+        },
+    }
+    touch = tgdsl.compile(document)
+    state = touch.example_state(5)
+    tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
+    scene = scene_of(touch.plan, touch.constants.tree, tensors, {}, {}, torch.float32)
+    ((own,),) = [found.values() for found in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
+    strides = {part.stride() for part in (*own.pairs.rotation, *own.pairs.offset)}
+    assert len(strides) == 1 and (own.pairs.gate is not None) == (gate == "contact_pair")
