@@ -1,17 +1,16 @@
 """Sources that installed packages bring, simulators among them; MuJoCo Warp connected to like any other; unknown options."""
 
 import re
-import sys
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from installed_packages import installing
 from warp_cases import SCENE, module
 
 import tgdsl
 from tgdsl.errors import ObservationError, SimulationError, TgdslError
-from tgdsl.files.plugins import installed
 from tgdsl.runtime.known import SOURCES, known_sources
 from tgdsl.runtime.source import Simulator, Source
 
@@ -73,23 +72,8 @@ OWN = [kind.name for kind in SOURCES]
 @pytest.fixture
 def install(tmp_path, monkeypatch):
     """Return a function that installs a package with sources, as pip would, for one test."""
-
-    def add(package: str, version: str, **points: str) -> None:
-        site = tmp_path / f"site_{package}"
-        info = site / f"{package}-{version}.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
-        lines = [f"{name} = {value}" for name, value in points.items()]
-        (info / "entry_points.txt").write_text("[tgdsl.sources]\n" + "\n".join(lines) + "\n")
-        (site / f"{package}.py").write_text(MODULE)
-        monkeypatch.syspath_prepend(site)
-        installed.cache_clear()
-
-    installed.cache_clear()
-    yield add
-    for name in ("grippy", "handy"):
-        sys.modules.pop(name, None)
-    installed.cache_clear()
+    with installing(tmp_path, monkeypatch, "tgdsl.sources", MODULE) as install:
+        yield install
 
 
 def observed(folder):

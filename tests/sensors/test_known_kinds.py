@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from installed_packages import installing
 
 import tgdsl
 from tgdsl.errors import SpecError, TgdslError
-from tgdsl.files.plugins import installed
 from tgdsl.schema.document import json_schema
 from tgdsl.sensors import CONTACT, KINDS
 from tgdsl.sensors.known import known_kinds
@@ -72,25 +72,10 @@ sensors: {mine: {kind: inverse, links: pad, feels: [item], scale: 3}}
 @pytest.fixture
 def install(tmp_path, monkeypatch):
     """Return a function that installs a package with kinds, as pip would, for one test."""
-
-    def add(package: str, version: str, **points: str) -> None:
-        site = tmp_path / f"site_{package}"
-        info = site / f"{package}-{version}.dist-info"
-        info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
-        lines = [f"{name} = {value}" for name, value in points.items()]
-        (info / "entry_points.txt").write_text("[tgdsl.kinds]\n" + "\n".join(lines) + "\n")
-        (site / f"{package}.py").write_text(MODULE)
-        monkeypatch.syspath_prepend(site)
-        installed.cache_clear()
-
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "hand.yaml").write_text(DOCUMENT)
-    installed.cache_clear()
-    yield add
-    for name in ("touchy", "feely"):
-        sys.modules.pop(name, None)
-    installed.cache_clear()
+    with installing(tmp_path, monkeypatch, "tgdsl.kinds", MODULE) as install:
+        yield install
 
 
 def test_a_kind_that_nobody_brings(install, tmp_path):
