@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tgdsl.compiler import passes
+from tgdsl.compiler.links import link_parts
 from tgdsl.compiler.lowered import LoweredSensor, lowered_sensors
 from tgdsl.compiler.observed import Observed, observed
 from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
@@ -59,9 +60,9 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
             should.
     """
     sensors = lowered_sensors(loaded, resolved, kinds, progress)
-    pruned = passes.prune(sensors, resolved.objects, resolved.scene)
+    pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)
     _report_hopeless(loaded, pruned)
-    parts_of = _contact_parts(loaded, resolved, sensors, pruned)
+    touched = _contact_parts(loaded, resolved, sensors, pruned)
     joined, quantities = passes.join(sensors), quantities_of(kinds)
     shared = passes.share(sensors, joined, resolved.layout, quantities)
     numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
@@ -74,7 +75,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
     made = Plan(
         origin=origin,
-        inputs=_inputs(sensors, pruned, numbered, shared, parts, asked, parts_of, seen),
+        inputs=_inputs(sensors, pruned, numbered, shared, parts, asked, touched, seen),
         layout=resolved.layout,
         objects=numbered.objects,
         pairs=numbered.table,
@@ -101,20 +102,43 @@ def _report_hopeless(loaded: Loaded, pruned: Pruned) -> None:
         loaded.problems.append(loaded.problem(path, what, hint))
 
 
-def _contact_parts(
-    loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned
-) -> dict[str, tuple[ContactPart, ...]]:
-    """Return which geoms' contacts are an object's; what cannot be told apart is a mistake."""
-    parts = {}
+class ContactParts(NamedTuple):
+    """Which geoms' contacts are an object's and a link's, by name, where they are not just those of its body."""
+
+    objects: dict[str, tuple[ContactPart, ...]]
+    links: dict[str, tuple[ContactPart, ...]]
+
+
+def _contact_parts(loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned) -> ContactParts:
+    """Return which geoms' contacts are an object's and a link's; what cannot be told apart is a mistake."""
+    objects = {}
     for name in sorted({pair.object for pair in pruned.contact_pairs}):
 
         def report(what: str, hint: str, at: Path = ("objects", name, "surface")) -> None:
             loaded.problems.append(loaded.problem(at, what, hint))
 
-        parts[name] = contact_parts(resolved.scene, resolved.objects[name], report)
+        felt = resolved.objects[name]
+        own = contact_parts(resolved.scene, felt.bodies, felt.touched, report)
+        objects |= {name: own} if own != (ContactPart("body", felt.body),) else {}
     for sensor in sensors:
         for request in (request for request in sensor.requests if request.wants_contacts):
             _check_shared(loaded, resolved, sensor, request)
+    return ContactParts(objects, _link_parts(loaded, resolved, sensors, pruned))
+
+
+def _link_parts(
+    loaded: Loaded, resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: Pruned
+) -> dict[str, tuple[ContactPart, ...]]:
+    """Return which geoms' contacts are a link's; what cannot be told apart is a mistake."""
+    parts = {}
+    for link in sorted({pair.link for pair in pruned.contact_pairs}):
+        at: Path = ("sensors", next(sensor.sensor for sensor in sensors if link in sensor.layout.bodies), "links")
+
+        def report(what: str, hint: str, at: Path = at, link: str = link) -> None:
+            loaded.problems.append(loaded.problem(at, f'body "{link}" and what is welded to it: {what}', hint))
+
+        own = link_parts(resolved.scene, resolved.link_bodies[link], report)
+        parts |= {link: own} if own else {}
     return parts
 
 
@@ -190,7 +214,7 @@ def _inputs(
     shared: Shared,
     parts: Parts,
     asked: Sequence[Quantity],
-    contact_parts_of: Mapping[str, tuple[ContactPart, ...]],
+    touched: ContactParts,
     seen: Observed,
 ) -> Inputs:
     """Return what the module wants of a scene."""
@@ -210,7 +234,8 @@ def _inputs(
         num_variants=tuple(target.num_variants for target in varied),
         joints=seen.joints,
         actuators=seen.actuators,
-        contacts_of={n: own for n, own in contact_parts_of.items() if own != (ContactPart("body", body_of[n]),)},
+        contacts_of=touched.objects,
+        link_parts=touched.links,
         substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
     )
 

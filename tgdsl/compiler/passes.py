@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tgdsl.compiler.links import LinkBodies
 from tgdsl.compiler.lowered import LoweredSensor
 from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
@@ -40,8 +41,16 @@ class Pruned(NamedTuple):
     hopeless: tuple[tuple[str, str], ...]
 
 
-def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], scene: Model) -> Pruned:
-    """Return the pairs that some request is of and that can meet."""
+def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], link_bodies: LinkBodies, scene: Model) -> Pruned:
+    """Return the pairs that some request is of and that can meet.
+
+    Args:
+        sensors: The sensors.
+        sensed: The objects.
+        link_bodies: The bodies of each link.
+        scene: The scene.
+    """
+    geoms = {link: [geom.id for geom in scene.rigid_geoms(bodies) if geom.is_colliding] for link, bodies in link_bodies.items()}
     wanted: set[Pair] = set()
     touching: set[Pair] = set()
     never: set[Pair] = set()
@@ -50,7 +59,7 @@ def prune(sensors: Sensors, sensed: Mapping[str, SensedObject], scene: Model) ->
         for target in dict.fromkeys(name for request in sensor.requests for name in request.objects):
             own = [request for request in sensor.requests if target in request.objects]
             pairs, felt = {Pair(body, target) for body in sensor.layout.bodies}, sensed[target]
-            meeting = {p for p in pairs if scene.can_collide_with(p.link, felt.touched)}
+            meeting = {p for p in pairs if scene.geoms_can_collide(geoms[p.link], felt.touched)}
             is_gated = any(request.is_gated for request in own)
             if is_gated or any(request.wants_contacts for request in own):
                 touching |= meeting

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgdsl.compiler.links import LinkBodies, link_bodies
 from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
@@ -53,6 +54,7 @@ class Resolved:
         unused: What has taxels or can be felt but is not needed, and why.
         patches: The links that carry taxels.
         on_links: The sensors that have a place on each link, whatever its taxels.
+        link_bodies: The bodies of each link that carries taxels or is a sensor's.
     """
 
     layout: Layout
@@ -63,7 +65,8 @@ class Resolved:
     robot: Model
     unused: tuple[tuple[str, str], ...]
     patches: Mapping[str, Patch]
-    on_links: frozenset[str] = frozenset()
+    on_links: frozenset[str]
+    link_bodies: LinkBodies
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -129,10 +132,14 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
     listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
-    welded = {scene.compiled.body(i).name for felt in objects.values() for i in felt.bodies}
+    carrying = {patch.link.body for patch in patches}.union(*(links[name] for name in on_links))
+    parts_of = link_bodies(scene, carrying, listed_bodies)
+    rigid = [*(felt.bodies for felt in objects.values()), *parts_of.values()]
+    welded = {scene.compiled.body(i).name for bodies in rigid for i in bodies}
     others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {p.link.name: p for p in patches}, on_links)
+    by_name = {patch.link.name: patch for patch in patches}
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_name, on_links, parts_of)
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:

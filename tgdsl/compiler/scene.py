@@ -13,7 +13,7 @@ import mujoco
 from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.model import Model
-from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
+from tgdsl.plan.inputs import ContactPart, Inputs, Touching, contact_sensor_names
 from tgdsl.plan.scene import Asset, SceneFile
 from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.scene.compare import differing_fields
@@ -26,7 +26,7 @@ SENSED = ("found", "force", "torque", "dist", "pos", "normal", "tangent")
 MIXED_NUM = 64
 """Contacts that a sensor shows where geoms have gaps and different margins: the nearest need not be those that carry force."""
 OBJECT_TYPES = {"body": mujoco.mjtObj.mjOBJ_BODY, "subtree": mujoco.mjtObj.mjOBJ_XBODY, "geom": mujoco.mjtObj.mjOBJ_GEOM}
-"""MuJoCo's types of what an object's part is."""
+"""MuJoCo's types of what a part of an object or link is."""
 REDUCTIONS = ("none", "mindist", "maxforce", "netforce")
 """MuJoCo's ways to reduce contacts, in the order of its numbers."""
 ASSET_TAGS = ("mesh", "texture", "hfield", "skin")
@@ -38,8 +38,8 @@ FILE_ATTRIBUTES = ("file", *(f"file{side}" for side in ("right", "left", "up", "
 def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
     """Add the contact sensors that a module wants to a MuJoCo model: those of `inputs.pairs`, and no others.
 
-    Body 1 is the object and body 2 the link, so that MuJoCo's force is the one on the link and its normal points out of the
-    object. Sensors that are already there, by name, are left as they are.
+    The first side of a sensor is the object and the second the link, so that MuJoCo's force is the one on the link and its
+    normal points out of the object. Sensors that are already there, by name, are left as they are.
 
     Args:
         spec: The model, changed in place; compile it afterwards.
@@ -61,21 +61,20 @@ def instrument(spec: mujoco.MjSpec, inputs: Inputs) -> mujoco.MjSpec:
             spec.add_sensor(
                 name=own.name,
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
-                objtype=OBJECT_TYPES[own.part.kind],
-                objname=own.part.name,
-                reftype=mujoco.mjtObj.mjOBJ_BODY,
-                refname=own.link,
+                objtype=OBJECT_TYPES[own.between.object.kind],
+                objname=own.between.object.name,
+                reftype=OBJECT_TYPES[own.between.link.kind],
+                refname=own.between.link.name,
                 intprm=[fields, REDUCTIONS.index(own.reduce), own.num],
             )
     return spec
 
 
 class ContactSensor(NamedTuple):
-    """A contact sensor: between a part of an object and a link's body, what it shows, how it reduces, of how many contacts."""
+    """A contact sensor: between parts of an object and of a link, what it shows, how it reduces, of how many contacts."""
 
     name: str
-    part: ContactPart
-    link: str
+    between: Touching
     data: tuple[str, ...]
     reduce: str
     num: int
@@ -91,22 +90,22 @@ def _contact_sensors(inputs: Inputs, spec: mujoco.MjSpec) -> Iterator[ContactSen
     """
     wants_slots, wants_net = inputs.slots > 0, "contact_netforce" in inputs.fields
     for pair in inputs.pairs:
-        for i, part in enumerate(inputs.parts_of(pair.object)):
+        for i, between in enumerate(inputs.touching(pair)):
             point, net = contact_sensor_names(pair, i)
-            margins, has_gap = _margins(spec, part, pair.link)
+            margins, has_gap = _margins(spec, between)
             data = SLOT_DATA if wants_slots else ("found", "force") if has_gap else ("found",)
             num = max(inputs.slots, 1)
             if has_gap:
                 data = tuple(name for name in SENSED if name in (*data, "dist"))
                 num = max(num, MIXED_NUM) if len(margins) > 1 else num
-            yield ContactSensor(point, part, pair.link, data, "mindist" if has_gap else "none", num)
+            yield ContactSensor(point, between, data, "mindist" if has_gap else "none", num)
             if wants_net:
-                yield ContactSensor(net, part, pair.link, ("found", "force"), "netforce", 1)
+                yield ContactSensor(net, between, ("found", "force"), "netforce", 1)
 
 
-def _margins(spec: mujoco.MjSpec, part: ContactPart, link: str) -> tuple[set[tuple[float, float]], bool]:
+def _margins(spec: mujoco.MjSpec, between: Touching) -> tuple[set[tuple[float, float]], bool]:
     """Return the margins [m] of all pairs of geoms of an object and a link, and whether any of them has a gap."""
-    first, second = _geoms(spec, part), _geoms(spec, ContactPart("body", link))
+    first, second = (_geoms(spec, part) for part in between)
     names = [{geom.name for geom in own} for own in (first, second)]
     ways = (names, names[::-1])
     pairs = [pair for pair in spec.pairs if any(pair.geomname1 in a and pair.geomname2 in b for a, b in ways)]
@@ -154,7 +153,8 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
         main.append(as_worldbody(own.bodies))
     sensors = ET.SubElement(main, "sensor")
     for sensor in _contact_sensors(inputs, model.spec):
-        ends = {f"{sensor.part.kind}1": sensor.part.name, "body2": sensor.link}
+        one, two = sensor.between
+        ends = {f"{one.kind}1": one.name, f"{two.kind}2": two.name}
         shown = {"data": " ".join(sensor.data), "reduce": sensor.reduce, "num": str(sensor.num)}
         ET.SubElement(sensors, "contact", {"name": sensor.name, **ends, **shown})
     scene = SceneFile(

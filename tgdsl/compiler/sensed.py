@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Sequence, Set
 
 from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
@@ -68,32 +68,33 @@ def sensed_object(
     )
 
 
-def contact_parts(scene: Model, felt: SensedObject, report: Report) -> tuple[ContactPart, ...]:
-    """Return the geoms that contacts with an object act on as MuJoCo's contact sensors can name them.
+def contact_parts(scene: Model, bodies: Sequence[int], touched: Set[int], report: Report) -> tuple[ContactPart, ...]:
+    """Return the geoms that contacts with an object or a link act on as MuJoCo's contact sensors can name them.
 
     Args:
         scene: The scene.
-        felt: The object.
+        bodies: The bodies that are one rigid body, the first its own: see `Model.rigid_bodies`.
+        touched: Indices of the geoms.
         report: Called where a geom has no name that would tell it apart.
     """
-    model, first = scene.compiled, felt.bodies[0]
-    own = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in felt.bodies}
+    model, first = scene.compiled, bodies[0]
+    own = {body: {g.id for g in scene.rigid_geoms((body,)) if g.is_colliding} for body in bodies}
     below = [first]
     for i in range(first + 1, model.nbody if first else 0):
         below += [i] if model.body_parentid[i] in below else []
-    if tuple(below) == felt.bodies and set().union(*own.values()) <= felt.touched:
-        return (ContactPart("subtree" if len(below) > 1 else "body", felt.body),)
+    if below == list(bodies) and set().union(*own.values()) <= touched:
+        return (ContactPart("subtree" if len(below) > 1 else "body", model.body(first).name),)
     parts = []
     for body, geoms in own.items():
-        if geoms and geoms <= felt.touched and model.body(body).name:
+        if geoms and geoms <= touched and model.body(body).name:
             parts.append(ContactPart("body", model.body(body).name))
             continue
-        for geom in (geom for geom in scene.rigid_geoms((body,)) if geom.id in geoms & felt.touched):
+        for geom in (geom for geom in scene.rigid_geoms((body,)) if geom.id in geoms & touched):
             if not geom.name:
                 what = f"{geom.shown} has no name of its own, so the solver's contacts on it cannot be told from others"
                 report(what, "name it, or its body, in the scene")
             parts.append(ContactPart("geom", geom.name))
-    return tuple(parts) or (ContactPart("body", felt.body),)
+    return tuple(parts) or (ContactPart("body", model.body(first).name),)
 
 
 def _felt(geoms: Sequence[Geom], body: str, target: ObjectSpec, scene: Model, report: Report) -> tuple[SurfaceGeom, ...]:

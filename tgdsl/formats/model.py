@@ -125,15 +125,15 @@ class Model:
 
     def can_collide(self, first: str, second: str) -> bool:
         """Return whether MuJoCo can ever report a contact between the geoms of two bodies."""
-        return self.can_collide_with(first, [geom.id for geom in self.touchable(second)])
+        return self.geoms_can_collide(*([geom.id for geom in self.touchable(body)] for body in (first, second)))
 
-    def can_collide_with(self, body: str, geoms: Iterable[int]) -> bool:
-        """Return whether MuJoCo can ever report a contact between a body's geoms and some others, by their indices."""
+    def geoms_can_collide(self, geoms: Iterable[int], others: Iterable[int]) -> bool:
+        """Return whether MuJoCo can ever report a contact between some geoms and some others, by their indices."""
         model = self.compiled
         if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
             return False
         pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-        for a, b in itertools.product([geom.id for geom in self.touchable(body)], geoms):
+        for a, b in itertools.product(geoms, others):
             if frozenset((a, b)) in pairs:
                 return True
             one, two = sorted(int(model.geom_bodyid[i]) for i in (a, b))

@@ -241,7 +241,7 @@ def _inputs(touch: Explained) -> list[str]:
     lines = ["inputs wanted", f"  fields  {', '.join(inputs.fields)}", f"  bodies  {', '.join(inputs.bodies)}"]
     if inputs.pairs:
         lines.append(f"  pairs   {', '.join(f'{pair.link} – {pair.object}' for pair in inputs.pairs)}")
-    for name, parts in inputs.contacts_of.items():
+    for name, parts in [*inputs.contacts_of.items(), *inputs.link_parts.items()]:
         lines.append(f"  contacts with {name} are those on {', '.join(f'{part.kind} {part.name}' for part in parts)}")
     if inputs.slots:
         lines.append(f"  slots   {inputs.slots} contacts of each pair")

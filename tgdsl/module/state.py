@@ -55,7 +55,8 @@ class SceneState:
         body_linvel: Velocity of the body frame's origin, not of the centre of mass [m/s].
         body_angvel: Angular velocity of the body [rad/s].
         contact_found: Whether each (link, object) pair is in contact: boolean, or a number that is then positive, as that
-            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`.
+            of contacts is. An object's contacts are those on the geoms of `inputs.parts_of`, a link's
+            those on the geoms of `inputs.parts_of_link`.
         contact_pos: Contact points [m].
         contact_force: Force on the link at each point [N].
         contact_torque: Torque on the link at each point [N·m].

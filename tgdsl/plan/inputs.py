@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from tgdsl.console.tables import listing, spelled
 from tgdsl.quantities.pairs import Pair
@@ -13,10 +14,17 @@ from tgdsl.quantities.pairs import Pair
 
 @dataclass(frozen=True)
 class ContactPart:
-    """Geoms whose contacts are an object's: those of a body, those of a body and of all bodies below it, or a single one."""
+    """Geoms whose contacts count: those of a body, those of a body and of all bodies below it, or a single one."""
 
     kind: Literal["body", "subtree", "geom"]
     name: str
+
+
+class Touching(NamedTuple):
+    """A part of an object and a part of a link: contacts between their geoms are the pair's."""
+
+    object: ContactPart
+    link: ContactPart
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,7 @@ class Inputs:
         joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
         actuators: Actuators of the field `last_action`.
         contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
+        link_parts: Whose contacts are a link's, where they are not just those of its body: see `parts_of_link`.
         substeps: Physics steps of a call at each of which some sensor is advanced: see `SceneState.substeps`.
     """
 
@@ -47,18 +56,32 @@ class Inputs:
     joints: tuple[str, ...] = ()
     actuators: tuple[str, ...] = ()
     contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
+    link_parts: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
     substeps: int = 1
 
     def parts_of(self, name: str) -> tuple[ContactPart, ...]:
         """Return the geoms whose contacts are an object's; no geom is in two of its parts."""
         return self.contacts_of.get(name) or (ContactPart("body", self.bodies_of[name]),)
 
+    def parts_of_link(self, link: str) -> tuple[ContactPart, ...]:
+        """Return the geoms whose contacts are a link's; no geom is in two parts, nor in those of two links.
+
+        A link is rigid: its body, and the child bodies that have no joint, carry no taxels of the layout, are no sensor's link
+        and are not objects. This is so for all sensors of a module: a child body with taxels is a link of its own for a sensor
+        that is on its parent alone, too.
+        """
+        return self.link_parts.get(link) or (ContactPart("body", link),)
+
+    def touching(self, pair: Pair) -> tuple[Touching, ...]:
+        """Return the parts between which contacts are a pair's."""
+        return tuple(Touching(*parts) for parts in itertools.product(self.parts_of(pair.object), self.parts_of_link(pair.link)))
+
     def __repr__(self) -> str:
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return "Inputs\n" + listing((name, spelled(value)) for name, value in values.items() if value and value != 1)
 
 
-def contact_sensor_names(pair: Pair, part: int = 0) -> tuple[str, str]:
-    """Return the names of the contact sensors of a pair and a part of its object: the point slots, and the net force."""
-    end = f"{pair.link}/{pair.object}" + (f"/{part}" if part else "")
+def contact_sensor_names(pair: Pair, index: int = 0) -> tuple[str, str]:
+    """Return the names of the contact sensors of one of a pair's `Inputs.touching`: the point slots, and the net force."""
+    end = f"{pair.link}/{pair.object}" + (f"/{index}" if index else "")
     return f"tgdsl/contact/{end}", f"tgdsl/netforce/{end}"

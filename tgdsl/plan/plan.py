@@ -27,7 +27,7 @@ from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
-FORMAT = 11
+FORMAT = 12
 """Version of the Plan; a reader refuses any other."""
 
 

@@ -32,7 +32,8 @@ _ADVICE = "add them with tgdsl.instrument(spec, touch.inputs) before compiling"
 class ContactSensors:
     """Reads the contacts that a module wants from `sensordata`.
 
-    A pair has a sensor for each part of its object. Contacts that a `gap` adds beyond the margin carry no force, and are none.
+    A pair has a sensor for each part of its object and each part of its link. Contacts that a `gap` adds beyond the margin carry
+    no force, and are none.
     """
 
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
@@ -51,7 +52,7 @@ class ContactSensors:
         self._fields = [name for name in CONTACT_FIELDS if name in inputs.fields]
         self._shapes = {name: shape_of(name, inputs) for name in self._fields}
         self._num_slots = inputs.slots
-        names = [[contact_sensor_names(pair, i) for i in range(len(inputs.parts_of(pair.object)))] for pair in inputs.pairs]
+        names = [[contact_sensor_names(pair, i) for i in range(len(inputs.touching(pair)))] for pair in inputs.pairs]
         self._points = [[_PointSensor(model, point, inputs.slots) for point, _ in own] for own in names]
         self._nets: list[list[range]] = []
         if "contact_netforce" in self._fields:
@@ -116,7 +117,7 @@ class _PointSensor:
 
 
 def _first_contacts(parts: Sequence[_Shown], num_slots: int) -> Float[np.ndarray, "env slot value"]:
-    """Return the first contacts of a pair, of all parts of its object; slots that are left are zero."""
+    """Return the first contacts of a pair, of all parts of its object and link; slots that are left are zero."""
     is_contact = np.concatenate([part.is_contact for part in parts], axis=1)
     values = np.concatenate([part.values for part in parts], axis=1) * is_contact[..., None]
     if values.shape[1] == num_slots:

@@ -24,7 +24,7 @@ def body_id(model: mujoco.MjModel, name: str) -> int:
 
 
 def part_geoms(model: mujoco.MjModel, part: ContactPart) -> Int[np.ndarray, " geom"]:
-    """Return the indices of the geoms of an object's part.
+    """Return the indices of the geoms of a part of an object or link.
 
     Raises:
         SimulationError: If there is no body or geom of that name.

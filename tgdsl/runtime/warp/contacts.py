@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, no_type_check
 
 import mujoco
@@ -21,9 +21,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.module.state import shape_of
-from tgdsl.plan.inputs import Inputs, contact_sensor_names
+from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
 from tgdsl.quantities.contacts import SLOT_FIELDS
-from tgdsl.runtime.simulators.model_ids import body_id, part_geoms
+from tgdsl.runtime.simulators.model_ids import part_geoms
 from tgdsl.runtime.warp.private import constraint_contact_bit, contact_force_function
 from tgdsl.runtime.warp.stream import libraries
 
@@ -59,9 +59,9 @@ class PairContacts:
         """
         wp, mjw = libraries()
         self._fields = [name for name in ("contact_found", *_VECTORS) if name in inputs.fields]
-        parts = {name: [part_geoms(model, part) for part in inputs.parts_of(name)] for name in inputs.bodies_of}
-        geoms = {name: tuple(np.unique(np.concatenate(own)).tolist()) for name, own in parts.items()}
-        pairs = [(geoms[pair.object], body_id(model, pair.link)) for pair in inputs.pairs]
+        geoms = {name: _geoms(model, inputs.parts_of(name)) for name in inputs.bodies_of}
+        links = {link: i for i, link in enumerate(dict.fromkeys(pair.link for pair in inputs.pairs))}
+        pairs = [(geoms[pair.object], links[pair.link]) for pair in inputs.pairs]
         rows = {own: row for row, own in enumerate(dict.fromkeys(pairs))}
         self._row_of_pair: Int[Tensor, " pair"] | None = None
         if len(rows) < len(pairs):
@@ -72,11 +72,15 @@ class PairContacts:
         shapes = {name: (num_envs, len(rows), *shape_of(name, inputs)[1:]) for name in names}
         # One piece of memory, which one call clears.
         self._memory = torch.zeros(sum(math.prod(shape) for shape in shapes.values()), device=device)
-        parts = self._memory.split([math.prod(shape) for shape in shapes.values()])
-        self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+        pieces = self._memory.split([math.prod(shape) for shape in shapes.values()])
+        self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), pieces, strict=True)}
         self._launch, self._kernel = wp.launch, _kernel(wp, mjw)
+        link_of = np.full(model.ngeom, len(links), dtype=np.int32)
+        for link, i in links.items():
+            link_of[list(_geoms(model, inputs.parts_of_link(link)))] = i
+        tables = (link_of, _row_table(rows, model.ngeom, len(links)))
         self._outputs: list[Any] = [
-            wp.array(_row_table(rows, model), dtype=int, device=wp.device_from_torch(device)),
+            *(wp.array(table, dtype=int, device=wp.device_from_torch(device)) for table in tables),
             inputs.slots,
             wp.from_torch(self.arrays["contact_found"]) if "contact_found" in names else None,
             *(wp.from_torch(self.arrays[name], dtype=wp.vec3) if name in names else None for name in _VECTORS),
@@ -88,7 +92,7 @@ class PairContacts:
             return
         self._memory.zero_()
         own = warp_data.contact
-        inputs = [warp_model.opt.cone, warp_model.geom_bodyid, warp_data.nacon, own.worldid, own.geom, own.type, own.pos]
+        inputs = [warp_model.opt.cone, warp_data.nacon, own.worldid, own.geom, own.type, own.pos]
         inputs += [own.dist, own.includemargin, own.frame, own.friction, own.dim, own.efc_address, own.adhesion]
         inputs += [warp_data.efc.force, warp_data.njmax]
         self._launch(self._kernel, dim=warp_data.naconmax, inputs=inputs, outputs=self._outputs)
@@ -99,22 +103,30 @@ class PairContacts:
         return {name: self.arrays[name].clone() if rows is None else self.arrays[name][:, rows] for name in self._fields}
 
 
-def _row_table(rows: Mapping[tuple[tuple[int, ...], int], int], model: mujoco.MjModel) -> Int[np.ndarray, "layer geom body"]:
-    """Return the rows that contacts of an object's geom and a link's body belong to; −1 where there are no more."""
+def _geoms(model: mujoco.MjModel, parts: Sequence[ContactPart]) -> tuple[int, ...]:
+    """Return the indices of the geoms of an object's or a link's parts, ascending."""
+    return tuple(np.unique(np.concatenate([part_geoms(model, part) for part in parts])).tolist())
+
+
+def _row_table(
+    rows: Mapping[tuple[tuple[int, ...], int], int], num_geoms: int, num_links: int
+) -> Int[np.ndarray, "layer geom link"]:
+    """Return the rows that contacts of an object's geom and a link belong to; −1 where there are no more, and of no link."""
+    none = np.full((num_geoms, num_links + 1), -1, dtype=np.int32)
     layers: list[np.ndarray] = []
     for (geoms, link), row in rows.items():
         for geom in geoms:
             free = next((layer for layer in layers if layer[geom, link] < 0), None)
             if free is None:
-                free = np.full((model.ngeom, model.nbody), -1, dtype=np.int32)
+                free = none.copy()
                 layers.append(free)
             free[geom, link] = row
-    return np.stack(layers) if layers else np.full((1, model.ngeom, model.nbody), -1, dtype=np.int32)
+    return np.stack(layers or [none])
 
 
 def foreign_sensors(model: mujoco.MjModel, inputs: Inputs) -> Int[np.ndarray, " sensor"]:
     """Return the indices of a model's sensors, those left out that would find a module's contacts."""
-    parts = [(pair, i) for pair in inputs.pairs for i in range(len(inputs.parts_of(pair.object)))]
+    parts = [(pair, i) for pair in inputs.pairs for i in range(len(inputs.touching(pair)))]
     ours = {name for pair, i in parts for name in contact_sensor_names(pair, i)}
     is_contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
     is_ours = [bool(is_contact[i]) and model.sensor(i).name in ours for i in range(model.nsensor)]
@@ -136,11 +148,11 @@ def _kernel(wp: Any, mjw: Any) -> Any:
     # fmt: off
     @wp.kernel(enable_backward=False)
     def gather(
-        cone: int, geom_body: wp.array[int], nacon: wp.array[int], world: wp.array[int], geom: wp.array[wp.vec2i],
+        cone: int, nacon: wp.array[int], world: wp.array[int], geom: wp.array[wp.vec2i],
         kind: wp.array[int], pos: wp.array[wp.vec3], dist: wp.array[float], margin: wp.array[float], frame: wp.array[wp.mat33],
         friction: Any, dim: wp.array[int], efc_address: wp.array2d[int], adhesion: wp.array[float],
         efc_force: wp.array2d[float], njmax: int,
-        row_of: wp.array3d[int], num_slots: int, found: wp.array2d[float], place: wp.array3d[wp.vec3],
+        link_of: wp.array[int], row_of: wp.array3d[int], num_slots: int, found: wp.array2d[float], place: wp.array3d[wp.vec3],
         normal: wp.array3d[wp.vec3], force: wp.array3d[wp.vec3], torque: wp.array3d[wp.vec3], netforce: wp.array2d[wp.vec3],
     ):
         # fmt: on
@@ -155,7 +167,7 @@ def _kernel(wp: Any, mjw: Any) -> Any:
         env = world[contact]
         for turned in range(2):  # a geom may be the object's of one pair and the link's of another
             for layer in range(row_of.shape[0]):  # and it may be of several objects
-                row = row_of[layer, geoms[turned], geom_body[geoms[1 - turned]]]
+                row = row_of[layer, geoms[turned], link_of[geoms[1 - turned]]]
                 if row >= 0:
                     sign = 1.0 - 2.0 * float(turned)
                     slot = num_slots
