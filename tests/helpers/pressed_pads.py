@@ -14,12 +14,13 @@ RESTING = 1e-4
 MODELS = ("mujoco", "warp")
 
 
-def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", as_usd=False):
+PAD = '<body name="pad"><geom name="pad" type="box" size=".06 .06 .01"/></body>'
+
+
+def compiled(folder, bodies, objects, sensors, dtype=torch.float64, extra="", as_usd=False, pad=PAD):
     """Return a module of a pad of 6 × 6 taxels under some bodies."""
-    (folder / "scene.xml").write_text(
-        f'<mujoco><option timestep=".002"/>{extra}<worldbody><body name="pad"><geom name="pad" type="box" size=".06 .06 .01"/>'
-        f"</body>{bodies}</worldbody></mujoco>"
-    )
+    text = f'<mujoco><option timestep=".002"/>{extra}<worldbody>{pad}{bodies}</worldbody></mujoco>'
+    (folder / "scene.xml").write_text(text)
     model = folder / ("scene.usda" if as_usd else "scene.xml")
     if as_usd:
         export_model(folder / "scene.xml", model)

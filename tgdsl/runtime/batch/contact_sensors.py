@@ -32,8 +32,8 @@ _ADVICE = "add them with tgdsl.instrument(spec, touch.inputs) before compiling"
 class ContactSensors:
     """Reads the contacts that a module wants from `sensordata`.
 
-    A pair has a sensor for each part of its object and each part of its link. Contacts that a `gap` adds beyond the margin carry
-    no force, and are none.
+    A pair has a sensor for each part of its object and each part of its link. Contacts that a `gap` adds beyond the margin
+    carry no force, and are none.
     """
 
     def __init__(self, model: mujoco.MjModel, inputs: Inputs):
