@@ -36,6 +36,6 @@ class Compile:
         size = save_plan(plan, with_folder(out))
         layout = plan.layout
         sensors = ", ".join(f"{s.name} ({s.kind}, {s.rows[1] - s.rows[0]})" for s in plan.sensors)
-        print(f"{layout.num_taxels} taxels on {len(layout.links)} links at resolution {plan.origin.resolution}")
+        print(f"{layout.num_taxels} taxels on {len(layout.links)} links{plan.origin.at_resolution}")
         print(f"sensors: {sensors}")
         print(f"{out}: {size} bytes in {time.perf_counter() - start:.1f} s")

@@ -68,10 +68,10 @@ class LoweredSensor:
 
 
 def rows_of(lowered: Lowered, layout: Layout, spec: SensorSpec) -> Axis:
-    """Return what a sensor's own reading has rows of: what its kind says, else its taxels, or its bodies if it is on links."""
+    """Return what a sensor's own reading has rows of: what its kind says, else its taxels, or its bodies if it has none."""
     if lowered.rows is not None:
         return lowered.rows
-    return taxel_axis(layout) if spec.is_on_taxels else body_axis(layout)
+    return taxel_axis(layout) if spec.is_on_taxels and layout.num_taxels else body_axis(layout)
 
 
 def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], progress: Progress) -> tuple[LoweredSensor, ...]:

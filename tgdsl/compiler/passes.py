@@ -169,7 +169,7 @@ def rows_of(sensor: LoweredSensor, joined: Joined) -> tuple[int, int]:
     """Return which rows of its uses a sensor has: the first, and one beyond the last."""
     group = joined.get(sensor.name, ())
     before = sum(len(other.taxels) for other in group[: group.index(sensor)]) if group else 0
-    return before, before + (len(sensor.taxels) if sensor.spec.is_on_taxels else sensor.rows.size)
+    return before, before + (len(sensor.taxels) or sensor.rows.size)
 
 
 class Numbered(NamedTuple):

@@ -83,7 +83,7 @@ def layouts(
     chosen, known = overrides or {}, known_kinds(kinds)
     loaded = load(document, chosen, known, needs_sensors=False)
     if loaded.layout is None:
-        return resolve(loaded).scene.compiled, {}  # which says all that is wrong
+        return resolve(loaded).scene.compiled, {}  # which says all that is wrong, if a layout is needed
     names, own = list(loaded.layout.spec.resolutions), loaded.resolution
     wanted = list(resolutions) or ([own] if own is not None else names)
     for name in resolutions:
@@ -147,6 +147,6 @@ def _origin(loaded: Loaded) -> Origin:
         document_sha256=hashlib.sha256(text.encode()).hexdigest(),
         robot=portable(robot),
         robot_sha256=digest.hexdigest(),
-        resolution=str(loaded.resolution),
+        resolution=loaded.resolution or "",
         versions={"tgdsl": version("tgdsl"), "mujoco": mujoco.__version__},
     )

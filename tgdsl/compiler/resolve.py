@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,6 @@ from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.placement import Placement
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
-from tgdsl.sensors.base import SensorSpec
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.region import clip
 from tgdsl.surfaces.sensed import SensedObject
@@ -112,22 +111,26 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, SensedObject] = {}
     own = OwnObjects()
-    if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
+    on_links = frozenset(name for name, own in loaded.spec.sensors.items() if loaded.is_without_layout or not own.is_on_taxels)
+    if robot is not None and loaded.is_without_layout:
+        links = _sensor_links(loaded, {}, robot, [], on_links)
+    elif robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
         _check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
             patches = _patches(loaded, loaded.layout, robot, placements)
-            links = _sensor_links(loaded, loaded.layout, robot, patches)
+            links = _sensor_links(loaded, loaded.layout.spec.groups, robot, patches, on_links)
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
         scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
         objects = sensed_objects(loaded, scene, own)
     loaded.raise_problems()
-    assert robot is not None and scene is not None and loaded.layout is not None
-    on_links = frozenset(name for name, sensor in loaded.spec.sensors.items() if not sensor.is_on_taxels)
+    assert robot is not None and scene is not None
     needed = {link for name, own in links.items() for link in own if name not in on_links}
     needed = needed if links else {patch.link.name for patch in patches}
-    layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
+    layout = Layout.of_links((), {})
+    if loaded.layout is not None:
+        layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
@@ -262,7 +265,10 @@ def _matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
     return links
 
 
-def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
+def _sensor_links(
+    loaded: Loaded, groups: Mapping[str, Selection], robot: Model, patches: list[Patch], on_links: Set[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return the names of each sensor's links: of those with taxels, or of bodies if it is `on_links`."""
     candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
     on_robot = _names(robot)
     known = [name for names in (*on_robot, *candidates) for name in names]
@@ -270,15 +276,15 @@ def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: l
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
         _check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
-        if not sensor.is_on_taxels:
-            links[name] = _links_chosen(loaded, layout, robot, sensor, path)
+        if name in on_links:
+            links[name] = _links_chosen(loaded, groups, robot, name)
             continue
         missing: list[Problem] = []
-        chosen = select(sensor.links, candidates, layout.spec.groups, _reporter(loaded, path, missing), elsewhere=known)
+        chosen = select(sensor.links, candidates, groups, _reporter(loaded, path, missing), elsewhere=known)
         if missing:
             # A name that the robot has but the layout does not is another mistake than a name nobody has.
             unknown: list[Problem] = []
-            select(sensor.links, on_robot, layout.spec.groups, _reporter(loaded, path, unknown), elsewhere=known)
+            select(sensor.links, on_robot, groups, _reporter(loaded, path, unknown), elsewhere=known)
             what = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
             hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
             loaded.problems += unknown or [loaded.problem(path, what, hint)]
@@ -288,12 +294,13 @@ def _sensor_links(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: l
     return links
 
 
-def _links_chosen(loaded: Loaded, layout: LoadedLayout, robot: Model, sensor: SensorSpec, path: Path) -> tuple[str, ...]:
+def _links_chosen(loaded: Loaded, groups: Mapping[str, Selection], robot: Model, name: str) -> tuple[str, ...]:
     """Return the bodies of a sensor that has a place on each link."""
+    path: Path = ("sensors", name, "links")
     bodies = [body for body in robot.bodies if body != "world"]
     own = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
     before = len(loaded.problems)
-    chosen = select(sensor.links, own, layout.spec.groups, _reporter(loaded, path, loaded.problems))
+    chosen = select(loaded.spec.sensors[name].links, own, groups, _reporter(loaded, path, loaded.problems))
     if not chosen and len(loaded.problems) == before:
         loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
     return tuple(bodies[i] for i in chosen)

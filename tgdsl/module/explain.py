@@ -86,7 +86,7 @@ def operations_per_env(touch: Explained) -> int:
 def explain(touch: Explained) -> str:
     """Return the account as text."""
     plan = touch.plan
-    lines = [f"{plan.origin.robot} at resolution {plan.origin.resolution}, {plan.layout.num_taxels} taxels", ""]
+    lines = [f"{plan.origin.robot}{plan.origin.at_resolution}, {plan.layout.num_taxels} taxels", ""]
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]
@@ -118,6 +118,8 @@ def _asks(touch: Explained, sensor: PlannedSensor) -> list[str]:
 def _links(touch: Explained) -> list[str]:
     plan = touch.plan
     layout = plan.layout
+    if not layout.links:
+        return [f"bodies  {', '.join(dict.fromkeys(link.body for sensor in plan.sensors for link in sensor.links))}"]
     counts = {link.name: int((layout.link_id == i).sum()) for i, link in enumerate(layout.links)}
     lines = ["taxels per link"] + [f"  {name:<34}{count:>6}" for name, count in counts.items()]
     lines += ["taxels per group"]

@@ -76,7 +76,7 @@ class TactileModule(HookedModule):
     def __repr__(self) -> str:
         layout, origin = self.plan.layout, self.plan.origin
         where = f"{layout.num_taxels} taxels on {len(layout.links)} links of {origin.robot.rpartition('/')[2]}"
-        return f"TactileModule({where} at resolution {origin.resolution}, {self.dtype}, {self.device})\n{self.outputs}"
+        return f"TactileModule({where}{origin.at_resolution}, {self.dtype}, {self.device})\n{self.outputs}"
 
     @property
     def inputs(self) -> Inputs:

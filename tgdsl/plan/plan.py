@@ -33,13 +33,18 @@ FORMAT = 12
 
 @dataclass(frozen=True)
 class Origin:
-    """What a plan was made from."""
+    """What a plan was made from; its resolution is empty if it has no layout."""
 
     document_sha256: str
     robot: str
     robot_sha256: str
     resolution: str
     versions: Mapping[str, str]
+
+    @property
+    def at_resolution(self) -> str:
+        """What follows on a number of taxels, or a robot, in an account of it."""
+        return f" at resolution {self.resolution}" if self.resolution else ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,8 @@ class RobotSpec(SpecModel):
     model: str
     """MJCF, URDF or USD file, relative to this document; or the name of a robot that comes with tgdsl, such as `xhand1`."""
     layout: Annotated[Text | Annotated[LayoutSpec, Tag("other")], TEXT_OR_OTHER] | None = None
-    """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name."""
+    """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name.
+    Not needed where no sensor reads taxels, such as `link_contact`: these are then on any of the robot's bodies."""
 
 
 class SceneSpec(SpecModel):

@@ -162,6 +162,8 @@ def _layout_file(loaded: Loaded, wanted: str | None) -> Path | None:
     known = find.robot_names().get(loaded.spec.robot.model)
     if known is not None and (path := find.layout_file(known)) is not None:
         return path
+    if loaded.is_without_layout:
+        return None
     loaded.problems.append(
         loaded.source.problem(
             ("robot",), 'missing key "layout"', "only robots given by name bring their own layout", on_key=True

@@ -39,7 +39,7 @@ class Loaded:
         spec: The document.
         source: Its text's values and places.
         folder: Folder that file names in it are relative to.
-        layout: Its layout; None if that could not be read.
+        layout: Its layout; None if that could not be read, or if it `is_without_layout`.
         problems: Mistakes found so far; later stages add theirs.
     """
 
@@ -53,6 +53,13 @@ class Loaded:
     def robot_file(self) -> FilePath | None:
         """The robot's model file, if it exists."""
         return find.robot_file(self.spec.robot.model, self.folder)
+
+    @property
+    def is_without_layout(self) -> bool:
+        """Whether it has no layout and needs none: none of its sensors reads taxels, and all are on bodies of the robot."""
+        sensors = self.spec.sensors.values()
+        is_none = self.layout is None and self.spec.robot.layout is None and bool(sensors)
+        return is_none and not any(sensor.needs_taxels for sensor in sensors)
 
     @property
     def resolution(self) -> str | None:

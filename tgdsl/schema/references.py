@@ -59,6 +59,9 @@ def _observation_problems(loaded: Loaded) -> list[Problem]:
 
 def _resolution_problems(loaded: Loaded) -> list[Problem]:
     """Return that the resolution is not one of the layout's, or that one must be named."""
+    if loaded.is_without_layout and loaded.resolution is not None:
+        what = f'there is no layout, which could have a resolution "{loaded.resolution}"'
+        return [loaded.source.problem(("resolution",), what, "leave it out, or give the robot a layout")]
     if loaded.layout is None:
         return []
     resolutions = list(loaded.layout.source.get((*loaded.layout.prefix, "resolutions")) or {})

@@ -65,6 +65,8 @@ class SensorSpec(SpecModel):
     """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
+    needs_taxels: ClassVar[bool] = True
+    """Whether it reads its taxels. One that does not may be in a document without a layout, on any of the robot's bodies."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -81,6 +83,7 @@ class LinkSpec(SensorSpec):
     """A sensor that has a place on each link, whether the link has taxels or not."""
 
     is_on_taxels: ClassVar[bool] = False
+    needs_taxels: ClassVar[bool] = False
 
 
 class ProbeSpec(SensorSpec):

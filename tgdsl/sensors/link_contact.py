@@ -13,7 +13,7 @@ Source: MuJoCo's contact sensor with the reduction `netforce` (XML reference, se
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -51,6 +51,7 @@ class LinkContactSpec(ProbeSpec):
     """What a reading holds, the bit before the force."""
     threshold: NonNegative = 0.0
     """Force above which a body counts as touched [N]."""
+    needs_taxels: ClassVar[bool] = False
 
 
 def reference(
