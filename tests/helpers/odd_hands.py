@@ -53,7 +53,7 @@ TENDON = """
   <actuator><motor tendon="a"/><motor tendon="b"/></actuator>
 </mujoco>
 """
-# A gripper of two four-bars: driver and rocker hang on the base, the finger on the driver, and a connect closes the loop.
+# A gripper of two four-bars: driver and rocker are children of the base, the finger of the driver, and a connect closes the loop.
 _SIDE = """
       <body name="{0}_driver" pos="{1} 0 .02" euler="0 0 {2}"><joint axis="0 1 0" range="0 45"/>
         <geom type="capsule" fromto="0 0 0 0 0 .03" size=".004"/>

@@ -1,8 +1,8 @@
 """The outer surface of an object as triangles and as points with area weights: what integrals over it are summed from.
 
-Geoms become triangles, which are halved to a spacing; those of a primitive add up to its area in closed form. What lies inside
+Geoms become triangles, which are bisected to a spacing; those of a primitive add up to its area in closed form. What lies inside
 another geom of the object is no surface, nor is a face that two geoms share from opposite sides; of one that they share from
-the same side the first counts. Triangles that another geom's surface crosses are halved further. Nothing depends on a seed,
+the same side the first counts. Triangles that another geom's surface crosses are bisected further. Nothing depends on a seed,
 but for points that are asked to be random.
 
 Shapes: `n` points, `f` triangles.
@@ -23,7 +23,7 @@ from scipy.special import elliprg
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.surfaces.geom import SurfaceGeom
-from tgdsl.surfaces.solid import Solid, halved
+from tgdsl.surfaces.solid import Solid, bisected
 
 SECTIONS = 128
 """Least number of sides of what stands for a circle before its points are moved onto the true surface."""
@@ -181,7 +181,7 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
         is_done = is_out & ~is_split
         done = corners[is_done]
         kept.append((done, pos[is_done], normal[is_done], own.stretch * _areas(done)))
-        corners = halved(corners[is_split])
+        corners = bisected(corners[is_split])
     return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
 
 

@@ -130,7 +130,7 @@ class Solid:
                 is_cut[owner[is_done][is_inner]] = True
                 pieces.append(corners[is_done][~is_inner])
                 owners.append(owner[is_done][~is_inner])
-                corners, owner = halved(corners[~is_done]), np.tile(owner[~is_done], 2)
+                corners, owner = bisected(corners[~is_done]), np.tile(owner[~is_done], 2)
             outer += [whole[~is_cut], np.concatenate(pieces)[is_cut[np.concatenate(owners)]]]
         return np.concatenate(outer)
 
@@ -187,7 +187,7 @@ def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
     return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 1e-9 * longest
 
 
-def halved(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
+def bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
     """Return the two halves of each triangle by longest-edge bisection."""
     length = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3

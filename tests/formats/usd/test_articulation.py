@@ -1,4 +1,4 @@
-"""Which body hangs on which in a USD stage: trees, loops, names and random robots."""
+"""Which body is the parent of which in a USD stage: trees, loops, names and random robots."""
 
 import math
 
@@ -76,7 +76,7 @@ def test_robots_at_random(tmp_path, seed):
 def test_the_root_of_an_articulation(tmp_path, where):
     stage = new_stage(tmp_path)
     chain(stage, 3, axis="Z")
-    if where == "body":  # floating: all hangs on what is marked, whatever the order of bodies in the joints
+    if where == "body":  # floating: the marked one is the root, whatever the order of bodies in the joints
         UsdPhysics.ArticulationRootAPI.Apply(stage.GetPrimAtPath("/b1"))
         model = compiled(stage)
         assert parents(model) == {"b1": "world", "b0": "b1", "b2": "b1"}
@@ -122,7 +122,7 @@ def test_disabled_bodies_and_joints(tmp_path):
     compiled(stage)  # nothing to tell: there is nothing to collide with yet
     add_shape(stage, "/b1/box")
     model, messages = warned(stage)
-    assert messages == ["joints do not keep their bodies from colliding with the static prims that they hang on: /j1"]
+    assert messages == ["joints do not keep their bodies from colliding with the static prims that they are attached to: /j1"]
     assert parents(model) == {"b0": "world", "b2": "world"}
     assert model.jnt_type.tolist() == [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE]
     assert model.geom("box").bodyid == 0  # a static collider where the body is

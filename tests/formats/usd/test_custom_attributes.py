@@ -163,7 +163,7 @@ def test_meshes_of_one_name_are_kept_apart(tmp_path):
 
 
 def test_a_mesh_keeps_its_vertices_its_hull_and_its_name(tmp_path):
-    """A regular prism: which of its equal corners make a hull of few vertices hangs on the last bit of each."""
+    """A regular prism: which of its equal corners make a hull of few vertices depends on the last bit of each."""
     angles = 2 * np.pi * np.arange(40) / 40
     ring = np.round(0.01 * np.stack([np.cos(angles), np.sin(angles)], axis=1), 6)
     points = np.concatenate([np.c_[ring, np.full(40, z)] for z in (0.003, 0.041)])

@@ -140,7 +140,7 @@ def _end(joint: Joint | None, other: str | None) -> str | None:
 def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]) -> SpanningTree:
     """Choose the parent of every body.
 
-    A kinematic body is a root. Else a group of joined bodies hangs on the world by one of its joints to it (by the marked
+    A kinematic body is a root. Else a group of joined bodies is attached to the world by one of its joints to it (by the marked
     one, or one below the marked prim, if there are several); without any, its root is the marked body, or else one that is
     nobody's body 1. Of the joints of a loop, one without drive and limits is left out, the last one in stage order, and a
     prismatic one only if there is no other. Joints that are excluded from articulations are only in the tree where nothing

@@ -34,7 +34,9 @@ def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]) ->
         if joint.is_filtering and None not in joint.bodies:
             found.add(frozenset(joint.bodies))
         elif joint.is_filtering and any(target and _below(colliders.get(None, ()), target) for target in joint.targets):
-            stage.drop("joints do not keep their bodies from colliding with the static prims that they hang on", joint.prim)
+            stage.drop(
+                "joints do not keep their bodies from colliding with the static prims that they are attached to", joint.prim
+            )
     filtered, sources = _filtered_colliders(stage, prims)
     for first, second in combinations(colliders, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]

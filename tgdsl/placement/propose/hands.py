@@ -40,14 +40,14 @@ class KinematicTree:
 
     @cached_property
     def segment(self) -> list[int]:
-        """The segment of each body; what is fixed to the world belongs to the topmost body that it hangs on."""
+        """The segment of each body; what is fixed to the world belongs to the topmost body that it is fixed to."""
         model = self.model
         weld, root = model.body_weldid.tolist(), model.body_rootid.tolist()
         return [w or r for w, r in zip(weld, root, strict=True)]
 
     @cached_property
     def parent(self) -> dict[int, int]:
-        """The segment that each hangs on; 0 for the first of a tree. In depth-first order."""
+        """The parent of each segment; 0 for the first of a tree. In depth-first order."""
         above = self.model.body_parentid
         return {s: self.segment[above[s]] if above[s] else 0 for s in sorted(set(self.segment) - {0})}
 
@@ -73,7 +73,7 @@ class KinematicTree:
         return found
 
     def children(self, segment: int) -> list[int]:
-        """Return the segments with surface that hang on one."""
+        """Return the children of a segment that have surface."""
         return [child for child, parent in self.parent.items() if parent == segment and child in self.carries]
 
     def joints(self, segment: int) -> list[int]:
@@ -100,7 +100,7 @@ class Hand:
     """Palm, fingers and tips found in a kinematic tree.
 
     Attributes:
-        base: Segment from which the fingers branch off; 0 if they hang on the world.
+        base: Segment from which the fingers branch off; 0 if that is the world.
         palm: The largest body of it, or None if it has no surface.
         tips: Bodies at the ends of the fingers.
         fingers: All bodies that move against the base, tips included.
@@ -142,7 +142,7 @@ def _is_driven(tree: KinematicTree, segment: int) -> bool:
 
 
 def hands(tree: KinematicTree) -> list[Hand]:
-    """Return the hand found in each kinematic tree; trees that hang on the world by a hinge or slide make up one hand."""
+    """Return the hand found in each kinematic tree; trees that a hinge or slide joins to the world make up one hand."""
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
     straight = [root for root in roots if _is_driven(tree, root) and len(_branchings(tree, root)) == 0]

@@ -128,7 +128,7 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     from_center = (cell + 0.5 - np.array([placement.rows, placement.columns]) / 2) * pitch[::-1]
     distance = np.linalg.norm(from_center, axis=1)
     order = np.argsort(distance, kind="stable")
-    # Distances that differ by rounding are ties; which cell wins must not hang on the last bit of a mesh.
+    # Distances that differ by rounding are ties; which cell wins must not depend on the last bit of a mesh.
     steps = np.diff(distance[order], prepend=distance[order[0]]) > 1e-4 * pitch[pitch > 0].min(initial=np.inf)
     tier = np.empty(len(cell), dtype=np.int64)
     tier[order] = np.cumsum(steps)

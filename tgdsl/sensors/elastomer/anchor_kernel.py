@@ -2,7 +2,7 @@
 
 A program takes one link of an environment. In chunks of points it finds candidates, which have an anchor or may be in the
 skin by the distance at the next node of the link's grid, and compacts their indices: most points are none. Then one thread
-per candidate finds its depth (`skin_kernel`) and advances its anchor in place. Active points, those with a shear load, are
+per candidate finds its depth (`depth_kernel`) and advances its anchor in place. Active points, those with a shear load, are
 compacted in their order, and counted.
 
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.shapes_kernel import chosen, dot
-from tgdsl.quantities.points.skin_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
+from tgdsl.quantities.points.depth_kernel import cells, is_felt, is_within, measured, nearest, outside, placed, posed, surface
 
 LANES, CHUNK = 32, 512
 """Threads of a program, which is one warp, and most points of a chunk."""
@@ -80,7 +80,7 @@ def launch(
 
     Args:
         run: The kernel.
-        pose: As for `skin_kernel.launch`, as the next six.
+        pose: As for `depth_kernel.launch`, as the next six.
         gate: Negative where a pair may not be felt.
         pair: Index of each link's pair.
         points: Places in the object's frame [m].

@@ -2,7 +2,7 @@
 
 The edge is thinned to the vertices that give it its shape and cut into pieces no longer than the element size; inside stand the
 points of nested triangular lattices, of which those with spacing 2^k sizes are used where the edge is at least 2^k / `GRADE`
-sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are halved, and what lies outside is removed.
+sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are bisected, and what lies outside is removed.
 Neither scikit-fem nor libigl meshes an outline, and the meshers that do are not under a free licence.
 
 Shapes: `n` vertices of a loop, `p` points, `m` triangles, `seg` pieces of the edge.
@@ -33,7 +33,7 @@ COARSEST = 3
 CLEARANCE = 0.6
 """Distance of inner points from the edge, in element sizes."""
 ROUNDS = 40
-"""Times that pieces of the edge may be halved."""
+"""Times that pieces of the edge may be bisected."""
 
 
 def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
@@ -58,7 +58,7 @@ def mesh(outline: list[Float[np.ndarray, "n 2"]], size: float) -> MeshTri:
         missing = ~np.isin(_sides(pieces), _sides(np.asarray(found.facets).T))
         if not missing.any():
             break
-        points, pieces = _halved(points, pieces, missing)
+        points, pieces = _bisected(points, pieces, missing)
     within = np.flatnonzero(_is_within(everything[triangles].mean(axis=1), points, pieces))
     _check(found, within, pieces)
     kept = found.restrict(within)
@@ -141,7 +141,7 @@ def _is_within(
     return np.abs(igl.winding_number(points, pieces, where)) > 0.5
 
 
-def _halved(
+def _bisected(
     points: Float[np.ndarray, "p 2"], pieces: Int[np.ndarray, "seg 2"], which: Bool[np.ndarray, " seg"]
 ) -> tuple[Float[np.ndarray, "more 2"], Int[np.ndarray, "pieces 2"]]:
     """Return the edge with some pieces cut in the middle."""

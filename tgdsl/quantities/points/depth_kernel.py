@@ -73,7 +73,7 @@ def _meet(
     values: Tensor,
     is_cubic: bool,
 ) -> Tensor:
-    return launch(wrap_triton(skin_kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
+    return launch(wrap_triton(depth_kernel), pose, gate, pair, points, frames, counts, values, is_cubic)
 
 
 def launch(
@@ -114,7 +114,7 @@ def launch(
 
 
 @triton.jit
-def skin_kernel(
+def depth_kernel(
     found, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
     num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
     IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,
@@ -124,7 +124,7 @@ def skin_kernel(
     pair = tl.load(pairs + link)
     pose = posed((xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz), env * pose_env + pair * pose_pair)
     is_open = is_felt(gates, env * gate_env + pair * gate_pair, IS_GATED)
-    skin = surface(frames, counts, values, link)
+    grid = surface(frames, counts, values, link)
     points += env * point_env
     plane = (tl.num_programs(0).to(tl.int64)) * num_points
     found += tl.program_id(0).to(tl.int64) * num_points
@@ -137,7 +137,7 @@ def skin_kernel(
         tl.store(found + 2 * plane + point, here[2], is_point)
         distance, gradient = outside(here)
         if is_open:
-            distance, gradient = measured(skin, here, is_point, IS_CUBIC)
+            distance, gradient = measured(grid, here, is_point, IS_CUBIC)
         tl.store(found + 3 * plane + point, distance, is_point)
         tl.store(found + 4 * plane + point, gradient[0], is_point)
         tl.store(found + 5 * plane + point, gradient[1], is_point)
@@ -191,27 +191,27 @@ def outside(here):
 
 
 @triton.jit
-def cells(skin, here):
+def cells(grid, here):
     """Return where a block of points in the link's frame is along the axes of the grid, in its cells."""
-    place, turn, low, cell, _, _ = skin
+    place, turn, low, cell, _, _ = grid
     own = rotate_back(turn, (here[0] - place[0], here[1] - place[1], here[2] - place[2]))
     return (own[0] - low[0]) / cell, (own[1] - low[1]) / cell, (own[2] - low[2]) / cell
 
 
 @triton.jit
-def is_within(skin, at):
+def is_within(grid, at):
     """Return whether places in cells are inside the grid; what is no number is."""
-    num = skin[4]
+    num = grid[4]
     return (_is_beyond(at[0], num[0]) | _is_beyond(at[1], num[1]) | _is_beyond(at[2], num[2])) == 0
 
 
 @triton.jit
-def measured(skin, here, is_point, IS_CUBIC: tl.constexpr):
+def measured(grid, here, is_point, IS_CUBIC: tl.constexpr):
     """Return signed distances of a block of points to a link's surface [m], and unit gradients, in the link's frame."""
-    _, turn, _, cell, num, nodes = skin
+    _, turn, _, cell, num, nodes = grid
     distance, gradient = outside(here)
-    at = cells(skin, here)
-    is_in = is_within(skin, at) & is_point
+    at = cells(grid, here)
+    is_in = is_within(grid, at) & is_point
     if is_any(is_in):
         value, slope = _interpolated(nodes, at, num, TIE / cell, is_in, IS_CUBIC)
         distance = tl.where(is_in, value, distance)
@@ -227,9 +227,9 @@ def _is_beyond(place, num):
 
 
 @triton.jit
-def nearest(skin, at, is_in):
+def nearest(grid, at, is_in):
     """Return the distance at the node next to places in cells [m]: theirs is less than a cell below it."""
-    num, nodes = skin[4], skin[5]
+    num, nodes = grid[4], grid[5]
     x, y, z = _rounded(at[0], num[0]), _rounded(at[1], num[1]), _rounded(at[2], num[2])
     return tl.load(nodes + ((x * num[1] + y) * num[2] + z), is_in, float("inf"))
 
