@@ -1,6 +1,6 @@
 """The outer surface of an object as triangles and as points with area weights: what integrals over it are summed from.
 
-Geoms become triangles, which are bisected to a spacing; those of a primitive add up to its area in closed form. What lies inside
+Geoms become triangles, bisected to a spacing; those of a primitive add up to its area in closed form. What lies inside
 another geom of the object is no surface, nor is a face that two geoms share from opposite sides; of one that they share from
 the same side the first counts. Triangles that another geom's surface crosses are bisected further. Nothing depends on a seed,
 but for points that are asked to be random.

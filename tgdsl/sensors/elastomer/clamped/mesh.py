@@ -2,7 +2,8 @@
 
 The edge is thinned to the vertices that give it its shape and cut into pieces no longer than the element size; inside stand the
 points of nested triangular lattices, of which those with spacing 2^k sizes are used where the edge is at least 2^k / `GRADE`
-sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are bisected, and what lies outside is removed.
+sizes away; Delaunay's triangulation joins them, pieces of the edge that it misses are bisected, and what lies outside is
+removed.
 Neither scikit-fem nor libigl meshes an outline, and the meshers that do are not under a free licence.
 
 Shapes: `n` vertices of a loop, `p` points, `m` triangles, `seg` pieces of the edge.
