@@ -14,12 +14,13 @@ from safetensors.numpy import save as serialized
 from tgdsl.errors import ArtifactError, TgdslError
 from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
+from tgdsl.plan import ranges
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
 from tgdsl.scene.asset_paths import check_scene
 from tgdsl.sensors import Kind
-from tgdsl.sensors.known import known_kinds, quantities_of
+from tgdsl.sensors.known import kinds_by_sensor, known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of
 
 METADATA_KEY = "tgdsl"
@@ -58,12 +59,20 @@ def load(
         device: Where the module lives.
 
     Raises:
-        ArtifactError: If the file is not an artefact, is damaged, or is of another version.
+        ArtifactError: If the file is not an artefact, is damaged, is of another version, or holds indices of what is not there.
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
     known = known_kinds(kinds)
-    return TactileModule(load_plan(path, quantities_of(known)), known, dtype).to(device)
+    plan = load_plan(path, quantities_of(known))
+    by_sensor = kinds_by_sensor(known, {sensor.name: sensor.kind for sensor in plan.sensors})
+    try:
+        for sensor in plan.sensors:
+            counts = by_sensor[sensor.name].indices(sensor.constants, len(sensor.taxels))
+            ranges.check_constants(f"sensors/{sensor.name}", sensor.constants, counts)
+    except ArtifactError as error:
+        raise ArtifactError(f"{path}: {error}") from error
+    return TactileModule(plan, known, dtype).to(device)
 
 
 def save_plan(plan: Plan, path: str | PathLike[str]) -> int:

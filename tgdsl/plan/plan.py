@@ -19,7 +19,7 @@ import numpy as np
 
 from tgdsl.errors import ArtifactError
 from tgdsl.layout.layout import Layout
-from tgdsl.plan import tree
+from tgdsl.plan import ranges, tree
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.scene import SceneFile
 from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
@@ -113,7 +113,8 @@ class Plan:
             quantities: The quantities that it may ask for.
 
         Raises:
-            ArtifactError: If the text is not a plan of this version, the arrays are not its own, or a quantity is not known.
+            ArtifactError: If the text is not a plan of this version, the arrays are not its own, an index is of nothing, or a
+                quantity is not known.
         """
         try:
             plain = json.loads(text)
@@ -135,6 +136,7 @@ class Plan:
             raise ArtifactError(f'the plan has no array "{unknown[0]}"')
         if digest != _digest(arrays):
             raise ArtifactError("the arrays are not those that the plan was written with")
+        ranges.check(plan)
         return plan
 
     def _parts(self) -> dict[str, Any]:

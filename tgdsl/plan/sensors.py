@@ -6,11 +6,12 @@ Shapes: `taxel` taxels of one sensor, `row` rows of a reading, `channel` numbers
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
+from tgdsl.fields.indices import indices
 from tgdsl.layout.layout import Link
 from tgdsl.plan.tree import inline
 
@@ -119,7 +120,7 @@ class PlannedSensor(Generic[Array]):
     sensor: str
     kind: str
     links: tuple[Link, ...]
-    taxels: Array
+    taxels: Array = field(metadata=indices(lambda sensor, part, plan: plan.layout.num_taxels))
     uses: Mapping[str, int]
     joined: tuple[str, ...]
     rows: tuple[int, int]
@@ -170,9 +171,15 @@ class PlannedObservation(Generic[Array]):
     index: int
     type: str
     reading: str | None
-    channels: tuple[int, ...]
+    channels: tuple[int, ...] = field(
+        metadata=indices(lambda term, part, plan: len(plan.readings()[term.reading].channels) if term.reading else 0)
+    )
     num_features: int
-    constants: Mapping[str, Array] = inline()
+    constants: Mapping[str, Array] = field(
+        metadata=indices(
+            lambda term, part, plan: {"rows": plan.readings()[term.reading].num_rows} if term.reading else {}, inline=True
+        )
+    )
     axes: Literal["", "xyz", "zyx"] = ""
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -37,7 +37,7 @@ def flatten(value: Any, path: str = "") -> tuple[Any, dict[str, np.ndarray]]:
             arrays[name] = value
             return {LEAF: name}
         if _is_record(value):
-            return {f.name: plain(getattr(value, f.name), _below(path, f)) for f in dataclasses.fields(value)}
+            return {f.name: plain(getattr(value, f.name), below(path, f)) for f in dataclasses.fields(value)}
         if isinstance(value, Mapping):
             return {str(key): plain(part, _joined(path, str(key))) for key, part in value.items()}
         if isinstance(value, (tuple, list)):
@@ -86,6 +86,25 @@ def mapped(value: Any, change: Callable[[np.ndarray], Any], is_kept: Callable[[A
         return value
 
     return walk(value)
+
+
+def members(parts: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the members of a tuple or mapping, each after its name."""
+    if isinstance(parts, Mapping):
+        yield from ((_joined(path, str(key)), part) for key, part in parts.items())
+    else:
+        yield from ((_joined(path, _key(part, i)), part) for i, part in enumerate(parts))
+
+
+def records(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield the dataclasses of a tree, those that hold others first, each after its name."""
+    if _is_record(value):
+        yield path, value
+        for field in dataclasses.fields(value):
+            yield from records(getattr(value, field.name), below(path, field))
+    elif isinstance(value, (Mapping, tuple, list)):
+        for name, part in members(value, path):
+            yield from records(part, name)
 
 
 def frozen(array: np.ndarray) -> np.ndarray:
@@ -143,7 +162,8 @@ def _is_array(origin: Any) -> bool:
     return origin is np.ndarray or hasattr(origin, "array_type")
 
 
-def _below(path: str, field: dataclasses.Field) -> str:
+def below(path: str, field: dataclasses.Field) -> str:
+    """Return the name of a field of what is at a path."""
     return path if field.metadata.get("inline") else _joined(path, field.name)
 
 

@@ -6,13 +6,14 @@ a taxel's are not, so everything that depends on the pair alone is formed first 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Rot, Vec
 
@@ -43,11 +44,11 @@ class PairedObject:
 
     name: str
     body: str
-    first_pair: int
-    num_pairs: int
-    num_variants: int
+    first_pair: int = field(metadata=indices(lambda target, part, plan: len(plan.pairs.link) + 1))
+    num_pairs: int = field(metadata=indices(lambda target, part, plan: len(plan.pairs.link) + 1 - target.first_pair))
+    num_variants: int = field(metadata=indices(None, least=1))
     is_sized: bool
-    varied: int
+    varied: int = field(metadata=indices(lambda target, part, plan: len(plan.inputs.objects), least=-1))
 
     @property
     def pairs(self) -> slice:
@@ -65,9 +66,9 @@ class PairTable(Generic[Array]):
         gate: Its place among `inputs.pairs`, whose contacts are read; 0 where no request wants to know.
     """
 
-    link: Array
-    object: Array
-    gate: Array
+    link: Array = field(metadata=indices(lambda table, part, plan: len(plan.inputs.bodies)))
+    object: Array = field(metadata=indices(lambda table, part, plan: len(plan.inputs.bodies)))
+    gate: Array = field(metadata=indices(lambda table, part, plan: max(len(plan.inputs.pairs), 1)))
 
 
 class Motion(NamedTuple):

@@ -233,6 +233,11 @@ Planes = Mapping[str, Tensor]
 Reading = Float[np.ndarray, "row channel"]
 
 
+def no_indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> Mapping[str, int]:
+    """Return of how many things constants are indices: none is one."""
+    return {}
+
+
 @dataclass(frozen=True)
 class Kind:
     """A kind of sensor.
@@ -255,6 +260,7 @@ class Kind:
             computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
         is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
         quantities: Quantities of its own that it asks for, which no installed package brings.
+        indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
     """
 
     spec: type[SensorSpec]
@@ -268,6 +274,7 @@ class Kind:
     is_pointwise: bool = False
     is_timed: bool = False
     quantities: tuple[Quantity, ...] = ()
+    indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
 
     @property
     def name(self) -> str:

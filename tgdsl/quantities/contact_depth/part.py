@@ -5,9 +5,10 @@ Shapes: `object` objects of a use or query, `taxel` probes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from tgdsl.fields.indices import indices
 from tgdsl.quantities.geoms.tables import GeomTable
 
 Array = TypeVar("Array")
@@ -23,7 +24,7 @@ class SearchPart(Generic[Array]):
         geoms: Their geoms, (1, geom, row); None likewise.
     """
 
-    pair: Array
+    pair: Array = field(metadata=indices(lambda search, part, plan: len(plan.pairs.link)))
     spheres: Array | None
     geoms: Array | None
 
@@ -38,9 +39,9 @@ class ProbeQuery(Generic[Array]):
         pair: Index of each probe's pair with each object among that object's pairs, (object, taxel).
     """
 
-    objects: tuple[int, ...]
+    objects: tuple[int, ...] = field(metadata=indices(lambda query, part, plan: len(plan.objects)))
     pos: Array
-    pair: Array
+    pair: Array = field(metadata=indices(lambda query, part, plan: [[plan.objects[i].num_pairs] for i in query.objects]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,8 @@ class DepthUse(Generic[Array]):
         search: What a search by a kernel is given; None where it is of no use.
     """
 
-    query: int
-    objects: tuple[int, ...]
+    query: int = field(metadata=indices(lambda use, part, plan: len(part.queries)))
+    objects: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(part.queries[use.query].objects)))
     is_gated: bool
     wants: tuple[str, ...]
     radius_noise: str

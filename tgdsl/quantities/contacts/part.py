@@ -5,8 +5,10 @@ Shapes: `body` bodies that carry the sensors, `object` felt objects.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
+
+from tgdsl.fields.indices import indices
 
 Array = TypeVar("Array")
 
@@ -23,8 +25,8 @@ class ContactsUse(Generic[Array]):
         pairs: Whose contacts: indices into `inputs.pairs`, or their number for none, (body, object).
     """
 
-    bodies: Array
-    pairs: Array
+    bodies: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.bodies)))
+    pairs: Array = field(metadata=indices(lambda use, part, plan: len(plan.inputs.pairs) + 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,12 +6,13 @@ Shapes: `case` variants of an object, or links; `geom` columns; `node` nodes of 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from tgdsl.fields.indices import indices
 from tgdsl.geometry.bvh import TriangleMesh
 from tgdsl.quantities.geoms.distance import RaycastSurface
 
@@ -32,8 +33,10 @@ class GridTable(Generic[Array]):
     """
 
     values: Array
-    first: Array
-    num: Array
+    first: Array = field(
+        metadata=indices(lambda grids, part, plan: len(grids.values) + 1 - np.prod(grids.num, axis=1, dtype=float))
+    )
+    num: Array = field(metadata=indices(None, least=2))
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -51,7 +54,7 @@ class TriangleTable:
 
     stays_on_host: ClassVar[bool] = True
     vertices: tuple[np.ndarray, ...]
-    faces: tuple[np.ndarray, ...]
+    faces: tuple[np.ndarray, ...] = field(metadata=indices(lambda table, part, plan: tuple(map(len, table.vertices))))
     max_distance: float
 
     @cached_property
@@ -89,7 +92,7 @@ class GeomTable(Generic[Array]):
     size: Array
     pos: Array
     rotation: Array
-    is_absent: Array | None
+    is_absent: Array | None = field(metadata=indices(lambda table, part, plan: 2))
     surfaces: tuple[GridTable[Array] | TriangleTable | None, ...]
     accuracy: tuple[tuple[Mapping[str, float], ...], ...]
 

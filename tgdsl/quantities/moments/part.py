@@ -6,8 +6,12 @@ Shapes: `object` objects of a use, `taxel` probes, `variant` variants of an obje
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
+
+import numpy as np
+
+from tgdsl.fields.indices import indices
 
 Array = TypeVar("Array")
 
@@ -27,8 +31,10 @@ class FieldTable(Generic[Array]):
     """
 
     values: Array
-    first: Array
-    num: Array
+    first: Array = field(
+        metadata=indices(lambda fields, part, plan: len(fields.values) + 1 - np.prod(fields.num, axis=1, dtype=float))
+    )
+    num: Array = field(metadata=indices(None, least=2))
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -52,9 +58,11 @@ class CloudTable(Generic[Array]):
 
     points: Array
     weight: Array
-    lists: Array
-    first: Array
-    num: Array
+    lists: Array = field(metadata=indices(lambda clouds, part, plan: clouds.points.shape[1]))
+    first: Array = field(
+        metadata=indices(lambda clouds, part, plan: len(clouds.lists) + 1 - np.prod(clouds.num, axis=1, dtype=float))
+    )
+    num: Array = field(metadata=indices(None, least=1))
     origin: Array
     cell: Array
     counts: tuple[int, int, int]
@@ -74,7 +82,7 @@ class MomentTable(Generic[Array]):
         accuracy: What was measured of each field, variant after variant, radius by radius: see `fields.FieldErrors`.
     """
 
-    object: int
+    object: int = field(metadata=indices(lambda table, part, plan: len(plan.objects)))
     radii: tuple[float, ...]
     area: Array
     plane_pos: Array
@@ -97,11 +105,15 @@ class MomentUse(Generic[Array]):
         motion: Whether the objects' motions are asked for.
     """
 
-    tables: tuple[int, ...]
+    tables: tuple[int, ...] = field(metadata=indices(lambda use, part, plan: len(part.tables)))
     pos: Array
-    pair: Array
+    pair: Array = field(
+        metadata=indices(lambda use, part, plan: [[plan.objects[part.tables[i].object].num_pairs] for i in use.tables])
+    )
     reach: Array
-    radius_id: Array
+    radius_id: Array = field(
+        metadata=indices(lambda use, part, plan: [[max(len(part.tables[i].radii), 1)] for i in use.tables])
+    )
     radius_noise: str
     motion: bool
 

@@ -5,9 +5,10 @@ Shapes: `variant` variants of an object, `point` points of it, `link` links that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from tgdsl.fields.indices import indices
 from tgdsl.quantities.geoms.tables import GeomTable
 
 Array = TypeVar("Array")
@@ -23,7 +24,7 @@ class CloudPart(Generic[Array]):
         area: Surface that each stands for [m²], (variant,).
     """
 
-    object: int
+    object: int = field(metadata=indices(lambda cloud, part, plan: len(plan.objects)))
     points: Array
     area: Array
 
@@ -41,12 +42,14 @@ class MetObject(Generic[Array]):
         tiles: What `points.point_tiles` returns of the taxels, (tile, 3).
     """
 
-    cloud: int
-    links: tuple[int, ...]
-    taxels: tuple[tuple[int, int], ...]
-    pair: Array
-    link: Array
-    tiles: Array
+    cloud: int = field(metadata=indices(lambda met, part, plan: len(part.clouds)))
+    links: tuple[int, ...] = field(metadata=indices(lambda met, part, plan: len(part.links)))
+    taxels: tuple[tuple[int, int], ...] = field(metadata=indices(lambda met, part, plan: plan.layout.num_taxels + 1))
+    pair: Array = field(metadata=indices(lambda met, part, plan: len(plan.pairs.link)))
+    link: Array = field(metadata=indices(lambda met, part, plan: len(part.links)))
+    tiles: Array = field(
+        metadata=indices(lambda met, part, plan: [len(met.links), *[plan.layout.num_taxels + 1] * 2], least=-1)
+    )
 
 
 @dataclass(frozen=True, eq=False)

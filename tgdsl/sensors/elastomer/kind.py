@@ -146,4 +146,6 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
     return planes.vec(operators.apply(constants, "traction", traction))
 
 
-ELASTOMER = Kind(ElastomerSpec, lower, forward, reference, knobs=TAXEL, gains_depth=True)
+ELASTOMER = Kind(
+    ElastomerSpec, lower, forward, reference, knobs=TAXEL, gains_depth=True, indices=lambda found, _: operators.indices(found)
+)

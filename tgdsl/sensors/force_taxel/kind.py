@@ -28,6 +28,7 @@ still sum to the solver's.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -178,4 +179,9 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     return readings, {}
 
 
-FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE)
+def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> dict[str, int]:
+    """Return of how many things constants are indices: of taxels, and of places of all bodies' padded taxels."""
+    return {"taxel": num_taxels, "first": num_taxels + 1, "row": constants["taxel"].size}
+
+
+FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE, indices=indices)
