@@ -100,6 +100,8 @@ def _mjc_actuator(stage: Stage, prim: Prim, named: Named, name: str) -> Actuator
         return None
     ends |= {"slidersite": named.sites[slider[0]]} if slider else {}
     ends |= {"refsite": named.sites[reference[0]]} if reference else {}
+    if not slider and float(attributes.pop("cranklength", 0.0)):
+        stage.drop("mjc:crankLength was dropped of actuators without mjc:sliderSite", prim)
     joint = target if target in named.joints else ""
     return Actuator({"name": name} | ends | attributes, joint, math.inf if order is None else float(order))
 
