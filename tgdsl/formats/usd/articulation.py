@@ -40,7 +40,7 @@ class SpanningTree:
     """A spanning tree of all bodies.
 
     Attributes:
-        nodes: By body; a parent comes before its children.
+        nodes: By body, depth first and siblings in stage order, which is MuJoCo's order.
         loops: Joints that are not in the tree: they close a loop, or are equality constraints of MuJoCo.
     """
 
@@ -78,10 +78,15 @@ class _TreeBuilder:
             group, root = self._attached(waiting) or self._floating(waiting)
             waiting.remove(group)
             self._extend([root])
-        self.nodes = {body: self._stacked(node) for body, node in self.nodes.items()}
+        self.nodes = {body: self._stacked(self.nodes[body]) for body in self._depth_first(None)}
         used = {id(joint) for node in self.nodes.values() for joint in node.joints}
         loops = (joint for joint in (*self.joints, *self.constraints) if id(joint) not in used)
         return SpanningTree(self.nodes, tuple(loops))
+
+    def _depth_first(self, parent: str | None) -> list[str]:
+        """Return all bodies below one, siblings in stage order."""
+        children = [body for body in self.kinematic if self.nodes[body].parent == parent]
+        return [body for child in children for body in (child, *self._depth_first(child))]
 
     def _stacked(self, node: TreeNode) -> TreeNode:
         """Return a node with all joints that stack on its own, in stage order."""

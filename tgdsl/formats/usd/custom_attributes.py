@@ -33,6 +33,8 @@ GEOM: AttributeTable = {
 }
 JOINT: AttributeTable = {
     "margin": "jnt_margin",
+    "stiffness": "jnt_stiffness",
+    "actuatorgravcomp": "jnt_actgravcomp",
     "solreflimit": "jnt_solref",
     "solimplimit": "jnt_solimp",
     "solreffriction": "dof_solref",

@@ -152,8 +152,12 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
     if kind not in ("hinge", "slide"):
         attributes.pop("ref", None)
     if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
-        place = _moved(kind, axis, limits[0] - float(attributes.get("ref", 0.0)))
+        is_shifted = read_custom(stage, prim, "ref") is None
+        place = _moved(kind, axis, limits[0] - (float(attributes.get("ref", 0.0)) if is_shifted else 0.0))
         kind, frame0, limits, attributes = "fixed", frame0 @ place, None, {}
+    if read_custom(stage, prim, "ref") and "ref" in attributes:
+        # MuJoCo's position is USD's, and starts elsewhere; with `mjc:ref` it starts where the frames meet.
+        frame0 = frame0 @ _moved(kind, axis, float(attributes["ref"]))
     _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
     drive = None
     if kind in ("hinge", "slide"):

@@ -199,7 +199,7 @@ def _mjcf_root(stage: Stage, robot: _Robot) -> ET.Element:
     named = _named(robot)
     add_couplings(stage, equality, robot.joints, _scalars(robot))
     named = replace(named, tendons=add_tendons(stage, tendon, replace(named, joints=_scalars(robot))))
-    nodes = _depth_first(robot.tree)
+    nodes = list(robot.tree.nodes.values())
     motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in nodes]
     others = read_actuators(stage, named)
     driven = own_drives(stage, [joint for node in nodes for joint in node.joints], others)
@@ -235,11 +235,6 @@ def _add_exclusions(stage: Stage, robot: _Robot, contact: ET.Element, flags: Map
         first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
         ET.SubElement(contact, "exclude", body1=first, body2=second)
     return {"filterparent": "disable"} if is_off else {}
-
-
-def _depth_first(tree: SpanningTree, parent: str | None = None) -> list[TreeNode]:
-    """Return all nodes in MuJoCo's order."""
-    return [node for child in tree.children(parent) for node in (child, *_depth_first(tree, child.body))]
 
 
 def _add_body(

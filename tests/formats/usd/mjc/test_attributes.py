@@ -9,8 +9,8 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from schema_stages import PRIMS, author, relate, schema_stage
-from stages import compiled, error_of, path_of, warned
+from schema_stages import PRIMS, author, schema_stage
+from stages import compiled, warned
 
 DEGREE = math.radians(1)
 REF, IMP = [0.03, 0.8], [0.7, 0.9, 0.002, 0.4, 3.0]
@@ -365,86 +365,3 @@ def test_the_time_step_of_newtons_scene_is_its_schemas(tmp_path):
         if is_named:
             stage.GetPrimAtPath("/scene").AddAppliedSchema("NewtonSceneAPI")
         assert compiled(stage).opt.timestep == expected
-
-
-@pytest.mark.parametrize(
-    ("where", "names", "field", "expected"),
-    [
-        ("turn", {"tgdsl:margin": 0.1, "mjc:margin": 0.2}, turn("jnt_margin"), 0.1),
-        ("turn", {"mjc:armature": 0.1, "newton:armature": 0.2, "physxJoint:armature": 0.3}, turn("dof_armature"), 0.1),
-        ("turn", {"newton:armature": 0.2, "physxJoint:armature": 0.3}, turn("dof_armature"), 0.2),
-        ("rail", {"newton:friction": 0.2, "physxJoint:jointFriction": 0.3}, rail("dof_frictionloss"), 0.2),
-        ("ball", {"mjc:gap": 0.1, "newton:contactGap": 0.2}, ball("geom_gap"), 0.1),
-        ("scene", {"mjc:option:timestep": 0.005, "newton:timeStepsPerSecond": 500}, lambda m: m.opt.timestep, 0.005),
-        ("scene", {"mjc:option:iterations": 5, "newton:maxSolverIterations": 7}, lambda m: m.opt.iterations, 5),
-    ],
-)
-def test_the_most_specific_counts_and_contradictions_are_named(tmp_path, where, names, field, expected):
-    stage = schema_stage(tmp_path)
-    for name, value in names.items():
-        author(stage.GetPrimAtPath(PRIMS[where]), name, value)
-    model, messages = warned(stage)
-    assert field(model) == pytest.approx(expected)
-    first, *others = names
-    assert messages == [f"{name} was dropped, which contradicts {first}: {PRIMS[where]}" for name in others]
-
-
-def test_sources_that_agree_are_silent(tmp_path):
-    stage = schema_stage(tmp_path)
-    for where, name, value in (
-        ("scene", "mjc:option:timestep", 0.003),
-        ("scene", "newton:timeStepsPerSecond", 333),
-        ("turn", "mjc:damping", 0.3),
-        ("turn", "newton:damping", float(np.float32(0.3 * DEGREE))),
-    ):
-        author(stage.GetPrimAtPath(PRIMS[where]), name, value)
-    model = compiled(stage)
-    assert (model.opt.timestep, turn("dof_damping")(model)) == (0.003, 0.3)
-
-
-def test_a_materials_stiffness_is_that_of_its_colliders_solref(tmp_path):
-    stage = schema_stage(tmp_path)
-    author(stage.GetPrimAtPath("/rubber"), "newton:contactStiffness", 2500.0)
-    author(stage.GetPrimAtPath("/link/ball"), "mjc:solref", REF)
-    np.testing.assert_allclose(ball("geom_solref")(compiled(stage)), REF)
-
-
-def test_schemas_and_types_that_nobody_knows_are_named(tmp_path):
-    stage = schema_stage(tmp_path)
-    stage.GetPrimAtPath("/turn").AddAppliedSchema("NewtonKaminoSceneAPI")
-    stage.DefinePrim("/deformable", "NewtonSponge")
-    _, messages = warned(stage)
-    assert messages == [
-        "the API schema NewtonKaminoSceneAPI was dropped: /turn",
-        "prims of type NewtonSponge were dropped: /deformable",
-    ]
-
-
-def test_looks_and_bookkeeping_are_passed_over(tmp_path):
-    stage = schema_stage(tmp_path)
-    prim = stage.GetPrimAtPath("/link/ball")
-    for name, value in (
-        ("primvars:warmth", 1.0),
-        ("inputs:roughness", 0.1),
-        ("ui:order", 3),
-        ("physics:startsAsleep", True),
-    ):
-        author(prim, name, value)
-    relate(prim, "material:binding", ["/rubber"])
-    relate(prim, "physics:simulationOwner", ["/scene"])
-    compiled(stage)
-
-
-def test_one_warning_for_each_attribute(tmp_path):
-    stage = schema_stage(tmp_path)
-    for path in ("/turn", "/rail", "/socket"):
-        author(stage.GetPrimAtPath(path), "physxJoint:maxJointVelocity", 5.0)
-    _, messages = warned(stage)
-    assert messages == ["physxJoint:maxJointVelocity was dropped, which means nothing here: /turn, /rail, /socket"]
-
-
-def test_wrong_values_are_errors(tmp_path):
-    stage = schema_stage(tmp_path)
-    author(stage.GetPrimAtPath("/cart/wedge"), "mjc:inertia", "hollow")
-    assert error_of(stage) == "/cart/wedge: mjc:inertia is 'hollow'; expected one of legacy, convex, exact, shell"
-    assert path_of(stage).exists()

@@ -13,12 +13,14 @@ from tgdsl.formats.usd.stage import Prim, Stage, unique_names
 MJC_ACTUATOR, NEWTON_ACTUATOR = "MjcActuator", "NewtonActuator"
 """Types of the prims."""
 LIMITS = ("act", "ctrl", "force")
+OWN = ("delay", "nsample", "armature", "damping")
+"""Attributes that MjcPhysics does not have."""
 ACTUATOR: SourceTable = {
     **{name.lower(): mjc(name) for name in ("actDim", "actEarly", "biasPrm", "biasType", "crankLength", "dynPrm", "dynType")},
     **{name.lower(): mjc(name) for name in ("gainPrm", "gainType", "gear", "group", "inheritRange")},
     **{f"{name}limited": mjc(f"{name}Limited") for name in LIMITS},
     **{f"{name}range": mjc(f"{name}Range", is_range=True) for name in (*LIMITS, "length")},
-    **dict.fromkeys(("delay", "nsample", "interp", "armature"), ()),
+    **dict.fromkeys(OWN, ()),
 }
 SERVO: SourceTable = {
     "kp": (Source("newton:kp", "inertia"),),

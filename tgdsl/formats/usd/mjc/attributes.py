@@ -95,14 +95,13 @@ JOINTS: SourceTable = {
     "damping": mjc("damping", Source("newton:damping", "damping")),
     "armature": mjc("armature", Source("newton:armature", "inertia"), Source("physxJoint:armature", "inertia")),
     "frictionloss": mjc("frictionloss", Source("newton:friction", "effort"), Source("physxJoint:jointFriction", "effort")),
-    "stiffness": mjc("stiffness"),
     "springref": mjc("springref", unit="mjcf angle"),
     "springdamper": mjc("springdamper"),
     "ref": mjc("ref", unit="mjcf angle"),
     "actuatorfrclimited": mjc("actuatorfrclimited"),
     "actuatorfrcrange": mjc("actuatorfrcrange", is_range=True),
-    "actuatorgravcomp": mjc("actuatorgravcomp"),
     "group": mjc("group"),
+    "range": (),
 }
 BODY: SourceTable = {"gravcomp": mjc("body:gravcomp")}
 COLLIDER: SourceTable = {

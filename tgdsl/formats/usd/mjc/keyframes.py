@@ -26,7 +26,9 @@ def add_keyframes(stage: Stage, root: ET.Element, keyframe: ET.Element) -> None:
     model = mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
     sizes = {"qpos": model.nq, "qvel": model.nv, "act": model.na, "ctrl": model.nu}
     sizes |= {"mpos": 3 * model.nmocap, "mquat": 4 * model.nmocap, "time": 1}
-    names = unique_names(stage, prims, [key.get("name", "") for key in keyframe])
+    names = unique_names(stage, prims)
+    for key in [key for key in keyframe if key.get("name") in names.values()]:
+        keyframe.remove(key)  # the stage's own overrules what was made of its poses
     for prim in prims:
         attributes = read_attributes(stage, prim, KEY)
         attributes = {name: value for name, value in attributes.items() if value}

@@ -18,7 +18,7 @@ TENDON: SourceTable = {
     "actuatorfrcrange": mjc("actuatorfrcrange", is_range=True),
 }
 DRAWN: SourceTable = {"rgba": mjc("rgba"), "width": mjc("width")}
-"""Of a spatial tendon."""
+"""Of a spatial tendon; a fixed one is not drawn."""
 
 
 def add_tendons(stage: Stage, tendon: ET.Element, named: Named) -> dict[str, str]:
@@ -41,7 +41,9 @@ def add_tendons(stage: Stage, tendon: ET.Element, named: Named) -> dict[str, str
 
 def _tendon(stage: Stage, prim: Prim, named: Named) -> ET.Element | None:
     is_fixed = str(stage.value(prim, "mjc:type")) == "fixed"
-    attributes = with_limits(stage, read_attributes(stage, prim, TENDON | ({} if is_fixed else DRAWN)), ("", "actuatorfrc"))
+    attributes = with_limits(stage, read_attributes(stage, prim, TENDON), ("", "actuatorfrc"))
+    drawn = read_attributes(stage, prim, DRAWN)
+    attributes |= {} if is_fixed else drawn
     targets = [str(path) for path in stage.targets(prim, "mjc:path")]
     order = _array(stage, prim, "path:indices") or list(range(len(targets)))
     if not order or max(order) >= len(targets) or min(order) < 0:
