@@ -203,16 +203,21 @@ def random_qpos(model: mujoco.MjModel, generator: np.random.Generator) -> np.nda
     return qpos
 
 
+def ordered(one: int, two: int) -> tuple[int, int]:
+    """Return two indices, the smaller first."""
+    return min(one, two), max(one, two)
+
+
 def contacts(model: mujoco.MjModel, data: mujoco.MjData) -> dict[tuple[int, int], tuple[float, float]]:
     """Return of each pair of bodies in contact the greatest depth [m] and the sum of normal forces [N]."""
     found: dict[tuple[int, int], tuple[float, float]] = {}
     force = np.zeros(6)
     for i in range(data.ncon):
         contact = data.contact[i]
-        key = tuple(sorted(int(model.geom_bodyid[g]) for g in contact.geom))
+        key = ordered(*(int(model.geom_bodyid[g]) for g in contact.geom))
         mujoco.mj_contactForce(model, data, i, force)
-        depth, total = found.get((key[0], key[1]), (0.0, 0.0))
-        found[key[0], key[1]] = (max(depth, -float(contact.dist)), total + float(force[0]))
+        depth, total = found.get(key, (0.0, 0.0))
+        found[key] = (max(depth, -float(contact.dist)), total + float(force[0]))
     return found
 
 
@@ -228,7 +233,7 @@ def at_states(twins: Twins, seed: int) -> Iterator[tuple[str, str, bool]]:
         second.qpos[list(coordinates.values())] = first.qpos[list(coordinates.keys())]
         mujoco.mj_forward(twins.one, first)
         mujoco.mj_forward(twins.two, second)
-        a = {tuple(sorted(twins.bodies[i] for i in key)): value for key, value in contacts(twins.one, first).items()}
+        a = {ordered(twins.bodies[i], twins.bodies[j]): value for (i, j), value in contacts(twins.one, first).items()}
         b = contacts(twins.two, second)
         largest = max([force for _, force in a.values()], default=0.0)
         seen += len(a)

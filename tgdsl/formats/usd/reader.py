@@ -1,18 +1,30 @@
 """USD in: a UsdPhysics stage becomes MJCF.
 
-The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
+The semantics are those of the UsdPhysics schemas; of MuJoCo's own (`mjc:`) and Newton's (`newton:`) where they are authored,
+whose plugins need not be installed. Where several say the same, the most specific counts: `tgdsl:`, `mjc:`, `newton:`,
+`physx…:`, UsdPhysics, in this order; who contradicts it is warned of (`mjc/attributes.py`). Exceptions are what a user edits in
+a stage that `export` wrote: UsdPhysics' value of a drive, a friction or a mass overrules our exact copy of the old one.
+
+Where MuJoCo leaves a choice:
 
 - A body's frame is its prim's, without scale; its name is the end of the prim's path, or the custom attribute `tgdsl:name`.
-- Position zero is where the frames of a joint meet. If the authored poses or the drives' targets differ from it, the keyframe
-  `authored` has them.
+- Position zero is where the frames of a joint meet, with `mjc:ref` the position `ref`. If the authored poses or the drives'
+  targets differ from where the model starts, the keyframe `authored` has them. Limits are MuJoCo's positions.
 - A drive becomes a `position` actuator, or a `velocity` actuator if it has no stiffness, named after its joint. A drive
-  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's.
+  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's;
+  `mjc:damping` and `newton:damping` are beside it. A prim MjcActuator or NewtonActuator on the joint is that same actuator,
+  said more exactly: the drive is left out, with a warning if it contradicts.
+- Several joints between the same two bodies are degrees of freedom of one, where MjcJointAPI or `newton:jointsAddMobility` says
+  that joints add mobility; else all but one close a loop.
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
-  of two, and its own default where no material is bound.
-- `physxJoint:armature` and `physxJoint:jointFriction` (a torque or force) are read where they are authored.
-- A joint that closes a loop becomes an equality constraint between sites.
-- Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2. Materials' looks, subdivision,
-  holes of meshes and what is not drawn by default are left out; whatever else is dropped is warned of.
+  of two, and its own default where no material is bound. `newton:contactStiffness` and `contactDamping` are not read: they are
+  a force per distance, MuJoCo's `solref` is per effective mass.
+- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites.
+- Whether a parent and its child collide is what their joint says; where it says nothing and the scene has MjcSceneAPI,
+  MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
+- Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.
+- Materials' looks, subdivision, holes of meshes and what is not drawn by default are left out. Whatever else is authored and
+  nobody has read is warned of, by attribute and prim (`audit.py`).
 - Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever those of the stage.
 """
 
@@ -158,7 +170,9 @@ def _check(stage: Stage, robot: _Robot) -> None:
         for name in ("velocity", "angularVelocity"):
             if any(stage.value(prim, f"physics:{name}")):
                 stage.drop("initial velocities were dropped", prim)
-        if node.joint is not None and _authored(robot, node.joint)[2] > FRAME_TOLERANCE:
+        poses = [joint.pose(node.is_swapped) for joint in node.joints]
+        is_apart = any(np.abs(pose - poses[0]).max() > FRAME_TOLERANCE for pose in poses)
+        if node.joint is not None and (is_apart or _authored(robot, node.joint)[2] > FRAME_TOLERANCE):
             stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", node.joint.prim)
     for geom in robot.geoms:
         if geom.shape.kind == "plane" and geom.body is not None and not robot.kinematic[geom.body]:
