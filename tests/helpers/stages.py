@@ -164,6 +164,13 @@ def inertia(model: mujoco.MjModel, body: str) -> np.ndarray:
     return turned @ np.diag(model.body(body).inertia) @ turned.T
 
 
+def meetings(model: mujoco.MjModel) -> set[tuple[str, ...]]:
+    """Return the pairs of bodies that MuJoCo finds in contact."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return {tuple(sorted(model.body(model.geom_bodyid[g]).name for g in contact.geom)) for contact in data.contact}
+
+
 TOLERANCE = 1e-6
 """USD keeps joint frames and sizes in float32, MuJoCo mesh vertices too; all here is about 1 m or 1 kg."""
 ODD = (0.8, 0.3, -0.4, 0.2)

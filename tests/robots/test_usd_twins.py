@@ -6,6 +6,7 @@ What the two models differ by is the order of floating-point operations: 1e-16, 
 import runpy
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -98,6 +99,38 @@ def test_twins_are_made_again_byte_for_byte():
     runpy.run_path(str(ROOT / "robots" / "make_usd.py"), run_name="__main__")
     assert [file.read_bytes() for file in files] == before
     assert max(map(len, before)) < 3_000_000
+
+
+ROBOTS = sorted((ROOT / "robots").glob("*/*.xml"))
+
+
+@pytest.mark.parametrize("file", ROBOTS, ids=[file.stem for file in ROBOTS])
+def test_actuators_joints_and_colliding_pairs_are_the_same(file):
+    first, second = (load_model(path).compiled for path in (file, file.with_suffix(".usda")))
+    for kind, count in (("body", "nbody"), ("joint", "njnt"), ("actuator", "nu")):
+        names = [[getattr(m, kind)(i).name for i in range(getattr(m, count))] for m in (first, second)]
+        assert names[0] == names[1]
+    for array in ("damping", "armature", "frictionloss"):
+        np.testing.assert_allclose(getattr(second, f"dof_{array}"), getattr(first, f"dof_{array}"), rtol=1e-12)
+    for array in ("gainprm", "biasprm", "ctrlrange", "forcerange", "gear"):
+        np.testing.assert_allclose(getattr(second, f"actuator_{array}"), getattr(first, f"actuator_{array}"), rtol=1e-12)
+    assert second.opt.timestep == first.opt.timestep
+    assert colliding_pairs(first) == colliding_pairs(second) != set()
+
+
+def colliding_pairs(model) -> set[tuple[int, int]]:
+    """Return the pairs of bodies with colliders that can collide, by MuJoCo's filters of bodies."""
+    weld = model.body_weldid
+    parent = weld[model.body_parentid[weld]]
+    excluded = {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature.tolist()}
+    is_filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+
+    def is_family(a, b):
+        return weld[a] and weld[b] and (weld[b] == parent[a] or weld[a] == parent[b])
+
+    bodies = np.unique(model.geom_bodyid[(model.geom_contype | model.geom_conaffinity) != 0]).tolist()
+    pairs = {(a, b) for a in bodies for b in bodies if a < b and weld[a] != weld[b]} - excluded
+    return {(a, b) for a, b in pairs if not (is_filtering and is_family(a, b))}
 
 
 @pytest.mark.parametrize("resolution", ["low", "med", "high"])

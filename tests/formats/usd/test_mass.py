@@ -2,7 +2,6 @@
 
 import math
 
-import mujoco
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
@@ -21,6 +20,7 @@ from stages import (
     compiled,
     inertia,
     matrix,
+    meetings,
     new_stage,
     warned,
 )
@@ -123,13 +123,6 @@ def test_friction_of_materials(tmp_path):
     frictions = {name: float(model.geom(name).friction[0]) for name in (*values, "any", "none")}
     expected = {"both": 0.3, "static": 0.7, "zero": 0.0, "neither": 1.0, "any": 0.2, "none": 1.0}
     close([frictions[name] for name in expected], list(expected.values()))
-
-
-def meetings(model: mujoco.MjModel) -> set[tuple[str, ...]]:
-    """Return the pairs of bodies that MuJoCo finds in contact."""
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    return {tuple(sorted(model.body(model.geom_bodyid[g]).name for g in contact.geom)) for contact in data.contact}
 
 
 def crowd(stage: Usd.Stage, *names: str) -> None:

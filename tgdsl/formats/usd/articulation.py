@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tgdsl.formats.usd.joints import Joint
 
@@ -16,11 +16,18 @@ class TreeNode:
         body: Path of the body.
         parent: Path of its parent; None is the world.
         joint: What joins it to its parent, or None if it floats or is kinematic.
+        stacked: Joints between the same two bodies that add to its motion, in MuJoCo's order.
     """
 
     body: str
     parent: str | None
     joint: Joint | None
+    stacked: tuple[Joint, ...] = ()
+
+    @property
+    def joints(self) -> tuple[Joint, ...]:
+        """All joints to its parent."""
+        return () if self.joint is None else (self.joint, *self.stacked)
 
     @property
     def is_swapped(self) -> bool:
@@ -33,8 +40,8 @@ class SpanningTree:
     """A spanning tree of all bodies.
 
     Attributes:
-        nodes: By body; a parent comes before its children.
-        loops: Joints that are not in the tree.
+        nodes: By body, depth first and siblings in stage order, which is MuJoCo's order.
+        loops: Joints that are not in the tree: they close a loop, or are equality constraints of MuJoCo.
     """
 
     nodes: dict[str, TreeNode]
@@ -50,7 +57,9 @@ class _TreeBuilder:
 
     def __init__(self, kinematic: Mapping[str, bool], joints: Iterable[Joint], roots: Iterable[str]):
         self.kinematic = kinematic
-        self.joints = [joint for joint in joints if joint.kind != "free"]
+        joints = [joint for joint in joints if joint.kind != "free"]
+        self.joints = [joint for joint in joints if not joint.constraint]
+        self.constraints = [joint for joint in joints if joint.constraint]
         self.roots = list(roots)
         self.nodes: dict[str, TreeNode] = {}
         self.kept: list[Joint] = []
@@ -69,8 +78,23 @@ class _TreeBuilder:
             group, root = self._attached(waiting) or self._floating(waiting)
             waiting.remove(group)
             self._extend([root])
-        used = {id(node.joint) for node in self.nodes.values()}
-        return SpanningTree(self.nodes, tuple(joint for joint in self.joints if id(joint) not in used))
+        self.nodes = {body: self._stacked(self.nodes[body]) for body in self._depth_first(None)}
+        used = {id(joint) for node in self.nodes.values() for joint in node.joints}
+        loops = (joint for joint in (*self.joints, *self.constraints) if id(joint) not in used)
+        return SpanningTree(self.nodes, tuple(loops))
+
+    def _depth_first(self, parent: str | None) -> list[str]:
+        """Return all bodies below one, siblings in stage order."""
+        children = [body for body in self.kinematic if self.nodes[body].parent == parent]
+        return [body for child in children for body in (child, *self._depth_first(child))]
+
+    def _stacked(self, node: TreeNode) -> TreeNode:
+        """Return a node with all joints that stack on its own, in stage order."""
+        own = node.joint
+        if own is None or not own.is_stackable:
+            return node
+        first, *rest = [joint for joint in self.joints if joint.is_stackable and joint.bodies == own.bodies]
+        return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:
         """Rank a candidate root: has PhysicsArticulationRootAPI itself, is below a prim that has it, neither."""
@@ -144,7 +168,8 @@ def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots:
     one, or one below the marked prim, if there are several); without any, its root is the marked body, or else one that is
     nobody's body 1. Of the joints of a loop, one without drive and limits is left out, the last one in stage order, and a
     prismatic one only if there is no other. Joints that are excluded from articulations are only in the tree where nothing
-    else holds a group.
+    else holds a group. Joints of MuJoCo (MjcJointAPI) and those of an articulation whose joints add mobility stack: several
+    between the same two bodies are the degrees of freedom of one.
 
     Args:
         kinematic: All bodies by path in stage order, and whether each is kinematic.
@@ -152,3 +177,24 @@ def spanning_tree(kinematic: Mapping[str, bool], joints: Iterable[Joint], roots:
         roots: Paths of the prims that are marked as roots of articulations.
     """
     return _TreeBuilder(kinematic, joints, roots).build()
+
+
+def parent_pairs(tree: SpanningTree) -> set[frozenset[str | None]]:
+    """Return the pairs of bodies that MuJoCo's filter of parents and children keeps apart.
+
+    These are all pairs of two groups of welded bodies of which one is the other's parent, unless one is the world's; those
+    whose joint says itself whether they collide are left out.
+    """
+    group: dict[str | None, str | None] = {None: None}
+    parent: dict[str | None, str | None] = {}
+    for body, node in tree.nodes.items():
+        is_welded = node.joint is not None and node.joint.kind == "fixed"
+        group[body] = group[node.parent] if is_welded else body
+        if node.joint is not None and node.joint.is_filtering is None and not is_welded:
+            parent[body] = group[node.parent]
+    return {
+        frozenset((one, two))
+        for one in tree.nodes
+        for two in tree.nodes
+        if one != two and None not in (group[one], group[two]) and parent.get(group[one]) == group[two]
+    }

@@ -33,6 +33,8 @@ GEOM: AttributeTable = {
 }
 JOINT: AttributeTable = {
     "margin": "jnt_margin",
+    "stiffness": "jnt_stiffness",
+    "actuatorgravcomp": "jnt_actgravcomp",
     "solreflimit": "jnt_solref",
     "solimplimit": "jnt_solimp",
     "solreffriction": "dof_solref",
@@ -97,15 +99,18 @@ def non_default(table: AttributeTable, own: Any, usual: Any) -> dict[str, Any]:
     return found
 
 
+def flag_names(key: str) -> dict[str, int]:
+    """Return MJCF's names of the flags of `disable` or `enable`, and their bits."""
+    bits, prefix = FLAGS[key]
+    return {name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)}
+
+
 def non_default_flags(model: mujoco.MjModel) -> dict[str, list[str]]:
     """Return the flags of a model that are set and that USD has no attribute for, by `disable` and `enable`."""
     found = {}
-    for key, (bits, prefix) in FLAGS.items():
-        names = {
-            name.removeprefix(prefix).lower(): int(bit) for name, bit in bits.__members__.items() if name.startswith(prefix)
-        }
+    for key in FLAGS:
         value = int(getattr(model.opt, f"{key}flags"))
-        found[key] = [name for name, bit in names.items() if value & bit and name not in KNOWN_FLAGS]
+        found[key] = [name for name, bit in flag_names(key).items() if value & bit and name not in KNOWN_FLAGS]
     return {key: names for key, names in found.items() if names}
 
 
@@ -117,7 +122,7 @@ def read_custom(stage: Stage, prim: Prim, key: str) -> Any:
 def read_mjcf_attributes(stage: Stage, prim: Prim, attributes: Iterable[str]) -> dict[str, str]:
     """Return a prim's custom attributes as attributes of an MJCF element."""
     found = {attribute: read_custom(stage, prim, attribute) for attribute in attributes}
-    return {attribute: _text(value) for attribute, value in found.items() if value is not None}
+    return {attribute: text_of(value) for attribute, value in found.items() if value is not None}
 
 
 def read_option_flags(stage: Stage, scene: Prim) -> dict[str, str]:
@@ -125,5 +130,10 @@ def read_option_flags(stage: Stage, scene: Prim) -> dict[str, str]:
     return {str(name): key for key in FLAGS for name in read_custom(stage, scene, key) or ()}
 
 
-def _text(value: Any) -> str:
-    return str(value) if isinstance(value, (str, int, float)) else " ".join(repr(float(number)) for number in value)
+def text_of(value: Any) -> str:
+    """Return a value as MJCF writes it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (str, int, float)):
+        return str(value)
+    return " ".join(str(number) if isinstance(number, int) else repr(float(number)) for number in value)

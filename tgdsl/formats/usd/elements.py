@@ -13,15 +13,20 @@ from tgdsl.formats.usd.articulation import TreeNode
 from tgdsl.formats.usd.drives import Drive
 from tgdsl.formats.usd.geoms import Gprim, Site
 from tgdsl.formats.usd.joints import Joint
+from tgdsl.formats.usd.mjc.actuators import Actuator
 from tgdsl.formats.usd.shapes import Shape, quaternion
-from tgdsl.formats.usd.stage import Matrix
+from tgdsl.formats.usd.stage import Matrix, Stage
 
 AXIS_ARM = 0.05
 """Distance between the two connect constraints along the axis of a revolute joint that closes a loop [m]."""
 REST_TOLERANCE = 1e-6
 """Largest authored position without a keyframe [rad or m]: it is rounding of float32."""
 VISIBLE, VISUAL, HIDDEN = "0", "2", "3"
-"""Groups of geoms: colliders that are visible, visuals that do not collide, colliders that are not visible."""
+"""Groups of geoms: colliders that are visible, visuals that do not collide, what is not visible."""
+SAME_GAIN = 1e-5
+"""Relative difference up to which a drive, which is in float32, and an actuator are the same servo."""
+FRICTION = (1.0, 0.005, 0.0001)
+"""MuJoCo's default friction of a geom."""
 
 
 def floats_text(values: Iterable[float]) -> str:
@@ -72,14 +77,26 @@ def add_geom(body: ET.Element, name: str, geom: Gprim, meshes: MeshAssets) -> No
     if geom.is_collider:
         element.set("group", VISIBLE if geom.is_visible else HIDDEN)
         element.attrib |= geom.mjcf_attributes
-        if geom.friction is not None:
-            more = geom.mjcf_attributes.get("friction", "").split()[1:]
-            element.set("friction", " ".join([*floats_text([geom.friction]).split(), *more]))
+        if (friction := _friction(geom)) is not None:
+            element.set("friction", friction)
     else:
-        for attribute, value in {"group": VISUAL, "contype": "0", "conaffinity": "0", "mass": "0"}.items():
-            element.set(attribute, value)
+        element.set("group", geom.mjcf_attributes.get("group", VISUAL if geom.is_visible else HIDDEN))
+        for attribute in ("contype", "conaffinity", "mass"):
+            element.set(attribute, "0")
     if geom.color is not None:
         element.set("rgba", floats_text(geom.color))
+
+
+def _friction(geom: Gprim) -> str | None:
+    """Return the frictions of a geom: sliding as its material says, the others as `tgdsl:friction`, or else its material."""
+    own = [float(value) for value in geom.mjcf_attributes.get("friction", "").split()]
+    sliding, *others = geom.friction
+    if not own and geom.friction == (None, None, None):
+        return None
+    values = [sliding if sliding is not None else (own or FRICTION)[0]]
+    for number, other in enumerate(others, start=1):
+        values.append(own[number] if len(own) > number else FRICTION[number] if other is None else other)
+    return floats_text(values)
 
 
 def add_site(body: ET.Element, name: str, site: Site) -> None:
@@ -88,40 +105,44 @@ def add_site(body: ET.Element, name: str, site: Site) -> None:
 
 
 def add_joint_element(body: ET.Element, node: TreeNode, names: Mapping[str, str], free: str) -> None:
-    """Add a body's joint to its parent: none if it is fixed, a free joint named `free` if it floats."""
-    joint = node.joint
-    if joint is None:
+    """Add a body's joints to its parent: none if it is fixed, a free joint named `free` if it floats."""
+    if node.joint is None:
         ET.SubElement(body, "freejoint", {"name": free} if free else {})
-        return
-    if joint.kind == "fixed":
-        return
-    frame = joint.frames[0 if node.is_swapped else 1]
-    element = ET.SubElement(body, "joint", name=names[joint.path], type=joint.kind, pos=floats_text(frame[:3, 3]))
-    if joint.kind != "ball":
-        # Positions count body 1 against body 0; where body 0 is the child, it turns the other way.
-        element.set("axis", floats_text(frame[:3, :3] @ joint.axis * (-1 if node.is_swapped else 1)))
+    for joint in node.joints:
+        if joint.kind == "fixed":
+            continue
+        frame = joint.frames[0 if node.is_swapped else 1]
+        element = ET.SubElement(body, "joint", name=names[joint.path], type=joint.kind, pos=floats_text(frame[:3, 3]))
+        if joint.kind != "ball":
+            # Positions count body 1 against body 0; where body 0 is the child, it turns the other way.
+            element.set("axis", floats_text(frame[:3, :3] @ joint.axis * (-1 if node.is_swapped else 1)))
         if joint.range is not None:
             element.set("range", floats_text(joint.range))
-    for attribute, value in {"damping": joint.damping, "armature": joint.armature, "frictionloss": joint.friction}.items():
-        if value:
-            element.set(attribute, floats_text([value]))
-    element.attrib |= joint.mjcf_attributes
+        element.attrib |= joint.mjcf_attributes
 
 
 def add_loop_constraint(
-    equality: ET.Element, ends: tuple[ET.Element, ET.Element], joint: Joint, name: str, taken: Iterable[str] = ()
+    equality: ET.Element,
+    ends: tuple[ET.Element, ET.Element],
+    joint: Joint,
+    name: str,
+    attributes: Mapping[str, str],
+    taken: Iterable[str] = (),
 ) -> None:
     """Add the equality constraint of a joint that closes a loop: position zero of the model need not close it.
 
     Args:
         equality: Where constraints go.
         ends: Elements of body 0 and body 1.
-        joint: The joint: ball, fixed or hinge.
+        joint: The joint: ball, fixed or hinge, or one that is MuJoCo's own constraint.
         name: Its name.
+        attributes: More attributes of the constraint.
         taken: Names of the sites that are there.
     """
     taken = set(taken)
-    for end in range(2 if joint.kind == "hinge" else 1):
+    is_hinge = joint.kind == "hinge" and not joint.constraint
+    tag = "weld" if (joint.constraint or joint.kind) in ("MjcEqualityWeldAPI", "fixed") else "connect"
+    for end in range(2 if is_hinge else 1):
         sites = []
         for side in (0, 1):
             site = f"{name}_{end}{side}"
@@ -131,8 +152,39 @@ def add_loop_constraint(
             place[:3, 3] += place[:3, :3] @ joint.axis * AXIS_ARM * end
             with_pose(ET.SubElement(ends[side], "site", name=site, size="0.001", group="4"), place)
             sites.append(site)
-        tag = "weld" if joint.kind == "fixed" else "connect"
-        ET.SubElement(equality, tag, name=f"{name}_{end}" if joint.kind == "hinge" else name, site1=sites[0], site2=sites[1])
+        named = {"name": f"{name}_{end}" if is_hinge else name, "site1": sites[0], "site2": sites[1]}
+        ET.SubElement(equality, tag, {**named, **attributes})
+
+
+def own_drives(stage: Stage, joints: Iterable[Joint], actuators: Iterable[Actuator]) -> list[Joint]:
+    """Return the joints whose drives are actuators: those without a prim that says the same, and more exactly.
+
+    A drive with `tgdsl:order` is an actuator of its own beside them.
+
+    Args:
+        stage: The stage.
+        joints: All joints of the tree.
+        actuators: Those that are prims.
+    """
+    found, driven = [], {actuator.joint: actuator for actuator in actuators if actuator.joint}
+    for joint in joints:
+        if joint.drive is None:
+            continue
+        other = driven.get(joint.path)
+        if other is None or not math.isinf(joint.drive.order):
+            found.append(joint)
+        elif not _is_same_servo(joint.drive, other):
+            stage.drop("drives were dropped, which contradict the actuator prims of their joints", joint.prim)
+    return found
+
+
+def _is_same_servo(drive: Drive, actuator: Actuator) -> bool:
+    """Return whether an actuator pulls as a drive does."""
+    gain, gear = (float(actuator.attributes.get(name, "1").split()[0]) for name in ("gainprm", "gear"))
+    bias = [float(value) for value in actuator.attributes.get("biasprm", "").split()] + [0.0] * 3
+    gains = np.array([gain, -bias[1], -bias[2]]) * gear**2
+    wanted = np.array([drive.stiffness or drive.damping, drive.stiffness, drive.damping])
+    return bool(np.allclose(gains, wanted, rtol=SAME_GAIN))
 
 
 def add_actuators_and_key(
@@ -142,6 +194,8 @@ def add_actuators_and_key(
     frames: Mapping[str, Matrix],
     kinematic: Mapping[str, bool],
     names: Mapping[str, str],
+    driven: Iterable[Joint],
+    others: Iterable[Actuator],
 ) -> None:
     """Add all actuators, and the keyframe `authored` if the authored poses or the drives' targets are not MuJoCo's defaults.
 
@@ -152,12 +206,17 @@ def add_actuators_and_key(
         frames: World poses of all bodies [m].
         kinematic: Whether each body is kinematic.
         names: Names of the joints.
+        driven: Joints whose drives are actuators.
+        others: Actuators that are prims.
     """
-    motions = list(motions)
     qpos, is_needed = _authored_qpos(motions, frames, kinematic)
-    joints = [node.joint for node, _ in motions if node.joint is not None]
-    driven = [(joint.drive, names[joint.path]) for joint in joints if joint.drive is not None]
-    ctrl = [_add_actuator(actuator, drive, name) for drive, name in sorted(driven, key=lambda pair: pair[0].order)]
+    others = list(others)
+    taken = [other.attributes["name"] for other in others]
+    servos = [_servo(joint, names[joint.path], taken) for joint in driven]
+    actuators = sorted((*others, *servos), key=lambda own: own.order)
+    for own in actuators:
+        ET.SubElement(actuator, own.kind, own.attributes)
+    ctrl = [own.control for own in actuators]
     if is_needed or any(ctrl):
         key = ET.SubElement(keyframe, "key", name="authored", qpos=floats_text(qpos))
         if ctrl:
@@ -178,8 +237,11 @@ def _authored_qpos(
             if not kinematic[node.body]:
                 qpos += [*frames[node.body][:3, 3], *quaternion(frames[node.body])]
             continue
-        if joint.kind in ("hinge", "slide"):
-            qpos.append(authored[1])
+        if node.stacked:
+            for own in node.joints:
+                qpos += [1.0, 0.0, 0.0, 0.0] if own.kind == "ball" else [own.reference]
+        elif joint.kind in ("hinge", "slide"):
+            qpos.append(authored[1] + joint.reference)
             is_needed |= abs(authored[1]) > REST_TOLERANCE
         elif joint.kind == "ball":
             turn = quaternion(_child_turn(node, joint, authored[0]))
@@ -196,9 +258,15 @@ def _child_turn(node: TreeNode, joint: Joint, apart: Matrix) -> Matrix:
     return turn
 
 
-def _add_actuator(actuator: ET.Element, drive: Drive, joint: str) -> float:
-    """Add the actuator that is a drive of a joint, and return its control at the drive's target."""
-    attributes, gear = {"name": drive.actuator or joint, "joint": joint}, drive.gear
+def _servo(joint: Joint, name: str, taken: list[str]) -> Actuator:
+    """Return the actuator that is a joint's drive; its control at the keyframe is the drive's target."""
+    drive = joint.drive
+    assert drive is not None
+    own = drive.actuator or name
+    while own in taken:
+        own += "_drive"
+    taken.append(own)
+    attributes, gear = {"name": own, "joint": name}, drive.gear
     if gear != 1.0:
         attributes["gear"] = floats_text([gear])
     if drive.control is not None:
@@ -209,12 +277,10 @@ def _add_actuator(actuator: ET.Element, drive: Drive, joint: str) -> float:
     stiffness, damping = drive.stiffness / gear**2, drive.damping / gear**2
     kp, kv = floats_text([stiffness]), floats_text([damping])
     if not stiffness:
-        ET.SubElement(actuator, "velocity", attributes, kv=kv)
-        return drive.target_velocity * gear
+        return Actuator(attributes | {"kv": kv}, joint.path, drive.order, drive.target_velocity * gear, "velocity")
     if not drive.target_velocity:
-        ET.SubElement(actuator, "position", attributes, kp=kp, kv=kv)
-        return drive.target * gear
+        return Actuator(attributes | {"kp": kp, "kv": kv}, joint.path, drive.order, drive.target * gear, "position")
     # A spring whose damper pulls towards a speed: a position actuator with a constant force.
     bias = floats_text([damping * drive.target_velocity * gear, -stiffness, -damping])
-    ET.SubElement(actuator, "general", attributes, gainprm=kp, biastype="affine", biasprm=bias)
-    return drive.target * gear
+    attributes |= {"gainprm": kp, "biastype": "affine", "biasprm": bias}
+    return Actuator(attributes, joint.path, drive.order, drive.target * gear)

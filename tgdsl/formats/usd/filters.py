@@ -1,4 +1,14 @@
-"""Collision filtering of a USD stage (joints, FilteredPairsAPI, CollisionGroup) as pairs of bodies that must not collide."""
+"""Collision filters of a USD stage as pairs of bodies that must not collide: joints, FilteredPairsAPI, CollisionGroup.
+
+Whom a PhysicsFilteredPairsAPI filters is what its schema names, "a body or collision or even articulation" (UsdPhysics'
+schema.usda): a collider is that collider; a body is the colliders that it owns, not those of bodies nested below it; the root
+of an articulation (PhysicsArticulationRootAPI, "marks the subtree rooted here") is all bodies of the articulation, unless it
+is a body itself. The schema says nothing of other prims, so that a filter on or of one is dropped with a warning. Only the
+collection of a PhysicsCollisionGroup takes in what is below its members (Usd.CollectionAPI's `expandPrims`).
+
+`newton:selfCollisionEnabled` or `physxArticulation:enabledSelfCollisions` false on an articulation's root keeps all of its
+bodies from each other.
+"""
 
 from __future__ import annotations
 
@@ -7,79 +17,147 @@ from itertools import combinations
 
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import Joint
+from tgdsl.formats.usd.mjc.attributes import Source, read_attributes
 from tgdsl.formats.usd.stage import Prim, Stage
 
 Pair = frozenset[str | None]
 """Paths of two bodies; None is the world."""
+SELF_COLLISION = {"self": (Source("newton:selfCollisionEnabled"), Source("physxArticulation:enabledSelfCollisions"))}
 
 
-def exclusions(stage: Stage, joints: Iterable[Joint], geoms: Iterable[Gprim]) -> list[Pair]:
+def exclusions(
+    stage: Stage, bodies: Iterable[str], joints: Iterable[Joint], geoms: Iterable[Gprim], welded: Iterable[Pair] = ()
+) -> list[Pair]:
     """Return the pairs of bodies that must not collide, sorted.
 
     MuJoCo tells bodies apart, not their colliders: what only holds for some colliders of a body is dropped, with a warning.
 
     Args:
         stage: The stage.
+        bodies: Paths of all bodies.
         joints: All joints.
         geoms: All geoms.
+        welded: Pairs that MuJoCo's own filter would keep apart, where it is off only because some joints' bodies collide.
     """
-    colliders: dict[str | None, list[str]] = {}
+    bodies, joints = list(bodies), list(joints)
+    colliders: dict[str | None, list[str]] = {body: [] for body in bodies}
     prims: dict[str, Prim] = {}
     for geom in geoms:
         if geom.is_collider:
             colliders.setdefault(geom.body, []).append(geom.path)
             prims[geom.path] = geom.prim
-    found: set[Pair] = set()
-    for joint in joints:
-        if joint.is_filtering and None not in joint.bodies:
-            found.add(frozenset(joint.bodies))
-        elif joint.is_filtering and any(target and _below(colliders.get(None, ()), target) for target in joint.targets):
-            stage.drop(
-                "joints do not keep their bodies from colliding with the static prims that they are attached to", joint.prim
-            )
-    filtered, sources = _filtered_colliders(stage, prims)
-    for first, second in combinations(colliders, 2) if filtered else ():
+    filters = _Filters(stage, colliders, prims, joints)
+    found: set[Pair] = {*welded, *filters.of_joints(), *filters.of_articulations()}
+    filtered = filters.of_colliders()
+    owners = [owner for owner, own in colliders.items() if own]
+    for first, second in combinations(owners, 2) if filtered else ():
         pairs = [frozenset((a, b)) for a in colliders[first] for b in colliders[second]]
         hits = [pair for pair in pairs if pair in filtered]
         if len(hits) == len(pairs):
             found.add(frozenset((first, second)))
         elif hits and frozenset((first, second)) not in found:
             for pair in hits:
-                stage.drop("collision filters were dropped that hold for some colliders of a body only", sources[pair])
+                stage.drop("collision filters were dropped that hold for some colliders of a body only", filtered[pair])
     return sorted(found, key=lambda pair: sorted(path or "" for path in pair))
 
 
-def _filtered_colliders(stage: Stage, prims: Mapping[str, Prim]) -> tuple[set[frozenset[str]], dict[frozenset[str], Prim]]:
-    """Return pairs of colliders that must not collide, and the prim that says so."""
-    physics = stage.pxr.UsdPhysics
-    sources: dict[frozenset[str], Prim] = {}
-    for prim in stage.prims:
-        if not prim.HasAPI(physics.FilteredPairsAPI):
-            continue
-        here = _below(prims, str(prim.GetPath()))
-        for target in physics.FilteredPairsAPI(prim).GetFilteredPairsRel().GetForwardedTargets():
-            if not stage.usd.GetPrimAtPath(target):
-                raise stage.error(prim, f"physics:filteredPairs names {target}, which does not exist")
-            there = _below(prims, str(target))
-            sources |= {frozenset((a, b)): prim for a in here for b in there if a != b}
-    groups = [prim for prim in stage.prims if prim.IsA(physics.CollisionGroup)]
-    if groups:
-        table = physics.CollisionGroup.ComputeCollisionGroupTable(stage.usd)
-        members = {str(group.GetPath()): _members(stage, group, prims) for group in groups}
+class _Filters:
+    """Filters of a stage, by who says so."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        colliders: Mapping[str | None, list[str]],
+        prims: Mapping[str, Prim],
+        joints: Iterable[Joint],
+    ):
+        self.stage = stage
+        self.colliders = colliders
+        self.prims = prims
+        self.joints = [joint for joint in joints if joint.kind != "free"]
+
+    def of_joints(self) -> set[Pair]:
+        """Return pairs of bodies that a joint keeps apart."""
+        found = set()
+        for joint in self.joints:
+            if joint.is_filtering and None not in joint.bodies:
+                found.add(frozenset(joint.bodies))
+            elif joint.is_filtering and any(target and self._static(target) for target in joint.targets):
+                self.stage.drop(
+                    "joints do not keep their bodies from colliding with the static prims that they hang on", joint.prim
+                )
+        return found
+
+    def of_articulations(self) -> set[Pair]:
+        """Return pairs of bodies of articulations without self-collision."""
+        found = set()
+        for prim in self.stage.prims:
+            is_root = self.stage.has(prim, "PhysicsArticulationRootAPI")
+            if is_root and read_attributes(self.stage, prim, SELF_COLLISION).get("self") == "false":
+                found |= {frozenset(pair) for pair in combinations(self._articulation(str(prim.GetPath())), 2)}
+        return found
+
+    def of_colliders(self) -> dict[frozenset[str], Prim]:
+        """Return pairs of colliders that must not collide, and the prim that says so."""
+        sources = self._listed_pairs()
+        for pair, group in self._groups().items():
+            sources.setdefault(pair, group)
+        return sources
+
+    def _listed_pairs(self) -> dict[frozenset[str], Prim]:
+        stage, sources = self.stage, {}
+        for prim in stage.prims:
+            if not stage.has(prim, "PhysicsFilteredPairsAPI"):
+                continue
+            here = self._named(prim, prim)
+            for target in stage.targets(prim, "physics:filteredPairs"):
+                if not stage.usd.GetPrimAtPath(target):
+                    raise stage.error(prim, f"physics:filteredPairs names {target}, which does not exist")
+                there = self._named(stage.usd.GetPrimAtPath(target), prim)
+                sources |= {frozenset((a, b)): prim for a in here for b in there if a != b}
+        return sources
+
+    def _named(self, prim: Prim, source: Prim) -> list[str]:
+        """Return the colliders that a prim stands for in a filter that a source has."""
+        path = str(prim.GetPath())
+        if path in self.colliders:
+            return self.colliders[path]
+        if path in self.prims:
+            return [path]
+        if self.stage.has(prim, "PhysicsArticulationRootAPI"):
+            return [own for body in self._articulation(path) for own in self.colliders[body]]
+        if not self.stage.has(prim, "PhysicsCollisionAPI"):  # a collider that is disabled collides with nothing anyway
+            self.stage.drop(f"collision filters were dropped of no body, collider or articulation, but {path}", source)
+        return []
+
+    def _articulation(self, root: str) -> list[str]:
+        """Return the bodies of an articulation: those at and below its root, and all that joints connect with them."""
+        found = {body for body in self.colliders if body is not None and (body == root or body.startswith(f"{root}/"))}
+        links = [joint.bodies for joint in self.joints if not joint.is_excluded and None not in joint.bodies]
+        found |= {body for joint in self.joints if joint.path == root for body in joint.bodies if body is not None}
+        while new := {body for pair in links if found & set(pair) for body in pair if body is not None} - found:
+            found |= new
+        return [body for body in self.colliders if body in found and body is not None]
+
+    def _static(self, path: str) -> bool:
+        return any(own == path or own.startswith(f"{path}/") for own in self.colliders.get(None, ()))
+
+    def _groups(self) -> dict[frozenset[str], Prim]:
+        physics, sources = self.stage.pxr.UsdPhysics, {}
+        groups = [prim for prim in self.stage.prims if prim.IsA(physics.CollisionGroup)]
+        table = physics.CollisionGroup.ComputeCollisionGroupTable(self.stage.usd) if groups else None
+        members = {str(group.GetPath()): self._members(group) for group in groups}
         for group in groups:
             for other in groups:
-                if not table.IsCollisionEnabled(group, other):
+                if table is not None and not table.IsCollisionEnabled(group, other):
                     pairs = ((a, b) for a in members[str(group.GetPath())] for b in members[str(other.GetPath())] if a != b)
                     for pair in pairs:
                         sources.setdefault(frozenset(pair), group)
-    return set(sources), sources
+        return sources
 
-
-def _below(prims: Iterable[str], path: str) -> list[str]:
-    return [own for own in prims if own == path or own.startswith(f"{path}/")]
-
-
-def _members(stage: Stage, group: Prim, prims: Mapping[str, Prim]) -> list[str]:
-    collection = stage.pxr.Usd.CollectionAPI(group, "colliders")
-    query = collection.ComputeMembershipQuery()
-    return [path for path, prim in prims.items() if query.IsPathIncluded(prim.GetPath())]
+    def _members(self, group: Prim) -> list[str]:
+        names = [name for name in group.GetPropertyNames() if name.startswith("collection:colliders")]
+        groups = (f"physics:{name}" for name in ("filteredGroups", "invertFilteredGroups", "mergeGroup"))
+        self.stage.note(group, *names, *groups)
+        query = self.stage.pxr.Usd.CollectionAPI(group, "colliders").ComputeMembershipQuery()
+        return [path for path, prim in self.prims.items() if query.IsPathIncluded(prim.GetPath())]

@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.formats.usd.custom_attributes import GEOM, MESH, SITE, read_custom, read_mjcf_attributes
+from tgdsl.formats.usd.custom_attributes import SITE, read_custom, read_mjcf_attributes, text_of
+from tgdsl.formats.usd.mjc.attributes import ASSET, COLLIDER, FRICTION, GROUP, read_attributes
+from tgdsl.formats.usd.mjc.solids import MASS_MODELS
 from tgdsl.formats.usd.shapes import SCHEMAS, Shape, collision_shape, shape_of
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
+MASKS = ("tgdsl:contype", "tgdsl:conaffinity")
 FRICTIONS = ("dynamicFriction", "staticFriction")
 """Coefficients of a physics material, the one that MuJoCo gets first."""
 
@@ -28,9 +31,10 @@ class Gprim:
         is_collider: Whether it collides.
         is_visible: Whether it is drawn by default.
         is_hull: Whether a mesh was meant to be its convex hull.
-        friction: Coefficient of sliding friction, or None if its material has none.
+        friction: Coefficients of sliding, torsional [m] and rolling [m] friction, each None if its material does not say.
         density: Density of its material [kg/m³], or 0.
         color: Red, green, blue, alpha, or None.
+        mass_model: How MuJoCo takes its mass and inertia, or empty: as UsdPhysics does.
         mjcf_attributes: More attributes of the MJCF geom, if it collides.
         mesh: Attributes of its MJCF mesh, its name among them.
     """
@@ -42,9 +46,10 @@ class Gprim:
     is_collider: bool
     is_visible: bool
     is_hull: bool
-    friction: float | None
+    friction: tuple[float | None, float | None, float | None]
     density: float
     color: Float[np.ndarray, 4] | None
+    mass_model: str = ""
     mjcf_attributes: dict[str, str] = field(default_factory=dict)
     mesh: dict[str, str] = field(default_factory=dict)
 
@@ -67,7 +72,7 @@ class Site:
 
 
 def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Site]:
-    """Read all prims with the custom attribute `site`.
+    """Read all sites: prims with the custom attribute `site`, and gprims with MjcSiteAPI or NewtonSiteAPI.
 
     Args:
         stage: The stage.
@@ -76,12 +81,29 @@ def read_sites(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[s
     """
     sites = []
     for prim in stage.prims:
-        if read_custom(stage, prim, "site"):
-            body = owners[str(prim.GetPath())]
-            pose = stage.frame(prim)[0]
-            place = pose if body is None else np.linalg.inv(frames[body]) @ pose
-            sites.append(Site(prim, body, place, read_mjcf_attributes(stage, prim, SITE)))
+        if not _is_site(stage, prim):
+            continue
+        body, pose, attributes = owners[str(prim.GetPath())], stage.frame(prim)[0], read_mjcf_attributes(stage, prim, SITE)
+        attributes |= read_attributes(stage, prim, GROUP)
+        if prim.GetTypeName() in SCHEMAS:
+            pose, drawn = _drawn_site(stage, prim, pose)
+            attributes = drawn | attributes
+        place = pose if body is None else np.linalg.inv(frames[body]) @ pose
+        sites.append(Site(prim, body, place, attributes))
     return sites
+
+
+def _is_site(stage: Stage, prim: Prim) -> bool:
+    return bool(read_custom(stage, prim, "site")) or stage.has(prim, "NewtonSiteAPI")
+
+
+def _drawn_site(stage: Stage, prim: Prim, pose: Matrix) -> tuple[Matrix, dict[str, str]]:
+    """Return the frame [m] of a site that is a gprim, and how it is drawn."""
+    shape, color = shape_of(stage, prim, stage.pose(prim)), _color(stage, prim)
+    found = {} if color is None else {"rgba": text_of(color.tolist())}
+    if shape.kind in ("sphere", "capsule", "ellipsoid", "cylinder", "box"):
+        return shape.pose, found | {"type": shape.kind, "size": text_of(shape.size)}
+    return pose, found
 
 
 def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]) -> list[Gprim]:
@@ -102,7 +124,9 @@ def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
     for prim in stage.prims:
         if str(prim.GetPath()).startswith(instancer):
             continue
-        is_collider = prim.HasAPI(stage.pxr.UsdPhysics.CollisionAPI) and bool(stage.value(prim, "physics:collisionEnabled"))
+        if _is_site(stage, prim):
+            continue
+        is_collider = stage.has(prim, "PhysicsCollisionAPI") and bool(stage.value(prim, "physics:collisionEnabled"))
         is_shape = prim.GetTypeName() in SCHEMAS
         is_visible = _is_visible(stage, prim)
         if not is_shape:
@@ -112,7 +136,7 @@ def read_gprims(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
                 stage.drop("visuals were dropped that are no geometry that MuJoCo has", prim)
             if prim.IsA(stage.pxr.UsdGeom.PointInstancer):
                 instancer = f"{prim.GetPath()}/"
-        elif is_collider or is_visible:
+        elif is_collider or is_visible or stage.has(prim, "MjcImageableAPI"):
             geoms += _geoms(stage, prim, owners[str(prim.GetPath())], frames, is_collider, is_visible)
     return geoms
 
@@ -125,26 +149,42 @@ def _geoms(
         raise stage.error(prim, "its transform is flat: a scale is zero")
     place = pose if body is None else np.linalg.inv(frames[body]) @ pose
     shape = shape_of(stage, prim, place)
-    friction, density = _material(stage, prim) if is_collider else (None, 0.0)
     color = _color(stage, prim)
-    attributes, mesh = read_mjcf_attributes(stage, prim, GEOM) if is_collider else {}, read_mjcf_attributes(stage, prim, MESH)
+    mesh = read_attributes(stage, prim, ASSET) if shape.kind == "mesh" else {}
+    model = _mass_model(stage, prim, mesh)
     mesh |= {"name": name} if (name := read_custom(stage, prim, "mesh")) else {}
-    path = str(prim.GetPath())
+    path, nothing = str(prim.GetPath()), (None, None, None)
     if not is_collider:
         if shape.vertices is not None and len(shape.vertices) < 4:
             stage.drop("visual meshes with less than four points were dropped", prim)
             return []
-        return [Gprim(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh)]
+        attributes = read_attributes(stage, prim, GROUP)
+        stage.note(prim, *MASKS)  # of a visual, zero
+        return [Gprim(path, prim, body, shape, False, is_visible, False, nothing, 0.0, color, "", attributes, mesh)]
+    attributes = read_attributes(stage, prim, COLLIDER)
+    friction, density = _material(stage, prim, "solref" in attributes)
     collided, is_hull = (
         collision_shape(stage, prim, shape, place) if shape.kind == "mesh" and prim.GetTypeName() == "Mesh" else (shape, True)
     )
     is_same = collided is shape
     found = [
-        Gprim(path, prim, body, collided, True, is_visible and is_same, is_hull, friction, density, color, attributes, mesh)
+        Gprim(
+            *(path, prim, body, collided, True, is_visible and is_same, is_hull),
+            *(friction, density, color, model if is_same else "", attributes, mesh),
+        )
     ]
     if is_visible and not is_same:
-        found.append(Gprim(path, prim, body, shape, False, True, False, None, 0.0, color, {}, mesh))
+        found.append(Gprim(path, prim, body, shape, False, True, False, nothing, 0.0, color, "", {}, mesh))
     return found
+
+
+def _mass_model(stage: Stage, prim: Prim, mesh: Mapping[str, str]) -> str:
+    """Return how MuJoCo takes a geom's mass and inertia, or nothing if only UsdPhysics says so."""
+    is_shell = stage.authored(prim, "newton:massModel") == "shell" or stage.authored(prim, "mjc:shellinertia")
+    own = "shell" if is_shell else str(stage.authored(prim, "mjc:inertia") or "")
+    if own and own not in MASS_MODELS:
+        raise stage.error(prim, f"mjc:inertia is {own!r}; expected one of {', '.join(MASS_MODELS)}")
+    return own
 
 
 def _is_visible(stage: Stage, prim: Prim) -> bool:
@@ -156,16 +196,28 @@ def _is_visible(stage: Stage, prim: Prim) -> bool:
     return is_drawn and imageable.ComputeVisibility() != geometry.Tokens.invisible
 
 
-def _material(stage: Stage, prim: Prim) -> tuple[float | None, float]:
-    """Return friction and density [kg/m³] of the material that is bound for physics, or else for all purposes."""
+def _material(stage: Stage, prim: Prim, is_solref: bool) -> tuple[tuple[float | None, float | None, float | None], float]:
+    """Return frictions and density [kg/m³] of the material that is bound for physics, or else for all purposes.
+
+    Args:
+        stage: The stage.
+        prim: The collider.
+        is_solref: Whether the collider says how stiff its contacts are as MuJoCo does, of which the material's is a copy.
+    """
+    stage.note(prim, "material:binding", "material:binding:physics")
     material = stage.pxr.UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
-    if not material or not material.HasAPI(stage.pxr.UsdPhysics.MaterialAPI):
-        return None, 0.0
+    if not material or not stage.has(material, "PhysicsMaterialAPI"):
+        return (None, None, None), 0.0
     if stage.number(material, "physics:restitution") > 0:
         stage.drop("restitution of materials was dropped: MuJoCo has none", material)
     authored = [stage.authored(material, f"physics:{name}") for name in FRICTIONS]
-    friction = next((float(value) for value in authored if value is not None), None)
-    return friction, stage.number(material, "physics:density") * stage.kilograms_per_unit / stage.metres_per_unit**3
+    sliding = next((float(value) for value in authored if value is not None), None)
+    if is_solref:
+        stage.note(material, "newton:contactStiffness", "newton:contactDamping")
+    more = read_attributes(stage, material, FRICTION)
+    torsional, rolling = (float(more[name]) if name in more else None for name in FRICTION)
+    density = stage.number(material, "physics:density") * stage.kilograms_per_unit / stage.metres_per_unit**3
+    return (sliding, torsional, rolling), density
 
 
 def _color(stage: Stage, prim: Prim) -> Float[np.ndarray, 4] | None:

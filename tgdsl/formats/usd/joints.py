@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.usd.custom_attributes import JOINT, read_custom, read_mjcf_attributes
+from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.drives import INFINITE, Drive, Range, read_drive
+from tgdsl.formats.usd.mjc.attributes import JOINTS, read_attributes, with_limits
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 FAR_LIMIT = 1e10
@@ -21,6 +22,10 @@ FRAME_TOLERANCE = 1e-4
 DOFS = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
 """Degrees of freedom of a generic joint, as its limits and drives are called."""
 AXES = {"X": np.array([1.0, 0.0, 0.0]), "Y": np.array([0.0, 1.0, 0.0]), "Z": np.array([0.0, 0.0, 1.0])}
+CONSTRAINTS = ("MjcEqualityConnectAPI", "MjcEqualityWeldAPI")
+"""Schemas of joints that are equality constraints of MuJoCo, in the tree or not."""
+FORCES = ("damping", "armature", "frictionloss", "stiffness", "springdamper")
+"""Attributes of an MJCF joint that an equality constraint does not have."""
 KINDS = {"PhysicsRevoluteJoint": "hinge", "PhysicsPrismaticJoint": "slide", "PhysicsSphericalJoint": "ball"}
 """MuJoCo's joints by the schemas of UsdPhysics; fixed, generic and distance joints are seen to one by one."""
 
@@ -39,12 +44,12 @@ class Joint:
         frames: The joint frame in the frames of body 0 and of body 1 [m]; they coincide at position zero.
         range: Least and greatest position [rad or m], or None if it has no limits.
         drive: What drives it.
-        damping: Its own [N·m·s/rad or N·s/m], beside the drive's.
-        armature: [kg·m² or kg].
-        friction: Friction torque or force [N·m or N].
         is_excluded: Whether it is kept out of the articulation.
-        is_filtering: Whether the bodies must not collide.
-        mjcf_attributes: More attributes of the MJCF joint.
+        is_filtering: Whether the bodies must not collide; None leaves it to MuJoCo's own filter of parents and children.
+        is_stackable: Whether it adds its motion to that of other joints between the same two bodies.
+        constraint: If it is an equality constraint of MuJoCo, its schema; or empty.
+        is_active: Whether that constraint is active.
+        mjcf_attributes: More attributes of the MJCF joint, its own damping, armature and dry friction among them.
     """
 
     path: str
@@ -56,12 +61,23 @@ class Joint:
     frames: tuple[Matrix, Matrix]
     range: Range | None
     drive: Drive | None
-    damping: float
-    armature: float
-    friction: float
     is_excluded: bool
-    is_filtering: bool
+    is_filtering: bool | None
+    is_stackable: bool
+    constraint: str
+    is_active: bool
     mjcf_attributes: dict[str, str]
+
+    @property
+    def reference(self) -> float:
+        """MuJoCo's position where the joint frames meet [rad or m]."""
+        return float(self.mjcf_attributes.get("ref", 0.0))
+
+    @property
+    def is_passive(self) -> bool:
+        """Whether it has neither limits nor a drive, and nothing holds, damps or rubs it."""
+        forces = (self.mjcf_attributes.get(name, "0").split() for name in FORCES)
+        return not (self.range or self.drive or any(float(value) for values in forces for value in values))
 
     def pose(self, is_swapped: bool) -> Matrix:
         """Return the pose of the child in its parent at position zero; body 0 is the child if swapped."""
@@ -82,7 +98,7 @@ class Joint:
             x, y, z, w = turn.as_quat(canonical=True)
             position = 2 * math.atan2(float(self.axis @ [x, y, z]), float(w))
             tilt = (Rotation.from_rotvec(-position * self.axis) * turn).magnitude()
-            position = _wrapped(position, self.range)
+            position = _wrapped(position + self.reference, self.range) - self.reference
         elif self.kind == "slide":
             position = float(self.axis @ off)
             off = off - position * self.axis
@@ -118,7 +134,7 @@ def read_joints(stage: Stage, owners: Mapping[str, str | None], frames: Mapping[
                     prim, f"{kind} is not supported; known joints: revolute, prismatic, spherical, fixed, generic"
                 )
             continue
-        if stage.value(prim, "physics:jointEnabled"):
+        if stage.value(prim, "physics:jointEnabled") or _constraint(stage, prim):
             joint = _joint(stage, prim, owners, frames)
             if joint.bodies[0] == joint.bodies[1]:
                 stage.drop("joints were dropped that join a body to itself, or the world to the world", prim)
@@ -132,13 +148,22 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
     if limits and limits[0] > limits[1]:
         raise stage.error(prim, f"its lower limit {limits[0]!r} is above its upper limit {limits[1]!r}")
     (first, frame0, target0), (second, frame1, target1) = (_side(stage, prim, side, owners, frames) for side in (0, 1))
+    attributes = with_limits(stage, read_attributes(stage, prim, JOINTS, kind != "slide"), ("actuatorfrc",))
+    if kind not in ("hinge", "slide"):
+        attributes.pop("ref", None)
     if limits and limits[0] == limits[1]:  # a range without width is a weld at that position
-        kind, frame0, limits = "fixed", frame0 @ _moved(kind, axis, limits[0]), None
+        is_shifted = read_custom(stage, prim, "ref") is None
+        place = _moved(kind, axis, limits[0] - (float(attributes.get("ref", 0.0)) if is_shifted else 0.0))
+        kind, frame0, limits, attributes = "fixed", frame0 @ place, None, {}
+    if read_custom(stage, prim, "ref") and "ref" in attributes:
+        # MuJoCo's position is USD's, and starts elsewhere; with `mjc:ref` it starts where the frames meet.
+        frame0 = frame0 @ _moved(kind, axis, float(attributes["ref"]))
     _drop_the_rest(stage, prim, instance if kind in ("hinge", "slide") else "")
-    drive, damping = None, float(read_custom(stage, prim, "damping") or 0.0)
+    drive = None
     if kind in ("hinge", "slide"):
-        drive, damping = read_drive(stage, prim, instance, kind, damping)
-    mass = stage.kilograms_per_unit * (1.0 if kind == "slide" else stage.metres_per_unit**2)
+        shared = float(read_custom(stage, prim, "damping") or 0.0)  # only `tgdsl:damping` is part of the drive's
+        drive, own = read_drive(stage, prim, instance, kind, shared)
+        attributes |= {"damping": repr(own)} if shared else {}
     return Joint(
         path=str(prim.GetPath()),
         prim=prim,
@@ -149,13 +174,30 @@ def _joint(stage: Stage, prim: Prim, owners: Mapping[str, str | None], frames: M
         frames=(frame0, frame1),
         range=limits,
         drive=drive,
-        damping=damping,
-        armature=stage.number(prim, "physxJoint:armature") * mass,
-        friction=stage.number(prim, "physxJoint:jointFriction") * mass * (stage.metres_per_unit if kind == "slide" else 1.0),
         is_excluded=bool(stage.value(prim, "physics:excludeFromArticulation")),
-        is_filtering=not stage.value(prim, "physics:collisionEnabled"),
-        mjcf_attributes=read_mjcf_attributes(stage, prim, JOINT),
+        is_filtering=_is_filtering(stage, prim),
+        is_stackable=kind in ("hinge", "slide", "ball") and _is_stackable(stage, prim, (target0, target1)),
+        constraint=_constraint(stage, prim),
+        is_active=bool(stage.value(prim, "physics:jointEnabled")),
+        mjcf_attributes=attributes,
     )
+
+
+def _is_filtering(stage: Stage, prim: Prim) -> bool | None:
+    """Return whether a joint keeps its bodies from colliding, or None if MuJoCo's scene decides and the joint says nothing."""
+    if stage.scenes and stage.has(stage.scenes[0], "MjcSceneAPI") and stage.authored(prim, "physics:collisionEnabled") is None:
+        return None
+    return not stage.value(prim, "physics:collisionEnabled")
+
+
+def _is_stackable(stage: Stage, prim: Prim, targets: tuple[str, str]) -> bool:
+    paths = (str(prim.GetPath()), *targets)
+    is_adding = any(path == root or path.startswith(f"{root}/") for root in stage.mobility_roots for path in paths)
+    return is_adding or stage.has(prim, "MjcJointAPI")  # every joint of MuJoCo adds a motion
+
+
+def _constraint(stage: Stage, prim: Prim) -> str:
+    return next((schema for schema in CONSTRAINTS if stage.has(prim, schema)), "")
 
 
 def _moved(kind: str, axis: Float[np.ndarray, 3], position: float) -> Matrix:
@@ -180,7 +222,10 @@ def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | 
         raise stage.error(prim, f"{schema} is not supported: MuJoCo has no such joint")
     kind = KINDS[schema]
     if kind == "ball":
-        if any(stage.number(prim, f"physics:coneAngle{i}Limit", -1.0) >= 0 for i in (0, 1)):
+        cone = [stage.number(prim, f"physics:coneAngle{i}Limit", -1.0) for i in (0, 1)]
+        if stage.has(prim, "MjcJointAPI") and cone[0] == cone[1] > 0:  # so the schema's own writer puts a ball joint's range
+            return kind, axis, (0.0, math.radians(cone[0])), ""
+        if max(cone) >= 0:
             stage.drop("cone limits of spherical joints were dropped: MuJoCo limits a ball joint's whole angle", prim)
         return kind, axis, None, ""
     low, high = (stage.number(prim, f"physics:{end}Limit") for end in ("lower", "upper"))
@@ -223,7 +268,7 @@ def _side(
     stage: Stage, prim: Prim, side: int, owners: Mapping[str, str | None], frames: Mapping[str, Matrix]
 ) -> tuple[str | None, Matrix, str]:
     """Return the body on one side of a joint, the joint frame in it, and the path of the prim that is named, or nothing."""
-    targets = prim.GetRelationship(f"physics:body{side}").GetForwardedTargets()
+    targets = stage.targets(prim, f"physics:body{side}")
     if len(targets) > 1:
         raise stage.error(prim, f"physics:body{side} has {len(targets)} targets; expected one at most")
     target = stage.usd.GetPrimAtPath(targets[0]) if targets else stage.usd.GetPseudoRoot()
@@ -265,6 +310,3 @@ def _drop_the_rest(stage: Stage, prim: Prim, instance: str) -> None:
     for name in ("physics:breakForce", "physics:breakTorque"):
         if stage.number(prim, name, math.inf) < INFINITE:
             stage.drop("joints do not break: their breakForce and breakTorque were dropped", prim)
-    # Schemas that usd-core does not know are not among `GetAppliedSchemas`.
-    if any("Mimic" in name for name in prim.GetPrimTypeInfo().GetAppliedAPISchemas()):
-        stage.drop("couplings between joints (mimic) were dropped", prim)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.formats.model import LEAST_INERTIA
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
+from tgdsl.formats.usd.mjc.solids import mujoco_mass_properties
 from tgdsl.formats.usd.stage import Matrix, Prim, Stage
 
 DENSITY = 1000.0
@@ -74,7 +76,10 @@ def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix)
         RobotError: If what is authored is no mass, or no inertia.
     """
     own, geoms = _authored(stage, body), list(geoms)
-    parts = [_collider(stage, geom, own.density, frame) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    colliders = [(geom, _own_mass(stage, geom)) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
+    if own.mass and own.centre is not None and own.tensor is not None:
+        return _repaired(stage, body, Inertial(own.mass, own.centre, own.tensor))
+    parts = [_collider(stage, geom, found, own.density, frame) for geom, found in colliders]
     whole = _sum([part for part in parts if part.mass > 0])
     if own.mass and whole is not None:
         whole = Inertial(own.mass, whole.centre, whole.tensor * (own.mass / whole.mass))
@@ -86,7 +91,7 @@ def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix)
 
 
 def _authored(stage: Stage, prim: Prim) -> _Authored:
-    if not prim.HasAPI(stage.pxr.UsdPhysics.MassAPI):
+    if not stage.has(prim, "PhysicsMassAPI"):
         return _Authored()
     mass, density = stage.number(prim, "physics:mass"), stage.number(prim, "physics:density")
     moments = np.array(stage.value(prim, "physics:diagonalInertia"), dtype=np.float64)
@@ -94,8 +99,8 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
         if not np.isfinite(value).all() or np.min(value) < 0:
             raise stage.error(prim, f"physics:{name} is {np.asarray(value).tolist()}; expected 0 or more")
     centre = np.array(stage.value(prim, "physics:centerOfMass"), dtype=np.float64)
-    tensor = None
-    if moments.any():
+    tensor = _full_tensor(stage, prim)
+    if tensor is None and moments.any():
         quat = stage.value(prim, "physics:principalAxes")
         is_turned = quat.GetReal() or any(quat.GetImaginary())
         axes = rotation_of(stage, prim, "physics:principalAxes").as_matrix() if is_turned else np.eye(3)
@@ -108,17 +113,33 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
     )
 
 
+def _full_tensor(stage: Stage, prim: Prim) -> Tensor | None:
+    """Return `newton:inertia` (xx, yy, zz, xy, xz, yz) [kg·m²], which overrules the principal moments and axes."""
+    values = np.array(stage.authored(prim, "newton:inertia") or (), dtype=np.float64)
+    if not values.size:
+        return None
+    if values.size != 6 or not np.isfinite(values).all() or values[:3].min() < 0:
+        raise stage.error(prim, f"newton:inertia is {values.tolist()}; expected six numbers, the first three 0 or more")
+    xx, yy, zz, xy, xz, yz = values * stage.kilograms_per_unit * stage.metres_per_unit**2
+    stage.note(prim, "physics:diagonalInertia", "physics:principalAxes")
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
 def _overruled(computed: Inertial, own: _Authored) -> Inertial:
     """Put an authored centre of mass and inertia in place of the computed ones."""
     centre = computed.centre if own.centre is None else own.centre
     return Inertial(computed.mass, centre, computed.about(centre) if own.tensor is None else own.tensor)
 
 
-def _collider(stage: Stage, geom: Gprim, body_density: float, frame: Matrix) -> Inertial:
+def _own_mass(stage: Stage, geom: Gprim) -> _Authored:
+    return _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
+
+
+def _collider(stage: Stage, geom: Gprim, own: _Authored, body_density: float, frame: Matrix) -> Inertial:
     """Return what a collider contributes, in the body's frame."""
-    own = _authored(stage, geom.prim) if str(geom.prim.GetPath()) != geom.body else _Authored()
-    volume, centre, tensor = geom.shape.mass_properties(geom.is_hull)
-    mass = own.mass or volume * (own.density or body_density or geom.density or DENSITY)
+    density = own.density or body_density or geom.density or DENSITY
+    volume, centre, tensor = _properties(stage, geom)
+    mass = own.mass or volume * density
     computed = Inertial(mass, centre, tensor * (mass / volume if volume else 0.0))
     if own.centre is None and own.tensor is None:
         return computed
@@ -131,6 +152,23 @@ def _collider(stage: Stage, geom: Gprim, body_density: float, frame: Matrix) -> 
             tensor=None if own.tensor is None else turn @ own.tensor @ turn.T,
         ),
     )
+
+
+def _properties(stage: Stage, geom: Gprim) -> tuple[float, Vector, Tensor]:
+    """Return volume [m³], centre of mass [m] and inertia about it at density one, in the body's frame.
+
+    A shell is as thick as `newton:shellThickness` says; without that, its density is in kg/m², as in MuJoCo.
+    """
+    if not geom.mass_model:
+        return geom.shape.mass_properties(geom.is_hull)
+    try:
+        volume, centre, tensor = mujoco_mass_properties(geom.shape, geom.mass_model)
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise stage.error(geom.prim, f"MuJoCo has no {geom.mass_model} inertia for it: {reason}") from error
+    thick = stage.number(geom.prim, "newton:shellThickness", -math.inf) * stage.metres_per_unit
+    thick = thick if geom.mass_model == "shell" and thick > 0 else 1.0
+    return volume * thick, centre, tensor * thick
 
 
 def _sum(parts: list[Inertial]) -> Inertial | None:

@@ -1,27 +1,38 @@
 """USD in: a UsdPhysics stage becomes MJCF.
 
-The semantics are those of the UsdPhysics schemas. Where MuJoCo leaves a choice:
+The semantics are those of the UsdPhysics schemas; of MuJoCo's own (`mjc:`) and Newton's (`newton:`) where they are authored,
+whose plugins need not be installed. Where several say the same, the most specific counts: `tgdsl:`, `mjc:`, `newton:`,
+`physx…:`, UsdPhysics, in this order; who contradicts it is warned of (`mjc/attributes.py`). Exceptions are what a user edits in
+a stage that `export` wrote: UsdPhysics' value of a drive, a friction or a mass overrules our exact copy of the old one.
+
+Where MuJoCo leaves a choice:
 
 - A body's frame is its prim's, without scale; its name is the end of the prim's path, or the custom attribute `tgdsl:name`.
-- Position zero is where the frames of a joint meet. If the authored poses or the drives' targets differ from it, the keyframe
-  `authored` has them.
+- Position zero is where the frames of a joint meet, with `mjc:ref` the position `ref`. If the authored poses or the drives'
+  targets differ from where the model starts, the keyframe `authored` has them. Limits are MuJoCo's positions.
 - A drive becomes a `position` actuator, or a `velocity` actuator if it has no stiffness, named after its joint. A drive
-  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's.
+  without gains exerts no force and gives none. What `tgdsl:damping` says is the joint's own is taken off the drive's;
+  `mjc:damping` and `newton:damping` are beside it. A prim MjcActuator or NewtonActuator on the joint is that same actuator,
+  said more exactly: the drive is left out, with a warning if it contradicts.
+- Several joints between the same two bodies are degrees of freedom of one, where MjcJointAPI or `newton:jointsAddMobility` says
+  that joints add mobility; else all but one close a loop.
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
-  of two, and its own default where no material is bound.
-- `physxJoint:armature` and `physxJoint:jointFriction` (a torque or force) are read where they are authored.
-- A joint that closes a loop becomes an equality constraint between sites.
-- Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2. Materials' looks, subdivision,
-  holes of meshes and what is not drawn by default are left out; whatever else is dropped is warned of.
+  of two, and its own default where no material is bound. `newton:contactStiffness` and `contactDamping` are not read: they are
+  a force per distance, MuJoCo's `solref` is per effective mass.
+- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites.
+- Whether a parent and its child collide is what their joint says; where it says nothing and the scene has MjcSceneAPI,
+  MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
+- Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.
+- Materials' looks, subdivision, holes of meshes and what is not drawn by default are left out. Whatever else is authored and
+  nobody has read is warned of, by attribute and prim (`audit.py`).
 - Custom attributes `tgdsl:` that `export` writes are read back, in SI units and radians whatever those of the stage.
 """
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import mujoco
@@ -29,8 +40,9 @@ import numpy as np
 
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
-from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, spanning_tree
-from tgdsl.formats.usd.custom_attributes import OPTION, read_custom, read_mjcf_attributes, read_option_flags
+from tgdsl.formats.usd.articulation import SpanningTree, TreeNode, parent_pairs, spanning_tree
+from tgdsl.formats.usd.audit import note_unread
+from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.elements import (
     MeshAssets,
     add_actuators_and_key,
@@ -39,16 +51,20 @@ from tgdsl.formats.usd.elements import (
     add_loop_constraint,
     add_site,
     floats_text,
+    own_drives,
     with_pose,
 )
 from tgdsl.formats.usd.filters import exclusions
 from tgdsl.formats.usd.geoms import Gprim, Site, read_gprims, read_sites
 from tgdsl.formats.usd.joints import FRAME_TOLERANCE, Joint, read_joints
 from tgdsl.formats.usd.mass import Inertial, inertial_of
-from tgdsl.formats.usd.stage import Matrix, Prim, Stage, open_stage, unique_names
-
-GRAVITY = 9.81
-"""What a stage's scene means by earth gravity [m/s²]."""
+from tgdsl.formats.usd.mjc.actuators import Named, read_actuators
+from tgdsl.formats.usd.mjc.attributes import BODY, EQUALITY, WELD, read_attributes
+from tgdsl.formats.usd.mjc.couplings import add_couplings
+from tgdsl.formats.usd.mjc.keyframes import add_keyframes
+from tgdsl.formats.usd.mjc.tendons import add_tendons
+from tgdsl.formats.usd.scene import add_scene
+from tgdsl.formats.usd.stage import NAME_ATTRIBUTE, Matrix, Prim, Stage, open_stage, unique_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +73,7 @@ class _Robot:
 
     Attributes:
         bodies: Prims of the rigid bodies, by path.
+        owners: For the path of each prim, that of the rigid body which it moves with; None is the world.
         frames: Their world poses [m].
         joints: All joints.
         geoms: All geoms.
@@ -64,11 +81,13 @@ class _Robot:
         inertials: Mass and inertia of each body that has one.
         tree: Parent and joint of each body.
         kinematic: Whether each body is kinematic.
+        body_attributes: Attributes of each MJCF body.
         names: Name of each body, then of each geom, of each joint and of each site, by path.
         free: Name of each floating body's joint, or empty, by the body's path.
     """
 
     bodies: dict[str, Prim]
+    owners: dict[str, str | None]
     frames: dict[str, Matrix]
     joints: list[Joint]
     geoms: list[Gprim]
@@ -76,6 +95,7 @@ class _Robot:
     inertials: dict[str, Inertial | None]
     tree: SpanningTree
     kinematic: dict[str, bool]
+    body_attributes: dict[str, dict[str, str]]
     names: tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]
     free: dict[str, str]
 
@@ -102,15 +122,16 @@ def usd_to_mjcf(path: Path) -> str:
     with open_stage(path) as stage:
         robot = _read(stage)
         _check(stage, robot)
-        return ET.tostring(_mjcf_root(stage, robot), encoding="unicode")
+        root = _mjcf_root(stage, robot)
+        note_unread(stage, robot.owners)
+        return ET.tostring(root, encoding="unicode")
 
 
 def _read(stage: Stage) -> _Robot:
-    physics = stage.pxr.UsdPhysics
     bodies = {
         str(prim.GetPath()): prim
         for prim in stage.prims
-        if prim.HasAPI(physics.RigidBodyAPI) and stage.value(prim, "physics:rigidBodyEnabled")
+        if stage.has(prim, "PhysicsRigidBodyAPI") and stage.value(prim, "physics:rigidBodyEnabled")
     }
     if not bodies:
         raise RobotError(f"{stage.file}: /: no prim has an enabled PhysicsRigidBodyAPI: there is no robot in it")
@@ -126,7 +147,8 @@ def _read(stage: Stage) -> _Robot:
         for path, prim in bodies.items()
     }
     kinematic = {path: bool(stage.value(prim, "physics:kinematicEnabled")) for path, prim in bodies.items()}
-    roots = [str(prim.GetPath()) for prim in stage.prims if prim.HasAPI(physics.ArticulationRootAPI)]
+    attributes = {path: read_attributes(stage, prim, BODY) for path, prim in bodies.items()}
+    roots = [str(prim.GetPath()) for prim in stage.prims if stage.has(prim, "PhysicsArticulationRootAPI")]
     names = (
         unique_names(stage, bodies.values(), ["world"]),
         unique_names(stage, {geom.path: geom.prim for geom in geoms}.values()),
@@ -135,7 +157,7 @@ def _read(stage: Stage) -> _Robot:
     )
     tree = spanning_tree(kinematic, joints, roots)
     free = {path: str(read_custom(stage, prim, "freejoint") or "") for path, prim in bodies.items()}
-    return _Robot(bodies, frames, joints, geoms, sites, inertials, tree, kinematic, names, free)
+    return _Robot(bodies, owners, frames, joints, geoms, sites, inertials, tree, kinematic, attributes, names, free)
 
 
 def _check(stage: Stage, robot: _Robot) -> None:
@@ -148,7 +170,9 @@ def _check(stage: Stage, robot: _Robot) -> None:
         for name in ("velocity", "angularVelocity"):
             if any(stage.value(prim, f"physics:{name}")):
                 stage.drop("initial velocities were dropped", prim)
-        if node.joint is not None and _authored(robot, node.joint)[2] > FRAME_TOLERANCE:
+        poses = [joint.pose(node.is_swapped) for joint in node.joints]
+        is_apart = any(np.abs(pose - poses[0]).max() > FRAME_TOLERANCE for pose in poses)
+        if node.joint is not None and (is_apart or _authored(robot, node.joint)[2] > FRAME_TOLERANCE):
             stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", node.joint.prim)
     for geom in robot.geoms:
         if geom.shape.kind == "plane" and geom.body is not None and not robot.kinematic[geom.body]:
@@ -167,68 +191,72 @@ def _authored(robot: _Robot, joint: Joint) -> tuple[Matrix, float, float]:
 
 
 def _mjcf_root(stage: Stage, robot: _Robot) -> ET.Element:
-    root = ET.Element("mujoco", model=stage.file.stem)
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    first = stage.usd.GetDefaultPrim()
+    name = stage.authored(first, NAME_ATTRIBUTE) if first else None
+    root = ET.Element("mujoco", model=str(name or stage.file.stem))
+    compiler = ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     option = ET.SubElement(root, "option")
-    flags = _option(stage, option)
+    flags = add_scene(stage, option, compiler)
     meshes = MeshAssets(ET.SubElement(root, "asset"))
     world = ET.SubElement(root, "worldbody")
     elements: dict[str | None, ET.Element] = {None: world}
     _add_geoms(robot, None, world, meshes)
     for node in robot.tree.children(None):
         _add_body(robot, node, world, meshes, elements)
-    contact = ET.SubElement(root, "contact")
-    for pair in exclusions(stage, robot.joints, robot.geoms):
-        first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
-        ET.SubElement(contact, "exclude", body1=first, body2=second)
-    if any(node.joint and node.parent and not node.joint.is_filtering for node in robot.tree.nodes.values()):
-        # MuJoCo never collides a parent with its child; here it should, and who should not is listed above.
-        flags["filterparent"] = "disable"
+    flags |= _add_exclusions(stage, robot, ET.SubElement(root, "contact"), flags)
     if flags:
         ET.SubElement(option, "flag", flags)
-    equality, actuator = ET.SubElement(root, "equality"), ET.SubElement(root, "actuator")
+    parts = ("equality", "tendon", "actuator", "keyframe")
+    equality, tendon, actuator, keyframe = (ET.SubElement(root, part) for part in parts)
     for joint in robot.tree.loops:
         _add_loop_constraint(stage, robot, joint, elements, equality)
-    motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in _depth_first(robot.tree)]
-    add_actuators_and_key(ET.SubElement(root, "keyframe"), actuator, motions, robot.frames, robot.kinematic, robot.names[2])
+    named = _named(robot)
+    add_couplings(stage, equality, robot.joints, _scalars(robot))
+    named = replace(named, tendons=add_tendons(stage, tendon, replace(named, joints=_scalars(robot))))
+    nodes = list(robot.tree.nodes.values())
+    motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in nodes]
+    others = read_actuators(stage, named)
+    driven = own_drives(stage, [joint for node in nodes for joint in node.joints], others)
+    add_actuators_and_key(keyframe, actuator, motions, robot.frames, robot.kinematic, robot.names[2], driven, others)
+    add_keyframes(stage, root, keyframe)
     for empty in [element for element in root if len(element) == 0 and not element.attrib]:
         root.remove(empty)
     return root
 
 
-def _depth_first(tree: SpanningTree, parent: str | None = None) -> list[TreeNode]:
-    """Return all nodes in MuJoCo's order."""
-    return [node for child in tree.children(parent) for node in (child, *_depth_first(tree, child.body))]
+def _named(robot: _Robot) -> Named:
+    joints = {joint.path for node in robot.tree.nodes.values() for joint in node.joints if joint.kind != "fixed"}
+    chosen = {path: name for path, name in robot.names[2].items() if path in joints}
+    return Named(chosen, robot.names[0], robot.names[3], robot.names[1], {})
 
 
-def _option(stage: Stage, option: ET.Element) -> dict[str, str]:
-    """Set gravity and the solver's settings as the first scene has them; return its flags."""
-    scenes = [prim for prim in stage.prims if prim.IsA(stage.pxr.UsdPhysics.Scene)]
-    for scene in scenes[1:]:
-        stage.drop("physics scenes after the first one were dropped", scene)
-    if not scenes:
-        return {}
-    option.attrib |= {"gravity": _gravity(stage, scenes[0]), **read_mjcf_attributes(stage, scenes[0], OPTION)}
-    return read_option_flags(stage, scenes[0])
+def _scalars(robot: _Robot) -> dict[str, str]:
+    """Return the names of the hinges and slides of the tree."""
+    joints = [joint for node in robot.tree.nodes.values() for joint in node.joints]
+    return {joint.path: robot.names[2][joint.path] for joint in joints if joint.kind in ("hinge", "slide")}
 
 
-def _gravity(stage: Stage, scene: Prim) -> str:
-    """Return gravity [m/s²]."""
-    direction = np.array(stage.value(scene, "physics:gravityDirection"), dtype=np.float64)
-    size = stage.number(scene, "physics:gravityMagnitude", -math.inf)
-    size = GRAVITY if size < 0 else size * stage.metres_per_unit
-    if not np.isfinite(direction).all() or not math.isfinite(size):
-        raise stage.error(scene, "gravity is not finite")
-    if not direction.any():
-        return floats_text([0.0, 0.0, -size])
-    return floats_text(stage.world_from_stage[:3, :3] @ direction / stage.metres_per_unit / np.linalg.norm(direction) * size)
+def _add_exclusions(stage: Stage, robot: _Robot, contact: ET.Element, flags: Mapping[str, str]) -> dict[str, str]:
+    """Add the pairs of bodies that do not collide; return the flags that this needs.
+
+    MuJoCo never collides a parent with its child. Where a joint says that they do, its filter is off, and all that it would
+    have kept apart is listed.
+    """
+    is_on = flags.get("filterparent") != "disable"
+    is_off = any(node.joint and node.parent and node.joint.is_filtering is False for node in robot.tree.nodes.values())
+    welded = parent_pairs(robot.tree) if is_on and is_off else ()
+    for pair in exclusions(stage, robot.bodies, robot.joints, robot.geoms, welded):
+        first, second = sorted("world" if path is None else robot.names[0][path] for path in pair)
+        ET.SubElement(contact, "exclude", body1=first, body2=second)
+    return {"filterparent": "disable"} if is_off else {}
 
 
 def _add_body(
     robot: _Robot, node: TreeNode, parent: ET.Element, meshes: MeshAssets, elements: dict[str | None, ET.Element]
 ) -> None:
     pose = robot.frames[node.body] if node.joint is None else node.joint.pose(node.is_swapped)
-    element = with_pose(ET.SubElement(parent, "body", name=robot.names[0][node.body]), pose)
+    attributes = {"name": robot.names[0][node.body]} | robot.body_attributes[node.body]
+    element = with_pose(ET.SubElement(parent, "body", attributes), pose)
     elements[node.body] = element
     if robot.kinematic[node.body]:
         element.set("mocap", "true")
@@ -271,10 +299,14 @@ def _add_loop_constraint(
     if all(body is None or robot.kinematic[body] for body in joint.bodies):
         stage.drop("joints between bodies that no force can move were dropped", joint.prim)
         return
-    if joint.kind == "slide":
+    if joint.kind == "slide" and not joint.constraint:
         raise stage.error(joint.prim, "a prismatic joint closes a loop, for which MuJoCo has no constraint")
-    if joint.range or joint.drive or joint.armature or joint.friction:
+    if not joint.is_passive:
         stage.drop("limits, drives, armature and friction of joints that close a loop were dropped", joint.prim)
     taken = {site.get("name", "") for element in elements.values() for site in element.iter("site")}
+    attributes = {}
+    if joint.constraint:
+        attributes = read_attributes(stage, joint.prim, WELD if joint.constraint.startswith("MjcEqualityWeld") else EQUALITY)
+        attributes |= {} if joint.is_active else {"active": "false"}
     ends = (elements[joint.bodies[0]], elements[joint.bodies[1]])
-    add_loop_constraint(equality, ends, joint, robot.names[2][joint.path], taken)
+    add_loop_constraint(equality, ends, joint, robot.names[2][joint.path], attributes, taken)

@@ -236,7 +236,7 @@ def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tu
         RobotError: If it is flat, so that it has no hull.
     """
     wanted = "none"
-    if prim.HasAPI(stage.pxr.UsdPhysics.MeshCollisionAPI):
+    if stage.has(prim, "PhysicsMeshCollisionAPI"):
         wanted = str(stage.value(prim, "physics:approximation"))
     assert shape.vertices is not None
     if wanted in ("boundingCube", "boundingSphere"):

@@ -23,6 +23,23 @@ Matrix = Float[np.ndarray, "4 4"]
 """A homogeneous transform of column vectors."""
 SHEAR = 1e-5
 """Cosine between the axes of a prim from which on it counts as sheared: transforms are often authored in float32."""
+IMPLIED = {
+    "MjcSceneAPI": ("NewtonSceneAPI",),
+    "MjcSiteAPI": ("NewtonSiteAPI",),
+    "MjcCollisionAPI": ("NewtonCollisionAPI",),
+    "MjcMeshCollisionAPI": ("NewtonMeshCollisionAPI",),
+    "MjcJointAPI": ("NewtonJointAPI",),
+    "MjcMaterialAPI": ("NewtonMaterialAPI",),
+    "MjcEqualityJointAPI": ("NewtonMimicAPI",),
+    "NewtonMeshCollisionAPI": ("NewtonCollisionAPI", "PhysicsMeshCollisionAPI"),
+    "NewtonCollisionAPI": ("PhysicsCollisionAPI",),
+    "NewtonArticulationRootAPI": ("PhysicsArticulationRootAPI",),
+    "NewtonMassAPI": ("PhysicsMassAPI",),
+    "NewtonMaterialAPI": ("PhysicsMaterialAPI",),
+}
+"""API schemas by those that build them in (MjcPhysics of mujoco-usd-converter 0.8, newton-usd-schemas 0.6); usd-core only knows
+this of schemas whose plugins are installed."""
+IMPLIED_PHYSICS = frozenset(name for names in IMPLIED.values() for name in names if name.startswith("Physics"))
 NAMESPACE = "tgdsl:"
 """Namespace of the custom attributes that hold MJCF's values."""
 NAME_ATTRIBUTE = f"{NAMESPACE}name"
@@ -53,12 +70,14 @@ class Stage:
         usd: The `pxr.Usd.Stage`.
         pxr: The modules of usd-core.
         dropped: Prim paths by what was dropped of them, in the order found.
+        read: Path of the prim and name of each attribute and relationship that was read.
     """
 
     file: Path
     usd: Any
     pxr: Any
     dropped: dict[str, list[str]] = field(default_factory=dict)
+    read: set[tuple[str, str]] = field(default_factory=set)
 
     @cached_property
     def metres_per_unit(self) -> float:
@@ -69,6 +88,30 @@ class Stage:
     def kilograms_per_unit(self) -> float:
         """Mass of the stage's unit [kg]."""
         return float(self.pxr.UsdPhysics.GetStageKilogramsPerUnit(self.usd))
+
+    @cached_property
+    def _schemas(self) -> dict[str, frozenset[str]]:
+        return {}
+
+    @cached_property
+    def scenes(self) -> tuple[Prim, ...]:
+        """All physics scenes."""
+        return tuple(prim for prim in self.prims if prim.IsA(self.pxr.UsdPhysics.Scene))
+
+    @cached_property
+    def is_mjcf_in_degrees(self) -> bool:
+        """Whether `mjc:` attributes of hinges that MJCF counts in its compiler's angle are in degrees."""
+        return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:angle") != "radian"
+
+    @cached_property
+    def is_mjcf_autolimited(self) -> bool:
+        """Whether `mjc:` attributes that are limits hold wherever they are a range."""
+        return not self.scenes or self.authored(self.scenes[0], "mjc:compiler:autoLimits") is not False
+
+    @cached_property
+    def mobility_roots(self) -> tuple[str, ...]:
+        """Paths of the articulations whose joints add mobility, rather than constrain it."""
+        return tuple(str(prim.GetPath()) for prim in self.prims if self.authored(prim, "newton:jointsAddMobility"))
 
     @cached_property
     def prims(self) -> tuple[Prim, ...]:
@@ -100,14 +143,52 @@ class Stage:
         Where it is what its double twin `tgdsl:<name>` rounds to, that is returned.
         """
         attribute, twin = prim.GetAttribute(name), prim.GetAttribute(f"{NAMESPACE}{name}")
+        self.note(prim, name, f"{NAMESPACE}{name}")
         value = attribute.Get(self._time) if attribute else None
+        if value is None:
+            value = self._fallback(prim, name)
         exact = twin.Get(self._time) if twin and value is not None else None
         return value if exact is None or not _is_rounded(exact, value) else exact
 
     def authored(self, prim: Prim, name: str) -> Any:
         """Return an attribute's value if it is authored, or else None."""
         attribute = prim.GetAttribute(name)
+        self.note(prim, name)
         return self.value(prim, name) if attribute and attribute.HasAuthoredValue() else None
+
+    def targets(self, prim: Prim, name: str) -> list[Any]:
+        """Return the paths that a relationship names, through those that it forwards to."""
+        self.note(prim, name)
+        relationship = prim.GetRelationship(name)
+        return list(relationship.GetForwardedTargets()) if relationship else []
+
+    def note(self, prim: Prim, *names: str) -> None:
+        """Record that attributes or relationships were read."""
+        path = str(prim.GetPath())
+        self.read.update((path, name) for name in names)
+
+    def schemas(self, prim: Prim) -> frozenset[str]:
+        """Return all API schemas of a prim: those that it names, known to usd-core or not, and those that these imply."""
+        path = str(prim.GetPath())
+        if path not in self._schemas:
+            names = [*prim.GetPrimTypeInfo().GetAppliedAPISchemas(), *prim.GetAppliedSchemas()]
+            for name in names:  # grows
+                names += [implied for implied in IMPLIED.get(name, ()) if implied not in names]
+            self._schemas[path] = frozenset(names)
+        return self._schemas[path]
+
+    def has(self, prim: Prim, schema: str) -> bool:
+        """Return whether a prim has an API schema, or one that implies it."""
+        return schema in self.schemas(prim)
+
+    def _fallback(self, prim: Prim, name: str) -> Any:
+        """Return the value that a schema gives an attribute which the prim only has by implication."""
+        registry = self.pxr.Usd.SchemaRegistry()
+        for schema in self.schemas(prim) & IMPLIED_PHYSICS:
+            definition = registry.FindAppliedAPIPrimDefinition(schema)
+            if definition and name in definition.GetPropertyNames():
+                return definition.GetAttributeFallbackValue(name)
+        return None
 
     def number(self, prim: Prim, name: str, default: float = 0.0) -> float:
         """Return the value of a scalar attribute."""

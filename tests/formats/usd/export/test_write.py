@@ -211,40 +211,17 @@ TWO = "<body name='a'><joint name='j' {joint}/><geom size='.1'/></body><body nam
     ("bodies", "rest", "messages"),
     [
         (
-            TWO,
-            "<actuator><motor name='m' joint='j'/></actuator>",
-            ['actuator "m" is a motor, which USD has no drive for: left out'],
-        ),
-        (
-            TWO,
-            "<actuator><position joint='k'/></actuator>",
-            [
-                "unnamed actuator 0 is no position or velocity servo of a hinge or slide joint, which USD has no drive for: left out"
-            ],
-        ),
-        (
-            TWO,
-            "<actuator><general name='g' joint='j' biastype='affine' gainprm='2' biasprm='1 -2 0'/></actuator>",
-            ['actuator "g" is no position or velocity servo of a hinge or slide joint, which USD has no drive for: left out'],
-        ),
-        (
-            TWO,
-            "<actuator><position name='p' joint='j' forcerange='-1 2'/><velocity name='v' joint='j'/></actuator>",
-            [
-                'actuator "p" has the force range -1 2, and USD\'s are symmetric: the larger is used',
-                'actuator "v" is not the first of its joint, and USD has one drive for each: left out',
-            ],
+            "<body name='a'><freejoint name='f'/><geom size='.1'/></body>",
+            "<actuator><motor name='m' joint='f'/></actuator>",
+            ['actuator "m" is on what USD has no prim for (a free joint): left out'],
         ),
         (
             TWO,
             "<equality><connect body1='a' body2='b' anchor='0 0 0'/><weld body1='a' body2='b'/></equality><sensor><clock/></sensor>"
             "<tendon><fixed><joint joint='j' coef='1'/></fixed></tendon><keyframe><key time='1'/></keyframe>",
-            [
-                f"USD holds no {k}: {n} left out"
-                for k, n in (("equality constraints", 2), ("tendons", 1), ("sensors", 1), ("keyframes", 1))
-            ],
+            [f"USD holds no {k}: {n} left out" for k, n in (("equality constraints", 2), ("sensors", 1))],
         ),
-        (TWO.replace("{joint}", "stiffness='2'"), "", ["USD holds no springs of joints: 1 left out"]),
+        (TWO.replace("{joint}", "stiffness='2 1'"), "", ["USD holds no polynomial springs and dampers: 1 left out"]),
         (
             "<body name='a'><joint/><geom size='.1'/><body name='dummy'/></body>",
             "",
@@ -261,7 +238,7 @@ TWO = "<body name='a'><joint name='j' {joint}/><geom size='.1'/></body><body nam
             ["USD's physics has no planes on bodies, and leaves out: unnamed geom 0"],
         ),
     ],
-    ids=["motor", "ball", "general", "second", "kinds", "springs", "massless", "ellipsoid", "plane"],
+    ids=["free", "kinds", "springs", "massless", "ellipsoid", "plane"],
 )
 def test_what_is_left_out_is_said(tmp_path, bodies, rest, messages):
     (tmp_path / "robot.xml").write_text(world_of(bodies.replace("{joint}", ""), rest))

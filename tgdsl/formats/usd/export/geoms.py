@@ -40,6 +40,7 @@ def add_geoms(writer: StageWriter, body: int, materials: str) -> None:
     for geom in range(first, first + int(model.body_geomnum[body])):
         shape, scale = _define(writer, geom)
         prim = shape.GetPrim()
+        writer.geoms[geom] = str(prim.GetPath())
         set_pose(prim, *_pose(writer, geom), scale)
         set_custom(prim, "name", model.geom(geom).name)
         _colour(writer, geom, shape)
@@ -169,6 +170,7 @@ def add_sites(writer: StageWriter, body: int) -> None:
     for site in np.flatnonzero(model.site_bodyid == body).tolist():
         name = model.site(site).name
         prim = usd_modules().UsdGeom.Xform.Define(writer.stage, writer.path(writer.bodies[body], name or "site")).GetPrim()
+        writer.sites[site] = str(prim.GetPath())
         set_pose(prim, model.site_pos[site], model.site_quat[site])
         set_custom(prim, "site", True)
         set_custom(prim, "name", name)

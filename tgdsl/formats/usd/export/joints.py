@@ -26,7 +26,7 @@ from tgdsl.formats.usd.stage import usd_modules
 FREE, BALL, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE"))
 JOINT_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 NO_DYNAMICS, FIXED_GAIN = int(mujoco.mjtDyn.mjDYN_NONE), int(mujoco.mjtGain.mjGAIN_FIXED)
-NO_BIAS, AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
+AFFINE_BIAS = int(mujoco.mjtBias.mjBIAS_AFFINE)
 SCHEMAS = {BALL: "SphericalJoint", SLIDE: "PrismaticJoint", HINGE: "RevoluteJoint"}
 
 
@@ -128,6 +128,13 @@ def _passive(model: mujoco.MjModel, joint: int, prim: Any) -> None:
     )
     for key, value in notes.items():
         set_custom(prim, key, value)
+    start = float(model.qpos0[model.jnt_qposadr[joint]])
+    if start and model.jnt_type[joint] in (SLIDE, HINGE):
+        set_custom(prim, "ref", start)
+    if model.jnt_stiffness[joint] and model.jnt_type[joint] in (SLIDE, HINGE):
+        set_custom(prim, "springref", float(model.qpos_spring[model.jnt_qposadr[joint]]))
+    if model.jnt_type[joint] == BALL and model.jnt_limited[joint]:
+        set_custom(prim, "range", model.jnt_range[joint].tolist())
     known = {"armature": model.dof_armature[first], "jointFriction": model.dof_frictionloss[first]}
     if any(known.values()):
         prim.AddAppliedSchema("PhysxJointAPI")  # Omniverse reads the attributes only of a prim that says so
@@ -160,36 +167,32 @@ class Servo:
     gear: float = 1.0
 
 
-def add_drives(writer: StageWriter, joints: dict[int, Any]) -> None:
-    """Write the actuators that USD has drives for; say which are left out.
+def add_drives(writer: StageWriter, joints: dict[int, Any]) -> list[int]:
+    """Write the actuators that USD has drives for.
 
     Args:
         writer: Where to write them.
         joints: The schema of each joint that can move, by MuJoCo's index.
+
+    Returns:
+        The other actuators, which need prims of their own.
     """
-    model, driven = writer.model, list[int]()
+    model, driven = writer.model, dict[int, int]()
     for actuator in range(model.nu):
-        name = model.actuator(actuator).name
-        shown = f'{writer.file}: actuator "{name}"' if name else f"{writer.file}: unnamed actuator {actuator}"
         servo, joint = _servo(model, actuator), int(model.actuator_trnid[actuator, 0])
-        if servo is None:
-            is_motor = model.actuator_biastype[actuator] == NO_BIAS and model.actuator_gaintype[actuator] == FIXED_GAIN
-            what = "is a motor" if is_motor else "is no position or velocity servo of a hinge or slide joint"
-            writer.unsupported.append(f"{shown} {what}, which USD has no drive for: left out")
+        if servo is None or joint in driven:
             continue
-        if joint in driven:
-            writer.unsupported.append(f"{shown} is not the first of its joint, and USD has one drive for each: left out")
-            continue
-        driven.append(joint)
-        low, high = model.actuator_forcerange[actuator].tolist()
-        if model.actuator_forcelimited[actuator] and low != -high:
-            writer.unsupported.append(
-                f"{shown} has the force range {low:g} {high:g}, and USD's are symmetric: the larger is used"
-            )
+        driven[joint] = actuator
         _drive(model, joint, servo, joints[joint].GetPrim())
-        set_custom(joints[joint].GetPrim(), "actuator", name)
-    for order, joint in enumerate(driven if driven != sorted(driven) else ()):
-        set_custom(joints[joint].GetPrim(), "order", order)
+        set_custom(joints[joint].GetPrim(), "actuator", model.actuator(actuator).name)
+    left = [actuator for actuator in range(model.nu) if actuator not in driven.values()]
+    if left or list(driven) != sorted(driven):
+        for joint, actuator in driven.items():
+            set_custom(joints[joint].GetPrim(), "order", actuator)
+    for joint in joints:
+        if model.jnt_actfrclimited[joint] and joint not in driven:
+            set_custom(joints[joint].GetPrim(), "actuatorfrcrange", model.jnt_actfrcrange[joint].tolist())
+    return left
 
 
 def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
@@ -203,6 +206,9 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
     gain, gear = float(model.actuator_gainprm[actuator, 0]), float(model.actuator_gear[actuator, 0])
     offset, stiffness, damping = (0.0 - model.actuator_biasprm[actuator, :3]).tolist()
     is_position, is_velocity = stiffness == gain, stiffness == 0 and damping == gain
+    low, high = model.actuator_forcerange[actuator].tolist()
+    if (model.actuator_forcelimited[actuator] and low != -high) or has_more(model, actuator):
+        return None
     if offset or gain <= 0 or not gear or not (is_position or is_velocity):
         return None
     limits = [abs(gear) * np.abs(model.actuator_forcerange[actuator]).max()] if model.actuator_forcelimited[actuator] else []
@@ -215,6 +221,12 @@ def _servo(model: mujoco.MjModel, actuator: int) -> Servo | None:
         control=(low, high) if model.actuator_ctrllimited[actuator] else None,
         gear=gear,
     )
+
+
+def has_more(model: mujoco.MjModel, actuator: int) -> bool:
+    """Return whether an actuator does more than act on its control as it is: it waits, or it weighs or damps."""
+    arrays = (model.actuator_delay, model.actuator_history, model.actuator_armature, model.actuator_damping)
+    return any(np.any(array[actuator]) for array in arrays)
 
 
 def _drive(model: mujoco.MjModel, joint: int, servo: Servo, prim: Any) -> None:

@@ -32,6 +32,8 @@ class StageWriter:
         stage: The `Usd.Stage`.
         root: Path of the default prim.
         bodies: Path of each body's prim by MuJoCo's index; the world's is there only if it holds something.
+        sites: Path of each site's prim, by MuJoCo's index.
+        geoms: Path of each geom's prim, by MuJoCo's index.
         frictions: The physics material of each sliding friction that is in use.
         unsupported: One message for each thing that USD does not hold.
     """
@@ -42,6 +44,8 @@ class StageWriter:
     stage: Any
     root: str = ""
     bodies: dict[int, str] = field(default_factory=dict)
+    sites: dict[int, str] = field(default_factory=dict)
+    geoms: dict[int, str] = field(default_factory=dict)
     frictions: dict[float, Any] = field(default_factory=dict)
     unsupported: list[str] = field(default_factory=list)
     _taken: set[str] = field(default_factory=set)

@@ -5,9 +5,11 @@ custom attributes named `tgdsl:`, in SI units and radians:
 
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
-  the actuator's place in the `order`, if actuators do not come in the joints' order;
+  the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
+- a joint's spring, a ball joint's range, a body's `gravcomp`;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
 
+Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe).
 Textures stay behind.
 """
 
@@ -25,8 +27,9 @@ from tgdsl.errors import FileError, RobotError, listed
 from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
+from tgdsl.formats.usd.export.actuators import add_actuators, add_keyframes, add_tendons
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
-from tgdsl.formats.usd.export.joints import BALL, FREE, add_drives, add_joint, joint_of
+from tgdsl.formats.usd.export.joints import FREE, add_drives, add_joint, joint_of
 from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
 from tgdsl.formats.usd.stage import usd_modules
 
@@ -95,6 +98,8 @@ def _add_bodies(writer: StageWriter, materials: str) -> None:
         prim = u.UsdGeom.Xform.Define(writer.stage, path).GetPrim()
         if body:
             set_custom(prim, "name", model.body(body).name)
+            if model.body_gravcomp[body]:
+                set_custom(prim, "gravcomp", float(model.body_gravcomp[body]))
             set_pose(prim, state.xpos[body], state.xquat[body])
             _add_mass(writer, body, prim)
         add_geoms(writer, body, materials)
@@ -127,7 +132,8 @@ def _add_joints(writer: StageWriter, scope: str) -> None:
             moving[joint] = made
         elif joint >= 0:
             set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
-    add_drives(writer, moving)
+    add_keyframes(writer, scope)
+    add_actuators(writer, add_drives(writer, moving), scope, moving, add_tendons(writer, scope, moving))
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
@@ -170,19 +176,16 @@ def _add_filters(writer: StageWriter) -> None:
 def _unsupported_elements(writer: StageWriter) -> list[str]:
     """Return one message for each kind of thing that the model has and USD does not."""
     model = writer.model
+    polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.tendon_stiffnesspoly, model.tendon_dampingpoly)
     counts = {
         "equality constraints": model.neq,
-        "tendons": model.ntendon,
         "contact pairs": model.npair,
         "sensors": model.nsensor,
-        "keyframes": model.nkey,
         "cameras": model.ncam,
         "lights": model.nlight,
         "flexes": model.nflex,
         "skins": model.nskin,
-        "springs of joints": np.count_nonzero(model.jnt_stiffness),
-        "limits of ball joints": np.count_nonzero(model.jnt_limited[model.jnt_type == BALL]),
-        "gravity compensations": np.count_nonzero(model.body_gravcomp),
+        "polynomial springs and dampers": sum(map(np.count_nonzero, polynomials)),
     }
     messages = [f"{writer.file}: USD holds no {kind}: {count} left out" for kind, count in counts.items() if count]
     colliding = (model.geom_contype | model.geom_conaffinity) != 0

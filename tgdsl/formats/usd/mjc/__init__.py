@@ -1,0 +1,1 @@
+"""What MuJoCo's and Newton's schemas for USD hold, as MJCF."""
