@@ -136,7 +136,7 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
 
 
 def _poisson(surface: Surface, placement: Poisson) -> Samples:
-    """Poisson-disk samples: an exact count by sample elimination, or as many as fit at a spacing by dart throwing."""
+    """Poisson-disk samples: an exact count, or as many as fit at a spacing."""
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
@@ -152,7 +152,7 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
         least = np.sqrt(pool.area / MAX_DENSITY)
         what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
         raise SampleError(what, f"expected at least {least:.2g} m")
-    chosen = poisson.choose(pool, placement.count, placement.spacing, placement.seed)
+    chosen = poisson.choose(pool, placement.count, placement.spacing)
     normal = pool.normal[chosen]
     return Samples(
         pos=pool.pos[chosen],
