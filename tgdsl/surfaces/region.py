@@ -20,7 +20,7 @@ from tgdsl.surfaces.surface import Surface
 LENGTH_TOLERANCE = 1e-6
 """Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
 ANGLE_TOLERANCE = 1e-4
-"""The same for the normals of faces a millimetre wide [rad]: a chamfer of 45° is within 45°, however its corners are rounded."""
+"""The same for the normals of faces a millimetre wide [rad]: a chamfer of 45° is within 45°, however its corners round."""
 
 
 @dataclass(frozen=True, eq=False)

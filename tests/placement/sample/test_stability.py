@@ -61,12 +61,14 @@ def test_rows_stay_when_a_surface_is_written_otherwise(name, noise):
 @pytest.mark.parametrize("keys", [{"count": 297}, {"spacing": 0.006}], ids=["count", "spacing"])
 @pytest.mark.parametrize("hand", PALMS)
 def test_rows_stay_on_real_palms(hand, keys):
-    surface, where = palm(hand), placement("poisson", **keys)
-    first = sample(surface, where, HERE)
-    for noise in (1e-9, 1e-8):
-        for seed in range(2):
-            assert equal_rows(first, sample(shaken(surface, noise, seed), where, HERE)) == 1.0
-    assert np.mean([equal_rows(first, sample(shaken(surface, 1e-7, seed), where, HERE)) for seed in range(3)]) >= 0.99
+    surface, shares = palm(hand), {noise: [] for noise in (1e-9, 1e-8, 1e-7)}
+    for seed in range(4):
+        where = placement("poisson", **keys, seed=seed)
+        first = sample(surface, where, HERE)
+        for noise, found in shares.items():
+            found.append(equal_rows(first, sample(shaken(surface, noise, seed), where, HERE)))
+    assert min(shares[1e-9] + shares[1e-8]) == 1.0
+    assert np.mean(shares[1e-7]) >= 0.99
 
 
 @pytest.mark.filterwarnings("ignore:.*USD holds no", "ignore:.*collides the convex hull")

@@ -7,8 +7,8 @@ whatever the order of faces, the numbers of vertices or the triangles that a fla
 the third moves by δ over the cosine of line and normal: no point hangs on any other one, nor on how many there are.
 
 Lines count where they meet a face steeply, |n_a| ≥ 0.37 for the unit normal n and the axis a: one family always does, and of
-one that grazes a face no point is where it seems. A face is met by |n_a| / h² lines of family a per area, and a point counts for
-the area h² |n_a| / Σ n_b², the sum over the families that count: together they count for the face's own.
+one that grazes a face no point is where it seems. A face is met by |n_a| / h² lines of family a per area, and a point counts
+for the area h² |n_a| / Σ n_b², the sum over the families that count: together they count for the face's own.
 
 Shapes: `piece` triangles, `strip` (piece, column of squares) pairs, `pair` (piece, square) pairs, `hit` points.
 Everything is in the body frame.

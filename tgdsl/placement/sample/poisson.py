@@ -12,8 +12,8 @@ distance equals a spacing to within the rounding, and then one or two neighbours
 2015) compares sums of eighth powers of distances: thirty times as many of its choices change. Distances are straight lines, not
 paths along the surface.
 
-Shapes: `piece` triangles cut from faces, `pool` points of the pool, `n` some points, `taxel` the points chosen.
-Everything is in the body frame.
+Shapes: `piece` triangles cut from faces, `hit` points drawn, `pool` points of the pool, `n` some points, `taxel` the points
+chosen. Everything is in the body frame.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ PER_SAMPLE = 50
 """Points per sample by which the area of each sample is measured; also the density of the pool for a spacing."""
 MIN_POOL, MAX_POOL = 10_000, 400_000
 """Bounds of the number of points in a pool; more are drawn only where an exact count needs them."""
+MANY = 30
+"""Points by which the area of a piece is known well enough to set it right for this piece alone."""
 FIRST_SPACING, SPACING_RATIO = 0.81, 0.99
 """Of an exact count: the largest first spacing, relative to the hexagonal packing's, at which nearly all samples fit; and each
 next one relative to the one before."""
@@ -126,11 +128,23 @@ def _drawn(
     """Draw points of pieces of faces on a lattice of some pitch [m]; keep those in the region and on the outer surface."""
     drawn = lattice.hits(corners, pitch, seed)
     pos, face = drawn.pos, face[drawn.piece]
-    # What all points stand for is as large as all pieces, of which a lattice knows the area to a percent only.
-    point_area = drawn.area * (_areas(corners).sum() / drawn.area.sum()) if len(pos) else drawn.area
+    point_area = _exact(drawn, _areas(corners))
     is_kept = region.has_points(pos)
     is_kept[is_kept] = _on_outer_surface(shell, region, pos[is_kept], face[is_kept])
     return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], point_area[is_kept])
+
+
+def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.ndarray, " hit"]:
+    """Return what points stand for so that it adds up to the areas of pieces, which a lattice knows to some percent only [m²].
+
+    Each piece with `MANY` points for itself, the others together.
+    """
+    num = np.bincount(drawn.piece, minlength=len(area))
+    owner = np.where(num >= MANY, np.arange(len(area)), len(area))
+    found = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
+    wanted = np.bincount(owner, area, minlength=len(area) + 1)
+    exact = drawn.area * (wanted / np.where(found > 0, found, 1.0))[owner[drawn.piece]]
+    return exact * (area.sum() / exact.sum()) if len(exact) else exact
 
 
 def _on_outer_surface(
