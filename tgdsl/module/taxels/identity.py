@@ -32,7 +32,7 @@ class HasPlan(Protocol):
         ...
 
 
-Taxels = HasPlan | Mapping[str, Columns] | str | PathLike[str]
+Taxels = HasPlan | Mapping[str, Any] | str | PathLike[str]
 """Taxels that are expected, see `check_taxels`."""
 
 
@@ -80,6 +80,10 @@ def _packed(plan: Plan) -> dict[str, Any]:
     return sensors
 
 
+def _unpacked(column: list[str] | torch.Tensor) -> np.ndarray:
+    return column.cpu().numpy() if isinstance(column, torch.Tensor) else np.array(column)
+
+
 class SavedTaxels(HookedModule):
     """Notes a module's taxels in the metadata of its state dict, and refuses a state dict of other taxels.
 
@@ -100,7 +104,7 @@ class SavedTaxels(HookedModule):
         """
         if _TAXELS in metadata:
             saved = metadata[_TAXELS].items()
-            tables = {name: {key: np.array(column) for key, column in table.items()} for name, table in saved}
+            tables = {name: {key: _unpacked(column) for key, column in table.items()} for name, table in saved}
             check_taxels(self, tables, "the state dict is of another module")
 
 
