@@ -25,12 +25,14 @@ if TYPE_CHECKING:
         SimulationError,
         SpecError,
         StateError,
+        TaxelError,
         TgdslError,
     )
     from tgdsl.module.artifact import load as load
     from tgdsl.module.artifact import save as save
     from tgdsl.module.module import TactileModule
     from tgdsl.module.state import SceneState
+    from tgdsl.module.taxels.identity import check_taxels as check_taxels
     from tgdsl.runtime.batch.simulation import BatchSimulation
     from tgdsl.runtime.connect import connect as connect
     from tgdsl.runtime.simulate import simulate as simulate
@@ -48,8 +50,10 @@ _PLACES = {
     "SpecError": "errors",
     "StateError": "errors",
     "TactileModule": "module.module",
+    "TaxelError": "errors",
     "TgdslError": "errors",
     "WarpSimulation": "runtime.warp",
+    "check_taxels": "module.taxels.identity",
     "compile": "compiler.pipeline",
     "connect": "runtime.connect",
     "instrument": "compiler.scene",
@@ -70,8 +74,10 @@ __all__ = [
     "SpecError",
     "StateError",
     "TactileModule",
+    "TaxelError",
     "TgdslError",
     "WarpSimulation",
+    "check_taxels",
     "compile",
     "connect",
     "instrument",

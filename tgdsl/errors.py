@@ -23,6 +23,10 @@ class ArtifactError(TgdslError):
     """A compiled artefact that is damaged, of another version, or whose assets have changed."""
 
 
+class TaxelError(TgdslError):
+    """Taxels that are others, or in another order, than those expected: readings would mean something else, row by row."""
+
+
 class SimulationError(TgdslError):
     """A simulator that cannot run what was asked of it, or that diverged."""
 

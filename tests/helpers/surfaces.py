@@ -51,3 +51,14 @@ def error_of(surface: Surface, where: Placement, folder: Path = HERE) -> SampleE
     with pytest.raises(SampleError) as caught:
         sample(surface, where, folder)
     return caught.value
+
+
+def shaken(surface: Surface, noise: float, seed: int) -> Surface:
+    """The same surface as another file may have it: vertices off by up to `noise` and renumbered, faces reordered and begun elsewhere."""
+    draw = np.random.default_rng(seed)
+    _, place = np.unique(surface.vertices, axis=0, return_inverse=True)  # vertices in one place move together
+    vertices = surface.vertices + draw.uniform(-noise, noise, surface.vertices.shape)[place.ravel()]
+    number, order = draw.permutation(len(vertices)), draw.permutation(len(surface.faces))
+    first = draw.integers(3, size=len(order))
+    faces = np.take_along_axis(surface.faces[order], (first[:, None] + np.arange(3)) % 3, axis=1)
+    return Surface(vertices[number], np.argsort(number)[faces], surface.face_geom[order], surface.geoms)

@@ -17,7 +17,7 @@ from tgdsl.commands.explain import Explain
 from tgdsl.commands.export_usd import ExportUsd
 from tgdsl.commands.hand.hand import Hand
 from tgdsl.commands.import_ import Import
-from tgdsl.commands.layout import Layout
+from tgdsl.commands.layout.layout import Layout
 from tgdsl.commands.links import Links
 from tgdsl.commands.render import Render
 from tgdsl.commands.run import Run

@@ -145,6 +145,23 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_name, on_links, parts_of)
 
 
+def taxels_of_all_links(loaded: Loaded) -> Layout:
+    """Return where a document's layout puts taxels, on links that no sensor has too.
+
+    Raises:
+        SpecError: All mistakes found so far, those of reading included.
+        RobotError: If a model file cannot be read.
+    """
+    robot, _ = _models(loaded)
+    patches: list[Patch] = []
+    if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
+        _check_groups(loaded.layout, robot, loaded.problems)
+        patches = _patches(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
+    loaded.raise_problems()
+    assert robot is not None and loaded.layout is not None
+    return _sampled(loaded, loaded.layout, robot, patches, silent)
+
+
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
     """Load the robot, and the scene if there is one; a file that does not exist is a mistake of the document."""
     wanted = loaded.spec.robot.model
@@ -319,7 +336,7 @@ def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[P
     for i, patch in enumerate(patches):
         progress(f"placing taxels on {patch.link.name} ({i + 1} of {len(patches)} links)")
         try:
-            parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder))
+            parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder, patch.link.name))
         except SampleError as error:
             what = f'link "{patch.link.name}": {error.what}'
             loaded.problems.append(layout.problem(patch.path, what, error.hint))

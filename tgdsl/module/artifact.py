@@ -4,26 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from pathlib import Path
 
-import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as serialized
 
 from tgdsl.errors import ArtifactError, TgdslError
-from tgdsl.files.write import atomic_write
 from tgdsl.module.module import TactileModule
+from tgdsl.module.plan_file import METADATA_KEY as METADATA_KEY
+from tgdsl.module.plan_file import load_plan, save_plan
+from tgdsl.module.taxels.identity import Taxels, check_taxels
 from tgdsl.plan import ranges
-from tgdsl.plan.plan import Plan
-from tgdsl.quantities.base import Quantity
-from tgdsl.quantities.known import QUANTITIES
-from tgdsl.scene.asset_paths import check_scene
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import kinds_by_sensor, known_kinds, quantities_of
 from tgdsl.tensors.devices import device_of, dtype_of
-
-METADATA_KEY = "tgdsl"
 
 
 def save(touch: TactileModule, path: str | PathLike[str]) -> int:
@@ -49,6 +41,7 @@ def load(
     kinds: Sequence[Kind] = (),
     dtype: torch.dtype | str = torch.float32,
     device: torch.device | str = "cpu",
+    taxels: Taxels | None = None,
 ) -> TactileModule:
     """Return the module of an artefact. Neither MuJoCo nor any file that it was compiled from is needed.
 
@@ -57,9 +50,11 @@ def load(
         kinds: Sensor kinds of your own, if it was compiled with any that no installed package brings.
         dtype: Dtype of the readings, float32 or float64, as for `compile`; its name will do.
         device: Where the module lives.
+        taxels: The taxels that are expected, such as those that a policy learned with: see `identity.check_taxels`.
 
     Raises:
         ArtifactError: If the file is not an artefact, is damaged, is of another version, or holds indices of what is not there.
+        TaxelError: If it has other taxels than expected, or in another order: it says how they differ.
         TgdslError: If it uses a kind that is neither installed nor given, or there is no such dtype or device.
     """
     dtype, device = dtype_of(dtype), device_of(device)
@@ -72,40 +67,7 @@ def load(
             ranges.check_constants(f"sensors/{sensor.name}", sensor.constants, counts)
     except ArtifactError as error:
         raise ArtifactError(f"{path}: {error}") from error
-    return TactileModule(plan, known, dtype).to(device)
-
-
-def save_plan(plan: Plan, path: str | PathLike[str]) -> int:
-    """Write a plan, as `save` does; return the bytes written."""
-    content = serialized({name: np.asarray(value) for name, value in plan.arrays.items()}, {METADATA_KEY: plan.to_json()})
-    atomic_write(Path(path), content)
-    return len(content)
-
-
-def load_plan(path: str | PathLike[str], quantities: Sequence[Quantity] = QUANTITIES) -> Plan:
-    """Read a plan. Only the artefact itself is opened: no file that it names.
-
-    Args:
-        path: The artefact.
-        quantities: The quantities that it may ask for.
-
-    Raises:
-        ArtifactError: If the file is not an artefact, is damaged, is of another version, or names files in places where those
-            of an artefact cannot be.
-    """
-    try:
-        with safe_open(str(path), framework="numpy") as file:
-            metadata = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
-    except (SafetensorError, OSError) as error:
-        raise ArtifactError(f"{path}: cannot read this artefact: {error}") from error
-    if METADATA_KEY not in metadata:
-        raise ArtifactError(f"{path}: this safetensors file was not written by tgdsl")
-    for array in arrays.values():
-        array.flags.writeable = False
-    try:
-        plan = Plan.from_json(metadata[METADATA_KEY], arrays, quantities)
-        check_scene(plan.scene)
-        return plan
-    except ArtifactError as error:
-        raise ArtifactError(f"{path}: {error}") from error
+    touch = TactileModule(plan, known, dtype)
+    if taxels is not None:
+        check_taxels(touch, taxels, str(path))
+    return touch.to(device)

@@ -86,7 +86,8 @@ def operations_per_env(touch: Explained) -> int:
 def explain(touch: Explained) -> str:
     """Return the account as text."""
     plan = touch.plan
-    lines = [f"{plan.origin.robot}{plan.origin.at_resolution}, {plan.layout.num_taxels} taxels", ""]
+    lines = [f"{plan.origin.robot}{plan.origin.at_resolution}, {plan.layout.num_taxels} taxels"]
+    lines += [f"taxels_id {plan.taxels_id}", ""] if plan.layout.num_taxels else [""]
     lines += _links(touch) + [""]
     lines += ["sensors"]
     lines += [f"  {line}" for sensor in plan.sensors for line in _sensor(touch, sensor)]

@@ -23,12 +23,13 @@ from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
 from tgdsl.module.memory.history import reduced
-from tgdsl.module.memory.memory import KEPT, WINDOW, Memory, chosen_only, store
+from tgdsl.module.memory.memory import KEPT, WINDOW, Memory, chosen_only, kept, store
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
 from tgdsl.module.sensing import Sensing, sense
 from tgdsl.module.state import SceneState
-from tgdsl.module.taxels import images_of, row_tables, taxel_table
+from tgdsl.module.taxels.identity import SavedTaxels
+from tgdsl.module.taxels.tables import images_of, row_tables, taxel_table
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.plan import Plan
 from tgdsl.sensors import KINDS, Kind
@@ -64,6 +65,7 @@ class TactileModule(HookedModule):
         """
         super().__init__()
         self.plan = plan
+        self.saved_taxels = SavedTaxels(plan)
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
@@ -98,6 +100,11 @@ class TactileModule(HookedModule):
         """The taxels of each sensor, in the order of its readings, as tables: see `taxels.taxel_table`."""
         own = [sensor for sensor in self.plan.sensors if len(sensor.taxels)]
         return TaxelTables({sensor.sensor: taxel_table(self.plan.layout_of(sensor)) for sensor in own})
+
+    @property
+    def taxels_id(self) -> str:
+        """A hash of all taxels, to the last bit; `identity.check_taxels` compares those of modules, artefacts and rollouts."""
+        return self.plan.taxels_id
 
     @property
     def rows(self) -> dict[str, TaxelTable]:
@@ -211,7 +218,7 @@ class TactileModule(HookedModule):
     def advance(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and put the new state in the place of the old one."""
         readings, updated = self._read(tensors, memory)
-        store(memory, updated | _kept(readings, memory))
+        store(memory, updated | kept(readings, memory))
         return readings
 
     def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -226,7 +233,7 @@ class TactileModule(HookedModule):
                 readings[name] = made.transpose(-2, -1)
             elif f"{WINDOW}{name}" in memory:
                 readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
-        store(memory, updated | _kept(readings, memory))
+        store(memory, updated | kept(readings, memory))
         return readings
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -389,11 +396,5 @@ class TactileModule(HookedModule):
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
         """Have state that is loaded before the first call where the module is."""
-        home = torch.empty(0, dtype=self.dtype, device=self.device)
-        self.memory.home = self.memory.clock.home = home
+        self.memory.home = self.memory.clock.home = torch.empty(0, dtype=self.dtype, device=self.device)
         load()
-
-
-def _kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return what is kept of readings that are handed out, if anything is."""
-    return {f"{KEPT}{name}": made.transpose(-2, -1) for name, made in readings.items() if f"{KEPT}{name}" in memory}

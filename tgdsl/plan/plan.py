@@ -18,6 +18,7 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from tgdsl.errors import ArtifactError
+from tgdsl.layout.identity import taxels_id
 from tgdsl.layout.layout import Layout
 from tgdsl.plan import ranges, tree
 from tgdsl.plan.inputs import Inputs
@@ -83,6 +84,11 @@ class Plan:
         arrays = tree.flatten(self._parts())[1]
         return {name: arrays[name] for name in sorted(arrays)}
 
+    @cached_property
+    def taxels_id(self) -> str:
+        """A hash of all taxels, to the last bit: see `layout.identity`."""
+        return taxels_id(self.layout)
+
     def layout_of(self, sensor: PlannedSensor) -> Layout:
         """Return the taxels of one sensor; of one that has none, its links."""
         if not len(sensor.taxels):
@@ -100,7 +106,7 @@ class Plan:
 
     def to_json(self) -> str:
         """Return everything but the arrays, of which only names and a hash, with sorted keys."""
-        plain = tree.flatten(self._parts())[0] | {"format": FORMAT, "arrays": _digest(self.arrays)}
+        plain = tree.flatten(self._parts())[0] | {"format": FORMAT, "arrays": _digest(self.arrays), "taxels_id": self.taxels_id}
         return json.dumps(plain, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
 
     @staticmethod
@@ -119,7 +125,7 @@ class Plan:
         try:
             plain = json.loads(text)
             version = plain.pop("format", None)
-            digest = plain.pop("arrays", None)
+            digest, identity = plain.pop("arrays", None), plain.pop("taxels_id", None)
         except (ValueError, TypeError, AttributeError) as error:
             raise ArtifactError(f"not a plan: {error}") from error
         if version != FORMAT:
@@ -137,6 +143,8 @@ class Plan:
         if digest != _digest(arrays):
             raise ArtifactError("the arrays are not those that the plan was written with")
         ranges.check(plan)
+        if identity != plan.taxels_id:
+            raise ArtifactError("the taxels are not those that the plan was written with")
         return plan
 
     def _parts(self) -> dict[str, Any]:

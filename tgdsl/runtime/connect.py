@@ -7,6 +7,7 @@ from typing import Any
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module.module import TactileModule
+from tgdsl.module.taxels.identity import Taxels, check_taxels
 from tgdsl.runtime.connection import Connection as Connection
 from tgdsl.runtime.known import known_sources
 from tgdsl.runtime.source_kind import SourceKind
@@ -30,6 +31,7 @@ def connect(
     addresses: Addresses | None = None,
     timing: SerialTiming | None = None,
     lockstep: bool = False,
+    taxels: Taxels | None = None,
     **own: Any,
 ) -> Connection:
     """Connect a module to what it shall feel.
@@ -49,10 +51,13 @@ def connect(
         timing: Times of the line. Where replies may take long, a step waits for a reading as long as two of them.
         lockstep: Nothing runs in real time: the emulator's scene moves when stepped, a log is read as fast as possible. A
             simulation is always so, a real hand never.
+        taxels: The taxels that the module shall have, such as those that a policy learned with: another module, its tables, an
+            artefact, a rollout or an id, see `module.taxels.identity.check_taxels`.
         **own: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
             where a source has no use for them, so that one script serves all.
 
     Raises:
+        TaxelError: If the module has other taxels than expected, or in another order. Nothing was opened then.
         ObservationError: If the source cannot give what the module observes. No hand was touched then.
         SpecError: If the calibration file has mistakes.
         SimulationError: If the scene cannot be stepped like this.
@@ -61,6 +66,8 @@ def connect(
     """
     name = str(source)
     kind = _kind_of(name)
+    if taxels is not None:
+        check_taxels(touch, taxels)
     if num_envs != 1 and "num_envs" not in kind.options:
         raise TgdslError(f'num_envs is {num_envs}, but "{name}" is one environment')
     shared: dict[str, Any] = {"num_envs": num_envs, "control_step": control_step, "keyframe": keyframe, "motion": motion}

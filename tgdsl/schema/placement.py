@@ -22,6 +22,7 @@ from tgdsl.fields.regions import Region
 
 MAX_COUNT = 1_000_000
 Count = Annotated[StrictInt, Field(ge=1, le=MAX_COUNT)]
+Cell = Annotated[StrictInt, Field(ge=0, lt=MAX_COUNT)]
 
 
 class _Sampled(SpecModel):
@@ -89,15 +90,30 @@ class Point(SpecModel):
     """Sensing radius [m]; default: the `radius` of the list."""
     area: Annotated[Area | None, Usual("area", high=0.01)] = None
     """Surface that the probe stands for [m²]; default: the disc of its radius."""
+    tangent: Direction | None = None
+    """Direction of shear x in the link frame, across the normal; default: the first of the z, y, x axes that is not near it."""
+    row: Cell | None = None
+    """Row in the grid of the link's taxels, for images; default: it is on no grid."""
+    column: Cell | None = None
+    """Column in that grid."""
+
+    @model_validator(mode="after")
+    def _whole_cell(self) -> Point:
+        if (self.row is None) != (self.column is None):
+            raise ValueError("expected both `row` and `column`, or neither")
+        return self
 
 
 class Points(SpecModel):
-    """Probes given one by one, or in a CSV file with the header `x,y,z,nx,ny,nz` and optionally `radius` and `area`."""
+    """Probes given one by one, or in a CSV file with the header `x,y,z,nx,ny,nz`.
+
+    Further columns as needed: `radius`, `area`, the tangent `tx,ty,tz`, the cell `row,column`, and `link` in a file of several.
+    """
 
     method: Literal["points"]
     """Explicit probes."""
     points: Annotated[Text | Annotated[tuple[Point, ...], Field(min_length=1), Tag("other")], TEXT_OR_OTHER]
-    """The probes, or the name of a CSV file beside the layout (SI units)."""
+    """The probes, or the name of a CSV file beside the layout (SI units), of which a link takes its own rows."""
     radius: Annotated[Radius | None, Usual("length", low=1e-5, high=0.1)] = None
     """Sensing radius of the points that name none [m]."""
 

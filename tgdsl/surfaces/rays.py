@@ -167,16 +167,16 @@ def _pairs(
     near = np.flatnonzero(((face_low <= high) & (face_high >= low)).all(axis=1))
     first, last = squares(face_low[near]), squares(face_high[near])
     # Squares of one u are contiguous, so that each (face, u) pair is one slice of the sorted rays.
-    which, u = _expanded(last[:, 0] - first[:, 0] + 1)
+    which, u = expanded(last[:, 0] - first[:, 0] + 1)
     row = (first[which, 0] + u) * side
     begin, end = starts[row + first[which, 1]], starts[row + last[which, 1] + 1]
     chunk = np.cumsum(end - begin) // _PAIRS
     for start, stop in zip(*_runs(chunk), strict=True):
-        part, step = _expanded((end - begin)[start:stop])
+        part, step = expanded((end - begin)[start:stop])
         yield near[which[start:stop][part]], order[begin[start:stop][part] + step]
 
 
-def _expanded(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+def expanded(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Return each index i `counts[i]` times, and the running number within it."""
     which = np.repeat(np.arange(len(counts)), counts)
     return which, np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)

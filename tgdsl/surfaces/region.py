@@ -17,10 +17,10 @@ from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import Facing, InBox, InSphere, OnGeoms, RegionPart
 from tgdsl.surfaces.surface import Surface
 
-LENGTH_TOLERANCE = 1e-7
+LENGTH_TOLERANCE = 1e-6
 """Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
-ANGLE_TOLERANCE = 1e-9
-"""The same for angles [rad]."""
+ANGLE_TOLERANCE = 1e-4
+"""The same for the normals of faces a millimetre wide [rad]: a chamfer of 45° is within 45°, however its corners round."""
 
 
 @dataclass(frozen=True, eq=False)

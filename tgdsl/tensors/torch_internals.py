@@ -5,7 +5,7 @@ Nothing else in tgdsl touches a name of torch that begins with an underscore (`t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -44,6 +44,9 @@ class HookedModule(nn.Module):
         """
         load()
 
+    def on_load_metadata(self, metadata: Mapping[str, Any]) -> None:
+        """Look at what `state_dict` noted of this module beside its tensors, before these are loaded; here, do nothing."""
+
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> HookedModule:
         self.on_move(fn, lambda: super(HookedModule, self)._apply(fn, recurse))
         return self
@@ -52,6 +55,7 @@ class HookedModule(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, metadata: dict[str, Any], strict: bool, *messages: list[str]
     ) -> None:
         missing, unexpected, errors = messages
+        self.on_load_metadata(metadata)
         arguments = state_dict, prefix, metadata, strict, missing, unexpected, errors
         self.on_load(state_dict, prefix, errors, lambda: super(HookedModule, self)._load_from_state_dict(*arguments))
 

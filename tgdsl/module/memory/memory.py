@@ -192,6 +192,11 @@ def store(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor]) -> None:
                 memory[name].copy_(value.detach())
 
 
+def kept(readings: Mapping[str, Tensor], memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return what is kept of readings that are handed out, if anything is."""
+    return {f"{KEPT}{name}": made.transpose(-2, -1) for name, made in readings.items() if f"{KEPT}{name}" in memory}
+
+
 def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
     """Return new state of the environments of a mask, and the old one of all others."""
     chosen = {}

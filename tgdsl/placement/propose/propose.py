@@ -43,12 +43,14 @@ class LinkSurface:
     Attributes:
         area: Its whole surface [m²].
         centroid: Its centre [m].
-        normals: Outward unit normals of points that stand for equal areas.
+        normals: Outward unit normals of points.
+        shares: Share of the surface that each point stands for.
     """
 
     area: float
     centroid: Float[np.ndarray, " 3"]
     normals: Float[np.ndarray, "point 3"]
+    shares: Float[np.ndarray, " point"]
 
 
 @dataclass(frozen=True)
@@ -164,19 +166,22 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
 def _link_surface(robot: Model, body: str) -> LinkSurface | None:
     surface = robot.surface(robot.touchable(body))
     if not surface.face_areas.sum() > MIN_AREA:
-        return LinkSurface(0.0, np.zeros(3), np.zeros((0, 3)))
+        return LinkSurface(0.0, np.zeros(3), np.zeros((0, 3)), np.zeros(0))
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
         raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
     pool = poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
-    return None if pool is None else LinkSurface(pool.area, pool.pos.mean(axis=0), pool.normal)
+    if pool is None:
+        return None
+    shares = pool.point_area / pool.area
+    return LinkSurface(pool.area, shares @ pool.pos, pool.normal, shares)
 
 
 def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
     share = 1.0
     if facing is not None:
-        share = float(_faces(surface.normals, facing).mean())
+        share = float(surface.shares[_faces(surface.normals, facing)].sum())
         if share < MIN_SHARE:
             share, facing = 1.0, None
     area = share * surface.area

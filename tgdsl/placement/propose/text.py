@@ -99,7 +99,7 @@ def _left_out(proposal: Proposal) -> list[str]:
     """Return the bodies without taxels, one line per reason."""
     reasons = dict.fromkeys(why for _, why in proposal.left_out)
     names = {reason: [quoted(name) for name, why in proposal.left_out if why == reason] for reason in reasons}
-    return [f"{', '.join(names[reason])}: {_one_line(reason)}" for reason in reasons]
+    return [f"{', '.join(names[reason])}: {one_line(reason)}" for reason in reasons]
 
 
 def _groups_text(proposal: Proposal) -> str:
@@ -144,7 +144,8 @@ def quoted(name: str) -> str:
     return "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in text)
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
+    """Return a text as a comment can hold it: on one line, of printable characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 

@@ -1,50 +1,95 @@
-"""Taxels given by hand: points in the layout, or in a CSV file beside it."""
+"""Taxels given by hand: points in the layout, or in a CSV file beside it, of one link or of several.
+
+Shapes: `point` the points of one link.
+"""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from tgdsl.errors import SampleError, did_you_mean
-from tgdsl.schema.placement import Points
+from tgdsl.schema.placement import MAX_COUNT, Point, Points
 
-_COLUMNS = ("x", "y", "z", "nx", "ny", "nz")
-_OPTIONAL = ("radius", "area")
+REQUIRED = ("x", "y", "z", "nx", "ny", "nz")
+TANGENT = ("tx", "ty", "tz")
+CELL = ("row", "column")
+OPTIONAL = ("radius", "area", *TANGENT, *CELL, "link")
 
 
-def point_table(placement: Points, folder: Path) -> Float[np.ndarray, "point 8"]:
-    """Return x, y, z, nx, ny, nz, radius and area of each point, as given; an area that is not given is NaN.
+@dataclass(frozen=True, eq=False)
+class PointTable:
+    """Points of a link as given, in its body's frame.
+
+    Attributes:
+        pos: Position [m].
+        normal: Outward normal, of any length.
+        tangent: Tangent, of any length and across the normal only roughly; NaN where none is given.
+        radius: Sensing radius [m].
+        area: Surface that the point stands for [m²]; NaN where none is given.
+        cell: Row and column in the link's grid; −1 where there is none.
+    """
+
+    pos: Float[np.ndarray, "point 3"]
+    normal: Float[np.ndarray, "point 3"]
+    tangent: Float[np.ndarray, "point 3"]
+    radius: Float[np.ndarray, " point"]
+    area: Float[np.ndarray, " point"]
+    cell: Int[np.ndarray, "point 2"]
+
+
+def point_table(placement: Points, folder: Path, link: str = "") -> PointTable:
+    """Return the points of a link.
 
     Args:
         placement: The points, or their file.
         folder: Where the file is looked up.
+        link: Name of the link, if the file has a column of links.
 
     Raises:
-        SampleError: If the file cannot be read as points.
+        SampleError: If the file cannot be read as points or has none of the link, a tangent is along its normal, or two points
+            have one cell.
     """
     if isinstance(placement.points, str):
-        rows = list(_read(folder, placement.points, placement.radius))
-        if not rows:
-            raise SampleError(f"{placement.points} has no points")
+        placed = list(_read(folder, placement.points, link))
     else:
-        rows = [
-            (
-                *point.pos,
-                *point.normal,
-                placement.radius if point.radius is None else point.radius,  # the schema sees to it that one is there
-                np.nan if point.area is None else point.area,
-            )
-            for point in placement.points
-        ]
-    return np.array(rows, dtype=np.float64)
+        placed = [(f"points[{i}]", _values(point)) for i, point in enumerate(placement.points)]
+    for place, values in placed:
+        _check(place, values, placement.radius)
+    rows = [values for _, values in placed]
+    table = PointTable(
+        pos=_columns(rows, REQUIRED[:3]),
+        normal=_columns(rows, REQUIRED[3:]),
+        tangent=_columns(rows, TANGENT),
+        radius=_columns(rows, ("radius",), placement.radius)[:, 0],
+        area=_columns(rows, ("area",))[:, 0],
+        cell=_columns(rows, CELL, -1.0).astype(np.int64),
+    )
+    _check_cells([place for place, _ in placed], table.cell)
+    return table
 
 
-def _read(folder: Path, name: str, default_radius: float | None) -> Iterator[tuple[float, ...]]:
-    """Yield x, y, z, nx, ny, nz, radius and area of each row of a CSV file; an area that is not given is NaN."""
+def _columns(rows: Sequence[Mapping[str, float]], names: Sequence[str], default: float | None = None) -> np.ndarray:
+    default = np.nan if default is None else default
+    return np.array([[row.get(name, default) for name in names] for row in rows], dtype=np.float64)
+
+
+def _values(point: Point) -> dict[str, float]:
+    """Return what a point in a layout gives, by the names of a file's columns."""
+    values = dict(zip(REQUIRED, (*point.pos, *point.normal), strict=True))
+    if point.tangent is not None:
+        values |= dict(zip(TANGENT, point.tangent, strict=True))
+    others = {"radius": point.radius, "area": point.area, "row": point.row, "column": point.column}
+    return values | {name: value for name, value in others.items() if value is not None}
+
+
+def _read(folder: Path, name: str, link: str) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the place and the numbers of each row of a CSV file that is a link's; empty cells have none."""
     try:
         text = (folder / name).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -53,27 +98,64 @@ def _read(folder: Path, name: str, default_radius: float | None) -> Iterator[tup
     reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
     header = [column.strip() for column in reader.fieldnames or ()]
     reader.fieldnames = header
-    for column in header:
-        if column not in _COLUMNS + _OPTIONAL:
-            raise SampleError(f'{name}:1: unknown column "{column}"', did_you_mean(column, _COLUMNS + _OPTIONAL))
-    missing = [column for column in _COLUMNS if column not in header]
-    if missing:
-        raise SampleError(f"{name}:1: no column {', '.join(missing)}", f"expected the header {','.join(_COLUMNS)}")
+    _check_header(name, header)
+    links: dict[str, None] = {}
     for row in reader:
         place = f"{name}:{reader.line_num}"
         if None in row:
             raise SampleError(f"{place}: more values than the header has columns")
+        if "link" in header:
+            own = (row.pop("link") or "").strip()
+            links[own] = None
+            if own != link:
+                continue
         values = {column: _number(place, column, text) for column, text in row.items() if (text or "").strip()}
-        radius = values.get("radius", default_radius)
-        if radius is None:
-            hint = "add a column `radius`, or give one `radius` for the whole file"
-            raise SampleError(f"{place}: the point has no radius", hint)
-        for column in _COLUMNS:
+        for column in REQUIRED:
             if column not in values:
                 raise SampleError(f"{place}: {column} is empty, expected a number")
-        if not any(values[column] for column in _COLUMNS[3:]):
-            raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
-        yield *(values[column] for column in _COLUMNS), radius, values.get("area", np.nan)
+        yield place, values
+    if "link" in header and link not in links:
+        raise SampleError(f'{name} has no points of the link "{link}"', did_you_mean(link, links, "links"))
+    if "link" not in header and reader.line_num <= 1:
+        raise SampleError(f"{name} has no points")
+
+
+def _check_header(name: str, header: Sequence[str]) -> None:
+    """Raise a `SampleError` unless a file's columns are known, each there once, and all that there must be."""
+    for i, column in enumerate(header):
+        if column not in REQUIRED + OPTIONAL:
+            raise SampleError(f'{name}:1: unknown column "{column}"', did_you_mean(column, REQUIRED + OPTIONAL))
+        if column in header[:i]:
+            raise SampleError(f'{name}:1: column "{column}" is there twice')
+    missing = [column for column in REQUIRED if column not in header]
+    if missing:
+        raise SampleError(f"{name}:1: no column {', '.join(missing)}", f"expected the header {','.join(REQUIRED)}")
+
+
+def _check(place: str, values: Mapping[str, float], radius: float | None) -> None:
+    """Raise a `SampleError` unless a point has a radius and directions, and all of a tangent or a cell if any."""
+    if values.get("radius", radius) is None:
+        hint = "add a column `radius`, or give one `radius` for the whole file"
+        raise SampleError(f"{place}: the point has no radius", hint)
+    if not any(values[column] for column in REQUIRED[3:]):
+        raise SampleError(f"{place}: normal [0, 0, 0] has no direction", "expected a vector of non-zero length")
+    for whole in (TANGENT, CELL):
+        given = [column for column in whole if column in values]
+        if given and len(given) < len(whole):
+            raise SampleError(f"{place}: {', '.join(given)} without the others of {', '.join(whole)}", "give all or none")
+    if TANGENT[0] in values:
+        normal, tangent = (np.array([values[column] for column in columns]) for columns in (REQUIRED[3:], TANGENT))
+        normal, tangent = normal / np.abs(normal).max(), tangent / max(np.abs(tangent).max(), np.finfo(float).tiny)
+        if np.linalg.norm(np.cross(normal, tangent)) < 1e-3:
+            raise SampleError(f"{place}: the tangent is along the normal", "expected a direction across it")
+
+
+def _check_cells(places: Sequence[str], cell: Int[np.ndarray, "point 2"]) -> None:
+    """Raise a `SampleError` if two points have one cell."""
+    first: dict[tuple[int, ...], str] = {}
+    for place, own in zip(places, map(tuple, cell.tolist()), strict=True):
+        if min(own) >= 0 and (other := first.setdefault(own, place)) != place:
+            raise SampleError(f"{place}: row {own[0]}, column {own[1]} is that of {other} too", "one point for each cell")
 
 
 def _number(place: str, column: str, text: str) -> float:
@@ -86,4 +168,6 @@ def _number(place: str, column: str, text: str) -> float:
     if (column == "radius" and value < 0) or (column == "area" and value <= 0):
         bound = "at least 0" if column == "radius" else "more than 0"
         raise SampleError(f"{place}: {column} {value:g} is out of range, expected {bound}")
+    if column in CELL and (value != int(value) or not 0 <= value < MAX_COUNT):
+        raise SampleError(f'{place}: {column} is "{text.strip()}", expected a whole number from 0 to {MAX_COUNT - 1}')
     return value

@@ -4,42 +4,52 @@ A point is on the outer surface if it is in no solid component (by winding numbe
 may be joined to the outside by a pinhole.
 
 Samplers of pymeshlab and libigl are unseeded and have no exact count (libigl's blue noise of one radius on one sphere: 84 to
-92 points), trimesh's rejects points within a radius; none knows a region. So the pool is drawn by NumPy: seeded, area-weighted
-and stratified over the faces. An exact count is chosen from the pool by weighted sample elimination (Yuksel, "Sample
-Elimination for Generating Poisson Disk Sample Sets", Computer Graphics Forum 34(2), 2015), a spacing by dart throwing.
-Distances are straight lines, not paths along the surface.
+92 points), trimesh's rejects points within a radius; none knows a region, and all follow the mesh's order of faces. So the pool
+is drawn on lines that are fixed in space (`lattice`), each with a priority of its own, and points are taken from it by dart
+throwing in the order of their priorities: at one spacing, or, for an exact count, at spacings that fall along a fixed series
+until there are enough. Hence a mesh whose vertices are off by rounding gives the same samples: a decision changes only where a
+distance equals a spacing to within the rounding, and then one or two neighbours change with it. Sample elimination (Yuksel
+2015) compares sums of eighth powers of distances: thirty times as many of its choices change. Distances are straight lines, not
+paths along the surface.
 
-Shapes: `piece` triangles cut from faces, `pool` points of the pool, `n` points of it, `taxel` the points chosen.
-Everything is in the body frame.
+Shapes: `piece` triangles cut from faces, `hit` points drawn, `pool` points of the pool, `n` some points, `taxel` the points
+chosen. Everything is in the body frame.
 """
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from tgdsl.placement.sample import lattice
 from tgdsl.surfaces.meshlab import Shell
 from tgdsl.surfaces.rays import OrthographicView, first_hits, frame
 from tgdsl.surfaces.region import Region
 from tgdsl.surfaces.surface import Surface
 
-CANDIDATES = 10
-"""Points per sample from which an exact count is chosen."""
+CANDIDATES = 20
+"""Least number of points per sample from which an exact count is chosen."""
 DIRECTIONS = 100
 """Directions from which points are looked at: what none of them sees is a pocket that nothing outside can touch."""
 PER_SAMPLE = 50
 """Points per sample by which the area of each sample is measured; also the density of the pool for a spacing."""
 MIN_POOL, MAX_POOL = 10_000, 400_000
 """Bounds of the number of points in a pool; more are drawn only where an exact count needs them."""
+MANY = 30
+"""Points by which the area of a piece is known well enough to set it right for this piece alone."""
+FIRST_SPACING, SPACING_RATIO = 0.81, 0.99
+"""Of an exact count: the largest first spacing, relative to the hexagonal packing's, at which nearly all samples fit; and each
+next one relative to the one before."""
+ORDER = np.sqrt([0.2, 0.3, 0.5])
+"""Samples are numbered along this direction, in the body frame: two change places only if they are equally far along it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Dense points on the outer surface in a region, each standing for the same area.
+    """Dense points on the outer surface in a region, in the order of their priorities.
 
     Attributes:
         pos: Position in the body frame [m].
@@ -49,12 +59,12 @@ class Pool:
 
     pos: Float[np.ndarray, "pool 3"]
     normal: Float[np.ndarray, "pool 3"]
-    point_area: float
+    point_area: Float[np.ndarray, " pool"]
 
     @property
     def area(self) -> float:
         """Area of the surface that the pool covers [m²]."""
-        return self.point_area * len(self.pos)
+        return float(self.point_area.sum())
 
 
 def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: float | None) -> Pool | None:
@@ -70,15 +80,17 @@ def pool(shell: Shell, region: Region, seed: int, count: int | None, spacing: fl
         spacing: Least distance of samples [m], if there is no count.
     """
     face, corners = _pieces(shell.surface, region)
+    area = float(_areas(corners).sum())
     limit = 4 * max(MAX_POOL, CANDIDATES * (count or 0))
-    num, drawn = int(_wanted(0.0, count, spacing)), None
+    point_area, drawn = area / _wanted(0.0, count, spacing), None
     while len(face):
-        drawn = _drawn(shell, region, face, corners, num, seed)
+        num = area / point_area
+        drawn = _drawn(shell, region, face, corners, lattice.pitch_below(np.sqrt(point_area)), seed)
         found, wanted = len(drawn.pos), _wanted(drawn.area, count, spacing)
-        is_hopeless = num == limit or (count is None and wanted > MAX_POOL) or (not found and num >= 10 * MIN_POOL)
+        is_hopeless = num >= limit or (count is None and wanted > MAX_POOL) or (not found and num >= 10 * MIN_POOL)
         if found > 0.7 * wanted or is_hopeless:
             break
-        num = min(int(wanted * num / found) + 1 if found > 100 else 10 * num, limit)
+        point_area = max(point_area * (found / wanted if found > 100 else 0.1), area / limit)
     return drawn if drawn is not None and len(drawn.pos) else None
 
 
@@ -110,22 +122,29 @@ def _drawn(
     region: Region,
     face: Int[np.ndarray, " piece"],
     corners: Float[np.ndarray, "piece 3 3"],
-    num: int,
+    pitch: float,
     seed: int,
 ) -> Pool:
-    """Draw stratified points over pieces of faces; keep those in the region and on the outer surface."""
-    rng = np.random.default_rng(seed)
-    area = np.cumsum(_areas(corners))
-    # One point in each of equal stretches of the cumulated area: never a bare patch, never a heap.
-    drawn = np.searchsorted(area, (np.arange(num) + rng.random(num)) / num * area[-1])
-    piece = np.minimum(drawn, len(face) - 1)
-    root, share = np.sqrt(rng.random(num)), rng.random(num)
-    weight = np.stack([1.0 - root, root * (1.0 - share), root * share], axis=-1)
-    pos, face = np.einsum("nk,nkx->nx", weight, corners[piece]), face[piece]
+    """Draw points of pieces of faces on a lattice of some pitch [m]; keep those in the region and on the outer surface."""
+    drawn = lattice.hits(corners, pitch, seed)
+    pos, face = drawn.pos, face[drawn.piece]
+    point_area = _exact(drawn, _areas(corners))
     is_kept = region.has_points(pos)
-    pos, face = pos[is_kept], face[is_kept]
-    is_kept = _on_outer_surface(shell, region, pos, face)
-    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], float(area[-1]) / num)
+    is_kept[is_kept] = _on_outer_surface(shell, region, pos[is_kept], face[is_kept])
+    return Pool(pos[is_kept], shell.surface.face_normals[face[is_kept]], point_area[is_kept])
+
+
+def _exact(drawn: lattice.Hits, area: Float[np.ndarray, " piece"]) -> Float[np.ndarray, " hit"]:
+    """Return what points stand for so that it adds up to the areas of pieces, which a lattice knows to some percent only [m²].
+
+    Each piece with `MANY` points for itself, the others together.
+    """
+    num = np.bincount(drawn.piece, minlength=len(area))
+    owner = np.where(num >= MANY, np.arange(len(area)), len(area))
+    found = np.bincount(owner[drawn.piece], drawn.area, minlength=len(area) + 1)
+    wanted = np.bincount(owner, area, minlength=len(area) + 1)
+    exact = drawn.area * (wanted / np.where(found > 0, found, 1.0))[owner[drawn.piece]]
+    return exact * (area.sum() / exact.sum()) if len(exact) else exact
 
 
 def _on_outer_surface(
@@ -169,54 +188,42 @@ def _visible(shell: Shell, above: Float[np.ndarray, "n 3"], normal: Float[np.nda
     return is_visible
 
 
-def choose(pool: Pool, count: int | None, spacing: float | None, seed: int) -> Int[np.ndarray, " taxel"]:
-    """Return the chosen points of a pool, ascending: exactly `count`, or as many as fit at `spacing` [m]."""
-    order = np.random.default_rng([seed, 1]).permutation(len(pool.pos))
+def choose(pool: Pool, count: int | None, spacing: float | None) -> Int[np.ndarray, " taxel"]:
+    """Return the chosen points of a pool along `ORDER`: exactly `count`, or as many as fit at `spacing` [m]."""
     if count is None:
         assert spacing is not None
-        return _dart_throwing(pool.pos, order, spacing)
-    candidates = np.sort(order[: CANDIDATES * count])
-    return candidates[_sample_elimination(pool.pos[candidates], count, pool.area)]
+        taken = _dart_throwing(pool.pos, (spacing,), len(pool.pos))
+    else:
+        hexagonal = np.sqrt(2.0 * pool.area / (np.sqrt(3.0) * count))
+        # The first is one of a fixed series too, 4 % apart: it shall not follow the last bits of an area.
+        first = 4.0 * np.ceil(np.log(FIRST_SPACING * hexagonal) / np.log(SPACING_RATIO) / 4.0)
+        least = np.log(1e-3) / np.log(SPACING_RATIO)
+        taken = _dart_throwing(pool.pos, tuple(SPACING_RATIO ** np.arange(first, first + least)), count)
+    return taken[np.argsort(pool.pos[taken] @ ORDER, kind="stable")]
 
 
-def _dart_throwing(pos: Float[np.ndarray, "pool 3"], order: Int[np.ndarray, " pool"], spacing: float) -> Int[np.ndarray, " n"]:
-    """Take points in some order; reject those within `spacing` of one taken before."""
+def _dart_throwing(pos: Float[np.ndarray, "pool 3"], spacings: tuple[float, ...], count: int) -> Int[np.ndarray, " taxel"]:
+    """Take points in order, those at least a spacing [m] away from all that were taken; then with the next smaller spacing.
+
+    At most `count` are taken; where fewer fit at the last of several spacings, the first of those left.
+    """
     tree = KDTree(pos)
-    is_free = np.ones(len(pos), dtype=bool)
-    taken = []
-    for point in order:
-        if is_free[point]:
-            taken.append(point)
-            is_free[tree.query_ball_point(pos[point], spacing)] = False
-    return np.sort(np.array(taken, dtype=np.int64))
-
-
-def _sample_elimination(pos: Float[np.ndarray, "n 3"], count: int, area: float) -> Int[np.ndarray, " count"]:
-    """Remove the most crowded point until `count` are left (Yuksel 2015, with its α = 8, β = 0.65, γ = 1.5)."""
-    reach = 2.0 * np.sqrt(area / (2.0 * np.sqrt(3.0) * count))
-    floor = reach * (1.0 - (count / len(pos)) ** 1.5) * 0.65
-    pairs = KDTree(pos).query_pairs(reach, output_type="ndarray")
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    distance = np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1)
-    weight = (1.0 - np.minimum(np.maximum(distance, floor), reach) / reach) ** 8
-    crowding = np.bincount(pairs[:, 0], weight, minlength=len(pos))
-    starts = np.searchsorted(pairs[:, 0], np.arange(len(pos) + 1))
-    heap = [(-crowding[point], point) for point in range(len(pos))]
-    heapq.heapify(heap)
-    is_left = np.ones(len(pos), dtype=bool)
-    for _ in range(len(pos) - count):
-        # Crowding only falls, so an outdated entry is too early in the queue: put it back where it belongs.
-        while -heap[0][0] != crowding[heap[0][1]]:
-            heapq.heapreplace(heap, (-crowding[heap[0][1]], heap[0][1]))
-        _, point = heapq.heappop(heap)
-        is_left[point] = False
-        around = slice(starts[point], starts[point + 1])
-        crowding[pairs[around, 1]] -= weight[around]
-    return np.flatnonzero(is_left)
+    gap = np.full(len(pos), np.inf)  # to the nearest point taken, if that is within the first spacing
+    taken: list[int] = []
+    for spacing in spacings:
+        for point in np.flatnonzero(gap >= spacing).tolist():
+            if gap[point] >= spacing and len(taken) < count:
+                taken.append(point)
+                near = tree.query_ball_point(pos[point], spacings[0])
+                gap[near] = np.minimum(gap[near], np.linalg.norm(pos[near] - pos[point], axis=1))
+        if len(taken) == count:
+            break
+    if len(spacings) > 1:
+        taken += np.setdiff1d(np.arange(len(pos)), taken)[: count - len(taken)].tolist()
+    return np.array(taken, dtype=np.int64)
 
 
 def voronoi_areas(pool: Pool, chosen: Int[np.ndarray, " taxel"]) -> Float[np.ndarray, " taxel"]:
-    """Return the area of each chosen point's Voronoi cell on the surface, by counting the pool's points in it [m²]."""
+    """Return the area of each chosen point's Voronoi cell on the surface, by adding up the pool's points in it [m²]."""
     _, nearest = KDTree(pool.pos[chosen]).query(pool.pos)
-    return pool.point_area * np.bincount(nearest, minlength=len(chosen))
+    return np.bincount(nearest, pool.point_area, minlength=len(chosen))

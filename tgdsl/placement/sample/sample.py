@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 
 from tgdsl.errors import SampleError
 from tgdsl.placement.sample import poisson
-from tgdsl.placement.sample.points import point_table
-from tgdsl.schema.placement import Grid, Placement, Points, Poisson
+from tgdsl.placement.sample.points import PointTable, point_table
+from tgdsl.schema.placement import Grid, Placement, Poisson
 from tgdsl.surfaces import meshlab
 from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, reference_axes, visible_rectangle
 from tgdsl.surfaces.region import Region, unit
@@ -22,6 +22,8 @@ from tgdsl.surfaces.surface import Surface
 
 MIN_COSINE = 0.1
 """A grid cell on a steep face counts at most 1/0.1 times its projected area."""
+ROUNDED = 1e-14
+"""Largest rounding of a squared length, and of the cosine of a normal and a tangent that was projected across it."""
 MAX_DENSITY = poisson.MAX_POOL / poisson.PER_SAMPLE
 """Largest area per squared spacing: about 0.7 times as many samples fit, and the pool resolves no finer spacing."""
 
@@ -47,13 +49,14 @@ class Samples:
     cell: Int[np.ndarray, "taxel 2"]
 
 
-def sample(surface: Surface, placement: Placement, folder: Path) -> Samples:
+def sample(surface: Surface, placement: Placement, folder: Path, link: str = "") -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
 
     Args:
         surface: The link's triangles, in the body frame.
         placement: How to sample them.
         folder: Where a file of points is looked up.
+        link: The link's name, by which its points are found in a file of several links.
 
     Raises:
         SampleError: If the surface, or the file of points, cannot satisfy the placement.
@@ -62,7 +65,7 @@ def sample(surface: Surface, placement: Placement, folder: Path) -> Samples:
         return _grid(surface, placement)
     if isinstance(placement, Poisson):
         return _poisson(surface, placement)
-    return _points(placement, folder)
+    return _points(point_table(placement, folder, link))
 
 
 def _grid(surface: Surface, placement: Grid) -> Samples:
@@ -136,7 +139,7 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
 
 
 def _poisson(surface: Surface, placement: Poisson) -> Samples:
-    """Poisson-disk samples: an exact count by sample elimination, or as many as fit at a spacing by dart throwing."""
+    """Poisson-disk samples: an exact count, or as many as fit at a spacing."""
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
@@ -152,7 +155,7 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
         least = np.sqrt(pool.area / MAX_DENSITY)
         what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"
         raise SampleError(what, f"expected at least {least:.2g} m")
-    chosen = poisson.choose(pool, placement.count, placement.spacing, placement.seed)
+    chosen = poisson.choose(pool, placement.count, placement.spacing)
     normal = pool.normal[chosen]
     return Samples(
         pos=pool.pos[chosen],
@@ -164,19 +167,22 @@ def _poisson(surface: Surface, placement: Poisson) -> Samples:
     )
 
 
-def _points(placement: Points, folder: Path) -> Samples:
-    """Take points as they are: nothing is projected."""
-    table = point_table(placement, folder)
-    pos, radius, area = table[:, :3], table[:, 6], table[:, 7]
-    normal = unit(table[:, 3:6])
-    return Samples(
-        pos=pos.copy(),
-        normal=normal,
-        tangent=_tangent(normal, reference_axes(normal)),
-        radius=radius.copy(),
-        area=np.where(np.isnan(area), np.pi * radius**2, area),
-        cell=np.full((len(table), 2), -1),
-    )
+def _points(table: PointTable) -> Samples:
+    """Take points as they are: nothing is projected, and what is unit and perpendicular already keeps its bits."""
+    normal = _kept_unit(table.normal)
+    tangent = _tangent(normal, reference_axes(normal))
+    given = np.flatnonzero(~np.isnan(table.tangent[:, 0]))
+    along = _kept_unit(table.tangent[given])
+    is_across = np.abs((along * normal[given]).sum(axis=1)) <= ROUNDED
+    tangent[given] = np.where(is_across[:, None], along, _tangent(normal[given], along))
+    area = np.where(np.isnan(table.area), np.pi * table.radius**2, table.area)
+    return Samples(table.pos, normal, tangent, table.radius, area, table.cell)
+
+
+def _kept_unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Return vectors over their lengths; those that are unit to within rounding as they are."""
+    is_unit = np.abs((vectors**2).sum(axis=1) - 1.0) <= ROUNDED
+    return np.where(is_unit[:, None], vectors, unit(vectors))
 
 
 def _shown(vector: tuple[float, ...]) -> str:

@@ -6,17 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from tgdsl.commands.arguments import OUT, Replace, Robot
 
 
 @dataclass(frozen=True)
-class Layout:
+class New:
     """Propose a layout for a robot: link groups, and taxels at three resolutions; every guess is marked in the file."""
 
-    action: Annotated[tyro.conf.Positional[Literal["new"]], tyro.conf.arg(metavar="new")]
-    """What to do: `new` proposes one."""
     robot: Robot
     density: str = "4/cm2"
     """Taxels per area at the resolution `med`, such as 4/cm2 or 1e4/m2; `low` has a quarter of it, `high` four times it."""

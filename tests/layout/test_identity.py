@@ -1,0 +1,96 @@
+"""Tables of taxels that are the same, and how others differ: rows changed by hand."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from tgdsl.errors import TaxelError
+from tgdsl.layout.identity import AREA, DIRECTION, POSITION, check_same_rows, columns_of, taxels_id
+from tgdsl.layout.layout import Layout, Link
+
+LAYOUT = Layout(
+    links=(Link("palm", "base"), Link("tip", "finger")),
+    groups={"all": ("palm", "tip")},
+    link_id=np.array([0, 0, 0, 1]),
+    pos=np.array([[0.001, 0.002, 0.003], [0.004, 0, 0], [0, 0.005, 0], [0.001, 0.002, 0.003]]),
+    normal=np.tile([0.0, 0, 1], (4, 1)),
+    tangent=np.tile([1.0, 0, 0], (4, 1)),
+    radius=np.full(4, 0.002),
+    area=np.full(4, 1e-5),
+    cell=np.array([[0, 0], [0, 1], [1, 0], [-1, -1]]),
+)
+
+
+def changed(**arrays: object) -> Layout:
+    return dataclasses.replace(LAYOUT, **arrays)
+
+
+def moved(name: str, row: int, by: object) -> Layout:
+    array = getattr(LAYOUT, name).copy()
+    array[row] += by
+    return changed(**{name: array})
+
+
+def message(here: Layout, there: Layout = LAYOUT) -> str:
+    with pytest.raises(TaxelError) as caught:
+        check_same_rows(columns_of(here), columns_of(there), "x")
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "by", "column"),
+    [
+        ("pos", POSITION, "pos"),
+        ("normal", DIRECTION, "normal [0, 0, 1"),
+        ("tangent", DIRECTION, "tangent [1, 0, 0"),
+        ("radius", POSITION, "radius 0.002"),
+        ("area", AREA * 1e-5, "area 1e-05"),
+    ],
+)
+def test_what_is_within_the_tolerance_is_the_same_and_what_is_beyond_is_not(name, by, column):
+    step = np.array([0, by, 0]) if getattr(LAYOUT, name).ndim == 2 else by
+    check_same_rows(columns_of(moved(name, 2, 0.99 * step)), columns_of(LAYOUT), "x")
+    text = message(moved(name, 2, 1.2 * step))
+    assert text.startswith("x: 1 of 4 rows are other taxels than expected")
+    assert 'the first is row 2: link "palm" at [0, 5' in text
+    if name != "pos":
+        assert column in text
+
+
+def test_the_message_counts_rows_and_shows_the_first_that_differs():
+    order = [0, 2, 1, 3]
+    assert message(changed(**{name: getattr(LAYOUT, name)[order] for name in ("pos", "cell")})) == (
+        "x: 2 of 4 rows are other taxels than expected, the same ones in another order; "
+        'the first is row 1: link "palm" at [0, 5, 0] mm here, link "palm" at [4, 0, 0] mm expected'
+    )
+    assert message(LAYOUT.take(np.array([0, 1, 3]))) == (
+        "x: 3 taxels here, 4 expected; "
+        'the first is row 2: link "tip" at [1, 2, 3] mm here, link "palm" at [0, 5, 0] mm expected'
+    )
+    assert message(LAYOUT.take(np.array([0, 1]))) == "x: 2 taxels here, 4 expected"
+    assert message(changed(cell=np.array([[0, 0], [0, 1], [1, 3], [-1, -1]]))) == (
+        "x: 1 of 4 rows are other taxels than expected, the same ones in another order; "
+        'the first is row 2: link "palm" at [0, 5, 0] mm, column 3 here, link "palm" at [0, 5, 0] mm, column 0 expected'
+    )
+    other = changed(links=(Link("palm", "base"), Link("tip", "thumb")))
+    assert message(other).endswith('[1, 2, 3] mm, body thumb here, link "tip" at [1, 2, 3] mm, body finger expected')
+
+
+def test_columns_that_one_table_lacks_are_not_compared():
+    short = {name: column for name, column in columns_of(moved("tangent", 0, [0, 1, 0])).items() if name != "tangent"}
+    check_same_rows(short, columns_of(LAYOUT), "x")
+    check_same_rows(columns_of(LAYOUT), short, "x")
+
+
+def test_an_id_is_of_every_bit_and_name_but_groups():
+    assert re.fullmatch("[0-9a-f]{32}", taxels_id(LAYOUT))
+    assert taxels_id(changed(groups={})) == taxels_id(changed()) == taxels_id(LAYOUT)
+    others = [moved(name, 1, np.spacing(getattr(LAYOUT, name)[1])) for name in ("pos", "normal", "tangent", "radius", "area")]
+    others += [moved("cell", 1, 1), changed(link_id=np.array([0, 0, 1, 1]))]
+    others += [changed(links=(Link("palm", "base"), Link(*names))) for names in (("tip", "thumb"), ("top", "finger"))]
+    others += [changed(links=(Link("palm base", "4 tip"), Link("", "finger")))]
+    ids = {taxels_id(layout) for layout in [LAYOUT, *others]}
+    assert len(ids) == 1 + len(others)
+    assert taxels_id(changed(tangent=LAYOUT.tangent * [1, -1, 1])) == taxels_id(LAYOUT)  # −0 is 0

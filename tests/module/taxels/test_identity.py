@@ -1,0 +1,151 @@
+"""Modules that meet tables, artefacts, rollouts and states of others: the same order passes, another one is refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from torch import nn
+
+import tgdsl
+from tgdsl.errors import ArtifactError, TaxelError, TgdslError
+from tgdsl.module.artifact import load_plan
+from tgdsl.runtime.rollout import Recorder, held_controls, rollout
+
+ROBOT = """
+<mujoco>
+  <worldbody>
+    <body name="pad"><geom type="box" size=".03 .03 .01"/></body>
+    <body name="cube" pos="0 0 .03"><freejoint/><geom type="box" size=".02 .02 .02"/></body>
+  </worldbody>
+</mujoco>
+"""
+POINTS = [{"pos": [x, 0.01, 0.01], "normal": [0, 0, 1]} for x in (0.0, 0.01, -0.02)]
+OTHER_ORDER = (
+    ': sensor "touch": 2 of 3 rows are other taxels than expected, the same ones in another order; '
+    'the first is row 1: link "pad" at [10, 10, 10] mm here, link "pad" at [-20, 10, 10] mm expected'
+)
+
+
+def compiled(folder, points=POINTS, noise="clean") -> tgdsl.TactileModule:
+    (folder / "robot.xml").write_text(ROBOT)
+    layout = {"resolutions": {"low": {"pad": {"method": "points", "points": points, "radius": 0.002}}}}
+    touch = {"kind": "kinematic_taxel", "links": "pad", "feels": ["cube"], "outputs": ["force"], "noise": noise}
+    return tgdsl.compile({
+        "tgdsl": 1,
+        "robot": {"model": str(folder / "robot.xml"), "layout": layout},
+        "objects": {"cube": {"body": "cube"}},
+        "sensors": {"touch": touch},
+        "observations": {"policy": [{"type": "force", "of": "touch"}]},
+    })  # fmt: skip
+
+
+def near(points=POINTS):
+    """The same points 1e-8 m away, as after a way through float32."""
+    return [{**point, "pos": [x + 1e-8 for x in point["pos"]]} for point in points]
+
+
+@pytest.fixture
+def three(tmp_path):
+    """A module, the same one within rounding, and one with two rows swapped."""
+    return compiled(tmp_path), compiled(tmp_path, near()), compiled(tmp_path, [POINTS[i] for i in (0, 2, 1)])
+
+
+def test_modules_and_tables(three):
+    touch, same, other = three
+    tgdsl.check_taxels(touch, same)
+    tgdsl.check_taxels(touch, same.taxels)
+    for expected in (other, other.taxels):
+        with pytest.raises(TaxelError) as caught:
+            tgdsl.check_taxels(touch, expected, "the policy's sensor")
+        assert str(caught.value) == "the policy's sensor" + OTHER_ORDER
+    with pytest.raises(TaxelError, match=r'^this module: there is no sensor "tuch", whose taxels'):
+        tgdsl.check_taxels(touch, {"tuch": touch.taxels["touch"]})
+
+
+def test_ids_tell_bits_apart(three):
+    touch, same, _ = three
+    assert len({module.taxels_id for module in three}) == 3
+    tgdsl.check_taxels(touch, touch.taxels_id)
+    with pytest.raises(TaxelError, match=f"{touch.taxels_id}, {same.taxels_id} is expected: 3 taxels of 1 links"):
+        tgdsl.check_taxels(touch, same.taxels_id)
+    assert f"taxels_id {touch.taxels_id}\n" in touch.explain()
+
+
+@pytest.mark.parametrize("expected", ["half a name", "no.txt", {"touch": {"pos": np.zeros((3, 3))}}, "missing.npz"])
+def test_what_is_no_table_is_refused(three, expected):
+    with pytest.raises(TgdslError, match="expected"):
+        tgdsl.check_taxels(three[0], expected)
+
+
+def test_artefacts(three, tmp_path):
+    touch = three[0]
+    for name, module in zip(("touch", "same", "other"), three, strict=True):
+        tgdsl.save(module, tmp_path / f"{name}.safetensors")
+    path = tmp_path / "touch.safetensors"
+    assert tgdsl.load(path, taxels=touch.taxels_id).taxels_id == touch.taxels_id
+    assert load_plan(path).taxels_id == touch.taxels_id
+    with safe_open(str(path), framework="numpy") as file:
+        assert json.loads(file.metadata()["tgdsl"])["taxels_id"] == touch.taxels_id
+    tgdsl.load(path, taxels=tmp_path / "same.safetensors")
+    with pytest.raises(TaxelError) as caught:
+        tgdsl.load(path, taxels=str(tmp_path / "other.safetensors"))
+    assert str(caught.value) == str(path) + OTHER_ORDER
+
+
+def test_a_plan_with_another_id_is_refused(three):
+    plan = three[0].plan
+    text = plan.to_json().replace(plan.taxels_id, "0" * 32)
+    with pytest.raises(ArtifactError, match="the taxels are not those that the plan was written with"):
+        type(plan).from_json(text, plan.arrays)
+
+
+def test_rollouts(three, tmp_path):
+    touch, same, other = three
+    for name, module in (("same", same), ("other", other)):
+        sim = tgdsl.simulate(module, 1)
+        controls = held_controls(sim.model, 2 * sim.control_step, sim.control_step)
+        recorder = Recorder(module, len(controls), 1)
+        for step in rollout(module, sim, controls):
+            recorder.add(step)
+        recorder.write(tmp_path / f"{name}.npz", controls)
+    tgdsl.check_taxels(touch, tmp_path / "same.npz")
+    with pytest.raises(TaxelError) as caught:
+        tgdsl.check_taxels(touch, tmp_path / "other.npz")
+    assert str(caught.value) == "this module" + OTHER_ORDER
+
+
+@pytest.mark.parametrize("noise", ["clean", "noisy"])
+def test_states_through_a_file(tmp_path, noise):
+    """With or without state, in a policy that has the module for a part, and with `weights_only`, torch's own default."""
+
+    class Policy(nn.Module):
+        def __init__(self, touch: tgdsl.TactileModule):
+            super().__init__()
+            self.touch, self.layer = touch, nn.Linear(9, 2)
+
+    one, same, other = (Policy(compiled(tmp_path, points, noise)) for points in (POINTS, near(), POINTS[::-1]))
+    state = one.touch.example_state(2)
+    one.touch(state)
+    torch.save(one.state_dict(), tmp_path / "policy.pt")
+    saved = torch.load(tmp_path / "policy.pt", weights_only=True)
+    assert set(saved) - set(one.state_dict()) == set()
+    same.load_state_dict(saved)
+    assert same.touch.num_envs == one.touch.num_envs
+    with pytest.raises(TaxelError, match=r'^the state dict is of another module: sensor "touch": 2 of 3 rows'):
+        other.load_state_dict(saved)
+    assert other.touch.num_envs is None
+    with pytest.raises(TaxelError, match="the state dict is of another module"):
+        other.touch.load_state_dict(one.touch.state_dict())
+    other.load_state_dict(dict(saved))  # a plain dictionary says nothing of taxels
+
+
+def test_connections(three, monkeypatch):
+    touch, same, other = three
+    with tgdsl.connect(touch, "simulation", taxels=same, control_step=0.004) as source:
+        source.step()
+        assert source.observe()["policy"].shape == (1, 9)
+    with pytest.raises(TaxelError) as caught:
+        tgdsl.connect(touch, "xhand1:/dev/nowhere", taxels=other.taxels)  # the port is not looked for
+    assert str(caught.value) == "this module" + OTHER_ORDER

@@ -1,0 +1,1 @@
+"""`tgdsl layout`: where taxels sit, proposed or written down, one command per file."""

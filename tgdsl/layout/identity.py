@@ -1,0 +1,119 @@
+"""Whether two tables of taxels are the same: a hash of the exact table, and a comparison that overlooks rounding.
+
+What learns from readings knows a taxel by its row alone, so that another order of rows is another input. Tables are the same if
+as many rows are on the same links and bodies, in the same cells, at the same places: to within `POSITION` for positions and
+radii, `DIRECTION` for normals and tangents, `AREA` for areas. Vertices that went through float32 are 1e-8 m away, two taxels of
+a hand at least some 1e-4 m apart. A hash tells bits apart, and is asked only where there is no table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Shaped
+
+from tgdsl.errors import TaxelError
+from tgdsl.layout.layout import Layout
+
+POSITION = 1e-6
+"""Largest distance of two positions that are the same place, and of two radii [m]."""
+DIRECTION = 1e-4
+"""Largest distance of two unit vectors that are the same direction: an angle [rad]."""
+AREA = 0.05
+"""Largest difference of two areas that are the same, relative to the larger: sampled ones are counted in points."""
+REQUIRED = ("link", "body", "pos", "normal")
+COMPARED = (*REQUIRED, "tangent", "radius", "area", "row", "column")
+_TOLERANCES = {"pos": POSITION, "normal": DIRECTION, "tangent": DIRECTION, "radius": POSITION, "area": AREA}
+
+Columns = Mapping[str, np.ndarray]
+"""A table of taxels by columns, as `TactileModule.taxels` names them; `REQUIRED` are there, others compared if both tables have
+them."""
+
+
+def taxels_id(layout: Layout) -> str:
+    """Return a hash of a layout's rows: names of link and body, place, directions, radius, area and cell, to the last bit."""
+    digest = hashlib.sha256()
+    for link in layout.links:
+        for name in (link.name, link.body):
+            digest.update(f"{len(name.encode())} {name} ".encode())
+    floats = (layout.pos, layout.normal, layout.tangent, layout.radius, layout.area)
+    for array in (layout.link_id.astype("<i8"), layout.cell.astype("<i8"), *(own.astype("<f8") for own in floats)):
+        digest.update(f"{array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array + 0).tobytes())  # −0 is 0
+    return digest.hexdigest()[:32]
+
+
+def columns_of(layout: Layout) -> dict[str, np.ndarray]:
+    """Return a layout as the columns of a table, a row per taxel."""
+    names = np.array([[link.name, link.body] for link in layout.links]).reshape(-1, 2)[layout.link_id]
+    row, column = layout.cell.T
+    floats = {name: getattr(layout, name) for name in _TOLERANCES}
+    return {"link": names[:, 0], "body": names[:, 1], **floats, "row": row, "column": column}
+
+
+def check_same_rows(here: Columns, there: Columns, what: str) -> None:
+    """Refuse tables of which some row is another one.
+
+    Args:
+        here: The table that is in use.
+        there: The one that is expected.
+        what: Whose tables they are, as the message begins.
+
+    Raises:
+        TaxelError: How they differ: how many rows, and the first one that does, here and there.
+    """
+    num_here, num_there = len(here["pos"]), len(there["pos"])
+    num = min(num_here, num_there)
+    is_same = _same_rows(here, there, num)
+    if num_here == num_there and is_same.all():
+        return
+    if num_here != num_there:
+        text = f"{num_here} taxels here, {num_there} expected"
+    else:
+        text = f"{int((~is_same).sum())} of {num} rows are other taxels than expected"
+        text += ", the same ones in another order" if _places(here) == _places(there) else ""
+    if not is_same.all():
+        row = int(np.argmin(is_same))
+        text += f"; the first is row {row}: {_shown(here, there, row)} here, {_shown(there, here, row)} expected"
+    raise TaxelError(f"{what}: {text}")
+
+
+def _same_rows(here: Columns, there: Columns, num: int) -> Bool[np.ndarray, " row"]:
+    """Return which of the first rows are the same."""
+    shared = [name for name in COMPARED if name in here and name in there]
+    return np.logical_and.reduce([_same(name, here[name][:num], there[name][:num]) for name in shared])
+
+
+def _same(name: str, here: Shaped[np.ndarray, "row ..."], there: Shaped[np.ndarray, "row ..."]) -> Bool[np.ndarray, " row"]:
+    """Return in which rows a column is the same."""
+    if name not in _TOLERANCES:
+        return np.asarray(here == there)
+    one, other = (np.asarray(values, dtype=np.float64).reshape(len(here), -1) for values in (here, there))
+    scale = np.maximum(np.abs(one), np.abs(other))[:, 0] if name == "area" else 1.0
+    return np.linalg.norm(one - other, axis=1) <= _TOLERANCES[name] * scale
+
+
+def _places(table: Columns) -> list[tuple[Any, ...]]:
+    """Return links and positions to a tenth of a millimetre, sorted: nearly always alike for the same taxels in any order."""
+    rounded = np.round(np.asarray(table["pos"], dtype=np.float64), 4) + 0.0
+    return sorted((str(link), *pos) for link, pos in zip(table["link"], rounded.tolist(), strict=True))
+
+
+def _shown(table: Columns, other: Columns, row: int) -> str:
+    """Return a row as a message says it: its link and place, and what tells it from the other table's if these do not."""
+    place = ", ".join(f"{1e3 * x:.6g}" for x in table["pos"][row])
+    text = f'link "{table["link"][row]}" at [{place}] mm'
+    shared = [name for name in COMPARED if name in table and name in other]
+    differing = [name for name in shared if not _same(name, table[name][row : row + 1], other[name][row : row + 1])[0]]
+    if {"link", "pos"} & set(differing):
+        return text
+    return text + "".join(f", {name} {_plain(table[name][row])}" for name in differing)
+
+
+def _plain(value: Any) -> str:
+    if np.ndim(value):
+        return f"[{', '.join(f'{x:.6g}' for x in value)}]"
+    return f"{value:.6g}" if isinstance(value, np.floating) else str(value)
