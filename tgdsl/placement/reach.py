@@ -188,9 +188,7 @@ def unfelt(colliders: Colliders, layout: Layout, found: Reach) -> tuple[Unfelt, 
             why = "on a body that the simulator does not collide"
             records.append(Unfelt(link.name, NOT_COLLIDED, why, taxels, int(own.sum())))
         if len(taxels := np.flatnonzero(own & is_buried)):
-            why = (
-                f"deeper inside what the simulator collides of the link than their radius, by up to {_mm(found.depth[taxels])}"
-            )
+            why = f"buried in the link's own colliding geoms, up to {_mm(found.depth[taxels])} deep, beyond their radius"
             records.append(Unfelt(link.name, BURIED, why, taxels, int(own.sum())))
         for body in np.unique(found.cover[own & is_covered]).tolist():
             taxels = np.flatnonzero(own & is_covered & (found.cover == body))
