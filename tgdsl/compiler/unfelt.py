@@ -11,7 +11,7 @@ import numpy as np
 from tgdsl.compiler.lowered import LoweredSensor
 from tgdsl.compiler.passes import Pruned
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, num_unfelt
+from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
 from tgdsl.placement.reach import unfelt
 
 SHOWN = 8
@@ -62,7 +62,7 @@ def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
         num_taxels: Number of all taxels.
     """
     if found:
-        what = f"{num_unfelt(found)} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
+        what = f"{len(unfelt_ids(found))} of {num_taxels} taxels cannot feel: {'; '.join(map(str, found[:SHOWN]))}"
         what += f"; and {len(found) - SHOWN} more, see `explain`" if len(found) > SHOWN else ""
         hints = {BURIED: "`surface: collision`", COVERED: "`exposed: true`"}
         wanted = [hint for reason, hint in hints.items() if any(own.reason == reason for own in found)]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-NOT_COLLIDED, BURIED, COVERED = "not collided", "buried", "covered at rest"
-"""Reasons, as a legend calls them; of several that hold the first counts."""
+REASONS = NOT_COLLIDED, BURIED, COVERED = "not collided", "buried", "covered at rest"
+"""Why a taxel cannot feel; of several reasons that hold the first counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,12 @@ class Unfelt:
         return f"{self.link}: {len(self.taxels)} of {self.of} taxels {self.why}"
 
 
-def num_unfelt(found: Sequence[Unfelt]) -> int:
-    """Return how many taxels cannot feel."""
-    return len(np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(own.taxels for own in found)])))
+def by_reason(found: Sequence[Unfelt]) -> str:
+    """Return how many taxels cannot feel for which reason: "buried 12, covered at rest 3"."""
+    counts = {reason: sum(len(own.taxels) for own in found if own.reason == reason) for reason in REASONS}
+    return ", ".join(f"{reason} {count}" for reason, count in counts.items() if count)
+
+
+def unfelt_ids(found: Sequence[Unfelt]) -> Int[np.ndarray, " unfelt"]:
+    """Return the taxels that cannot feel, ascending."""
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(own.taxels for own in found)]))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
-from tgdsl.layout.unfelt import num_unfelt
+from tgdsl.layout.unfelt import unfelt_ids
 from tgdsl.module.example import example_state
 from tgdsl.module.memory.memory import Memory
 from tgdsl.module.outputs import outputs_of
@@ -96,7 +96,7 @@ def explain(touch: Explained) -> str:
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
     if plan.unfelt:
-        lines += [f"{num_unfelt(plan.unfelt)} taxels cannot feel", *(f"  {own}" for own in plan.unfelt), ""]
+        lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {own}" for own in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
 
 
