@@ -78,13 +78,18 @@ class Region:
 
     def has_points(self, pos: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Return which points of such faces belong, by position (body frame) [m]."""
+        is_in = self.is_within(pos)
+        if self.is_covered is not None:
+            is_in[is_in] = ~self.is_covered(pos[is_in])
+        return is_in
+
+    def is_within(self, pos: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Return which points are in all boxes and spheres, whether covered or not."""
         is_in = np.ones(pos.shape[:-1], dtype=bool)
         for low, high in self.boxes:
             is_in &= ((pos >= low - LENGTH_TOLERANCE) & (pos <= high + LENGTH_TOLERANCE)).all(axis=-1)
         for center, radius in self.spheres:
             is_in &= np.linalg.norm(pos - center, axis=-1) <= radius + LENGTH_TOLERANCE
-        if self.is_covered is not None:
-            is_in[is_in] = ~self.is_covered(pos[is_in])
         return is_in
 
     def clipped(self, corners: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "k m 3"], Int[np.ndarray, " k"]]:
@@ -103,7 +108,7 @@ class Region:
     def extremes(
         self, corners: Float[np.ndarray, "n 3 3"], normals: Float[np.ndarray, "n 3"], axes: Float[np.ndarray, "2 3"]
     ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """Return the points where the part of a face in the region can reach farthest along some axes.
+        """Return the points where the part of a face in the region, covered or not, can reach farthest along some axes.
 
         Args:
             corners: The faces' corners (body frame) [m].
@@ -120,7 +125,7 @@ class Region:
             found.append(_disc(corners[owner], normals[owner], axes, center, radius))
         points = np.concatenate(found, axis=1)
         inner = np.broadcast_to(polygons.mean(axis=1, keepdims=True), points.shape)
-        is_in = self.has_points(points)  # false for NaN
+        is_in = self.is_within(points)  # false for NaN
         return points[is_in], inner[is_in]
 
 
