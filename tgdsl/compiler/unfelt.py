@@ -11,6 +11,7 @@ import numpy as np
 from tgdsl.compiler.lowered import LoweredSensor
 from tgdsl.compiler.passes import Pruned
 from tgdsl.compiler.resolve import Resolved
+from tgdsl.errors import UnfeltWarning
 from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt, unfelt_ids
 from tgdsl.placement.reach import unfelt
 
@@ -22,7 +23,7 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
     """Return the taxels with a sensor that cannot feel what it is to feel there.
 
     A sensor that reads contacts cannot on a body that is never in contact with its objects. Where no object collides with a
-    body, nothing keeps the objects out of it, so that no taxel is too deep in it.
+    body, nothing keeps the objects out of it, so that no taxel is too deep in it. Readings of bodies are not of taxels.
 
     Args:
         resolved: The document on its robot.
@@ -35,7 +36,7 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
     is_deep = within.is_buried | (within.cover >= 0)
     for sensor in sensors:
         objects = {name for request in sensor.requests for name in request.objects}
-        if not objects or not sensor.spec.is_on_taxels:
+        if not objects or sensor.rows.name != "taxel":
             continue
         if any(request.is_gated or request.wants_contacts for request in sensor.requests):
             met = {pair.link for pair in pruned.contact_pairs if pair.object in objects}
@@ -67,4 +68,4 @@ def warn_of_unfelt(file: str, found: Sequence[Unfelt], num_taxels: int) -> None:
         hints = {BURIED: "`surface: collision`", COVERED: "`exposed: true`"}
         wanted = [hint for reason, hint in hints.items() if any(own.reason == reason for own in found)]
         what += f"; in the layout {' and '.join(wanted)} would place them elsewhere" if wanted else ""
-        warnings.warn(f"{file}: {what}", stacklevel=3)
+        warnings.warn(f"{file}: {what}", UnfeltWarning, stacklevel=3)

@@ -26,6 +26,7 @@ INSIDE = 1e-6
 """Depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding."""
 DIRECTIONS = 100
 """Directions in which it is looked whether a ball reaches out of several solids together."""
+NEVER_MET = "on a body that is never in contact with what their sensor feels, by contact alone"
 _UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
 """Types of geoms that are no convex solid: the ground, and shapes that MuJoCo collides otherwise."""
 
@@ -185,7 +186,8 @@ def unfelt(colliders: Colliders, layout: Layout, found: Reach) -> tuple[Unfelt, 
     for i, link in enumerate(layout.links):
         own = layout.link_id == i
         if len(taxels := np.flatnonzero(own & ~found.is_collided)):
-            why = "on a body that the simulator does not collide"
+            collides = colliders.collides(int(colliders.robot.compiled.body(link.body).id))
+            why = NEVER_MET if collides else "on a body that the simulator does not collide"
             records.append(Unfelt(link.name, NOT_COLLIDED, why, taxels, int(own.sum())))
         if len(taxels := np.flatnonzero(own & is_buried)):
             why = f"buried in the link's own colliding geoms, up to {_mm(found.depth[taxels])} deep, beyond their radius"
