@@ -50,7 +50,7 @@ def hand(side: int = 1) -> str:
           <joint axis="0 1 0"/><geom name="nail" type="sphere" size=".004" contype="0" conaffinity="0"/>
         </body>
       </body>
-      <body name="thumb" pos="-.03 0 .02">
+      <body name="thumb" pos="-.05 0 .02">
         <joint axis="0 1 0"/><geom name="thumb" type="mesh" mesh="shell" contype="0" conaffinity="0"/>
       </body>
     </body>
