@@ -35,6 +35,10 @@ class ObservationError(TgdslError):
     """An observation that its source cannot give."""
 
 
+class UnfeltWarning(UserWarning):
+    """A document has taxels that cannot feel what their sensors are to feel."""
+
+
 class FileError(TgdslError, OSError):
     """A file that cannot be written; also caught as the system's own error.
 

@@ -19,7 +19,7 @@ FLOAT32_TOLERANCE = 1e-5
 SCENE = """
 <mujoco><worldbody>
   <body name="pad"><freejoint/><geom type="box" size=".03 .03 .01"/></body>
-  <body name="tip"><freejoint/><geom type="sphere" size=".02"/></body>
+  <body name="tip"><freejoint/><geom type="sphere" size=".01"/></body>
   <body name="item"><freejoint/><geom type="sphere" size=".025"/></body>
 </worldbody></mujoco>
 """

@@ -12,9 +12,7 @@ from tgdsl.commands.arguments import OUT, OptionalFile, Overrides, in_working_fo
 from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
-    import mujoco
-
-    from tgdsl.layout.layout import Layout
+    from tgdsl.compiler.pipeline import Placed
 
 
 @dataclass(frozen=True)
@@ -39,20 +37,24 @@ class Render:
 
     def run(self) -> None:
         """Draw, write and say how many taxels there are."""
+        from tgdsl.layout.unfelt import by_reason, unfelt_ids
         from tgdsl.view.render import render
 
         out = self.out or in_working_folder(self.hand, ".png")
-        model, layouts = self._layouts()
-        path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size)
+        model, layouts, unfelt = self._placed()
+        path = render(model, layouts, out, keyframe=self.keyframe, view=self.view, size=self.size, unfelt=unfelt)
         print(", ".join(f"{name}: {layout.num_taxels} taxels" for name, layout in layouts.items()))
+        for name, found in unfelt.items():
+            if found:
+                print(f"{name}: {len(unfelt_ids(found))} taxels cannot feel: {by_reason(found)}")
         print(f"picture: {path}")
 
-    def _layouts(self) -> tuple[mujoco.MjModel, dict[str, Layout]]:
+    def _placed(self) -> Placed:
         """Return the model and the layouts to draw by resolution: an artefact's own, or those that its document would have."""
-        if not self.hand.endswith(".safetensors"):
-            from tgdsl.compiler.pipeline import layouts
+        from tgdsl.compiler.pipeline import Placed, placed
 
-            return layouts(robot_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions)
+        if not self.hand.endswith(".safetensors"):
+            return placed(robot_document(self.hand, self.layout), parsed_overrides(self.set), self.resolutions)
         from tgdsl.module.artifact import load_plan
         from tgdsl.scene.scene import scene_model
 
@@ -60,4 +62,4 @@ class Render:
         resolution = plan.origin.resolution
         if self.set or self.layout or set(self.resolutions) - {resolution}:
             raise TgdslError(f'an artefact has the layout and resolution it was compiled with, "{resolution}", and no other')
-        return scene_model(plan.scene), {resolution: plan.layout}
+        return Placed(scene_model(plan.scene), {resolution: plan.layout}, {resolution: plan.unfelt})

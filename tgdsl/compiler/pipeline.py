@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import torch
@@ -20,7 +20,9 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
+from tgdsl.layout.unfelt import Unfelt
 from tgdsl.module.module import TactileModule
+from tgdsl.placement.reach import unfelt
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
 from tgdsl.schema.load import load
@@ -58,12 +60,37 @@ def compile_plan(
     return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
 
 
+class Placed(NamedTuple):
+    """Where a document puts taxels.
+
+    Attributes:
+        model: The model of the scene, or of the robot if there is no scene.
+        layouts: The layouts, by resolution.
+        unfelt: The taxels of each that are not collided, buried, or covered in the robot's initial state.
+    """
+
+    model: mujoco.MjModel
+    layouts: dict[str, Layout]
+    unfelt: dict[str, tuple[Unfelt, ...]]
+
+
 def layouts(
     document: Document,
     overrides: Mapping[str, Any] | None = None,
     resolutions: Sequence[str] = (),
     kinds: Sequence[Kind] = (),
 ) -> tuple[mujoco.MjModel, dict[str, Layout]]:
+    """Return the model and the layouts of `placed`."""
+    found = placed(document, overrides, resolutions, kinds)
+    return found.model, found.layouts
+
+
+def placed(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    resolutions: Sequence[str] = (),
+    kinds: Sequence[Kind] = (),
+) -> Placed:
     """Return where a document puts taxels, at one resolution or more, without lowering sensors or baking objects.
 
     Args:
@@ -71,9 +98,6 @@ def layouts(
         overrides: YAML text, or plain values, by dotted path.
         resolutions: Default: the document's own, or all of the layout's if it names none.
         kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
-
-    Returns:
-        The model of the scene, or of the robot if there is no scene, and the layouts by resolution.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
@@ -83,7 +107,7 @@ def layouts(
     chosen, known = overrides or {}, known_kinds(kinds)
     loaded = load(document, chosen, known, needs_sensors=False)
     if loaded.layout is None:
-        return resolve(loaded).scene.compiled, {}  # which says all that is wrong, if a layout is needed
+        return Placed(resolve(loaded).scene.compiled, {}, {})  # which says all that is wrong, if a layout is needed
     names, own = list(loaded.layout.spec.resolutions), loaded.resolution
     wanted = list(resolutions) or ([own] if own is not None else names)
     for name in resolutions:
@@ -91,7 +115,8 @@ def layouts(
             raise TgdslError(f'the layout has no resolution "{name}"; {did_you_mean(name, names, "resolutions")}')
     texts = {name: chosen if name == own else {**chosen, "resolution": name} for name in wanted}
     each = {name: resolve(load(document, text, known, needs_sensors=False)) for name, text in texts.items()}
-    return each[wanted[0]].scene.compiled, {name: resolved.layout for name, resolved in each.items()}
+    found = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
+    return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, found)
 
 
 def compile(

@@ -18,9 +18,10 @@ from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
+from tgdsl.placement.reach import Colliders, Reach, reach
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.loaded import Loaded, LoadedLayout
-from tgdsl.schema.placement import Placement
+from tgdsl.schema.placement import Placement, Points
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
@@ -38,6 +39,11 @@ class Patch:
     placement: Placement
     path: Path
 
+    @property
+    def as_collided(self) -> bool:
+        """Whether its taxels are on the convex hulls that the simulator collides."""
+        return not isinstance(self.placement, Points) and self.placement.surface == "collision"
+
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
@@ -52,6 +58,8 @@ class Resolved:
         robot: The robot's own model.
         unused: What has taxels or can be felt but is not needed, and why.
         patches: The links that carry taxels.
+        colliders: What the simulator collides of the robot.
+        reach: What that leaves of each taxel.
         on_links: The sensors that have a place on each link, whatever its taxels.
         link_bodies: The bodies of each link that carries taxels or is a sensor's.
     """
@@ -64,6 +72,8 @@ class Resolved:
     robot: Model
     unused: tuple[tuple[str, str], ...]
     patches: Mapping[str, Patch]
+    colliders: Colliders
+    reach: Reach
     on_links: frozenset[str]
     link_bodies: LinkBodies
 
@@ -73,16 +83,17 @@ class Resolved:
         Raises:
             LowerError: If the region holds nothing of the link.
         """
-        surface = self.robot.surface(self.patches[link].geoms)
+        surface = self.robot.surface(self.patches[link].geoms, self.patches[link].as_collided)
         try:
             return clip(surface, region) if region else surface
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
-        """Return the geoms that a link's taxels sit on: meshes as they are, not their convex hulls."""
+        """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
+        triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh
         geoms = self.patches[link].geoms
-        return tuple(SurfaceGeom(geom, self.robot.mesh(geom) if geom.shape == "mesh" else None) for geom in geoms)
+        return tuple(SurfaceGeom(geom, triangles(geom) if geom.shape == "mesh" else None) for geom in geoms)
 
     def layout_on(self, sensor: str) -> tuple[np.ndarray, Layout]:
         """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
@@ -128,9 +139,11 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     assert robot is not None and scene is not None
     needed = {link for name, own in links.items() for link in own if name not in on_links}
     needed = needed if links else {patch.link.name for patch in patches}
+    colliders, felt = Colliders(robot), _object_bodies(loaded, robot)
     layout = Layout.of_links((), {})
     if loaded.layout is not None:
-        layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
+        placed = [patch for patch in patches if patch.link.name in needed]
+        layout = _sampled(loaded, loaded.layout, colliders, placed, felt, progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
@@ -141,8 +154,9 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     welded = {scene.compiled.body(i).name for bodies in rigid for i in bodies}
     others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
     unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
-    by_name = {patch.link.name: patch for patch in patches}
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_name, on_links, parts_of)
+    by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
+    own_links = (on_links, parts_of)
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
 def taxels_of_all_links(loaded: Loaded) -> Layout:
@@ -159,7 +173,13 @@ def taxels_of_all_links(loaded: Loaded) -> Layout:
         patches = _patches(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
     loaded.raise_problems()
     assert robot is not None and loaded.layout is not None
-    return _sampled(loaded, loaded.layout, robot, patches, silent)
+    return _sampled(loaded, loaded.layout, Colliders(robot), patches, _object_bodies(loaded, robot), silent)
+
+
+def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
+    """Return the bodies of the robot's file that are a document's objects, or parts of them: they are no links."""
+    named = {target.body_of(name) for name, target in loaded.spec.objects.items()} & set(robot.bodies)
+    return tuple(sorted({i for body in named for i in robot.rigid_bodies(body, named - {body})}))
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
@@ -331,12 +351,21 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
 
 
-def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch], progress: Progress) -> Layout:
+def _sampled(
+    loaded: Loaded,
+    layout: LoadedLayout,
+    colliders: Colliders,
+    patches: list[Patch],
+    objects: Sequence[int],
+    progress: Progress,
+) -> Layout:
     parts: list[Samples] = []
     for i, patch in enumerate(patches):
         progress(f"placing taxels on {patch.link.name} ({i + 1} of {len(patches)} links)")
         try:
-            parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder, patch.link.name))
+            covered = colliders.cover_of(patch.link.body, patch.geoms, objects)
+            surface, name = _surface(colliders.robot, patch), patch.link.name
+            parts.append(sample(surface, patch.placement, layout.folder, name, covered))
         except SampleError as error:
             what = f'link "{patch.link.name}": {error.what}'
             loaded.problems.append(layout.problem(patch.path, what, error.hint))
@@ -355,6 +384,18 @@ def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[P
         area=np.concatenate([part.area for part in parts]),
         cell=np.concatenate([part.cell for part in parts]),
     )
+
+
+def _surface(robot: Model, patch: Patch) -> Surface:
+    """Return the triangles that a link's taxels are sampled on.
+
+    Raises:
+        SampleError: If they shall be on colliding geoms, and one of the link's does not collide.
+    """
+    if patch.as_collided and not all(geom.is_colliding for geom in patch.geoms):
+        apart = next(geom for geom in patch.geoms if not geom.is_colliding)
+        raise SampleError(f"the simulator does not collide {apart.shown}", "expected `surface: mesh`")
+    return robot.surface(patch.geoms, patch.as_collided)
 
 
 def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, ...]]:

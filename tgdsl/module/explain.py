@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
+from tgdsl.layout.unfelt import unfelt_ids
 from tgdsl.module.example import example_state
 from tgdsl.module.memory.memory import Memory
 from tgdsl.module.outputs import outputs_of
@@ -95,6 +96,8 @@ def explain(touch: Explained) -> str:
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
+    if plan.unfelt:
+        lines += [f"{len(unfelt_ids(plan.unfelt))} taxels cannot feel", *(f"  {own}" for own in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
 
 

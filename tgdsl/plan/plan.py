@@ -20,6 +20,7 @@ import numpy as np
 from tgdsl.errors import ArtifactError
 from tgdsl.layout.identity import taxels_id
 from tgdsl.layout.layout import Layout
+from tgdsl.layout.unfelt import Unfelt
 from tgdsl.plan import ranges, tree
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.scene import SceneFile
@@ -63,6 +64,7 @@ class Plan:
         proprioception: Readings of joints and actuators, which are fields of the state, handed out by the same names.
         observations: Observation terms, in the document's order.
         dropped: What the scene or the document has and the module does not need, and why.
+        unfelt: Taxels that cannot feel what their sensors are to feel, and why.
         scene: The instrumented scene.
     """
 
@@ -76,6 +78,7 @@ class Plan:
     proprioception: tuple[PlannedReading, ...]
     observations: tuple[PlannedObservation[np.ndarray], ...]
     dropped: tuple[tuple[str, str], ...]
+    unfelt: tuple[Unfelt, ...]
     scene: SceneFile
 
     @cached_property

@@ -194,7 +194,7 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     """Return the bounding rectangle, in (u, v), of all first hits in the region; None if there is no such hit.
 
     Without a region it is the rectangle of the projected corners. With one it is exact wherever an extreme point of the
-    region on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where an occluding part cuts
+    region on some face is visible (a box's side, a sphere's rim, a corner of the mesh); where what hides or covers it cuts
     the region it is known to within one raster cell, 1/256 of the region's longer side.
 
     Args:
@@ -211,7 +211,7 @@ def visible_rectangle(view: OrthographicView, region: Region) -> tuple[Float[np.
     uv = extremes @ view.axes[:2].T
     found = _raster_hits(view, region, uv.min(axis=0), uv.max(axis=0))
     low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.full(2, np.inf), np.full(2, -np.inf))
-    is_outside = ((uv < low) | (uv > high)).any(axis=1)
+    is_outside = ((uv < low) | (uv > high)).any(axis=1) & region.has_points(extremes)
     # A corner can be visible although its face is hidden, so look a little way inside the face.
     looked_at = extremes[is_outside] + 1e-3 * (inner[is_outside] - extremes[is_outside])
     uvt = looked_at @ view.axes.T

@@ -6,12 +6,12 @@ shows. Shapes: `point` points of the picture, `h` and `w` rows and columns of pi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter
 from tgdsl.errors import FileError
 from tgdsl.files.write import atomic_open, check_writable, with_folder
 from tgdsl.layout.layout import Layout
+from tgdsl.layout.unfelt import Unfelt, unfelt_ids
 from tgdsl.view.cameras import ViewError, angles_of, camera_of, pose_of
 from tgdsl.view.discs import discs, group_of, legend, radii
 from tgdsl.view.meshes import mesh_of, robot_bodies
@@ -42,6 +43,8 @@ _INCHES = 6.0  # the figure's height, whatever its pixels: text scales with it
 _HEAD, _FOOT, _GAP = 0.085, 0.085, 0.03  # parts of the figure's height
 _SUPERSAMPLING = 3  # pixels rendered per pixel of the file, along each axis
 _SURFACE = np.array([0.91, 0.92, 0.94])
+_CROSS = "#d40000"
+_DIAGONALS = np.array([[3, 15], [9, 21]])  # corners of a disc of 24 that lie opposite each other
 _AMBIENT_OCCLUSION = (
     (0.004, 12.0),
     (0.012, 6.0),
@@ -56,6 +59,7 @@ def render(
     keyframe: str | None = None,
     view: str = "front",
     size: tuple[int, int] | None = None,
+    unfelt: Mapping[str, Sequence[Unfelt]] | None = None,
 ) -> Path:
     """Draw the taxels of one layout or more on the robot that has them, and write the picture.
 
@@ -67,6 +71,7 @@ def render(
         view: One of `cameras.VIEWS`, or azimuth and elevation in degrees. In `front` the taxels' mean normal points at the
             camera, or nearly so.
         size: Columns and rows of the file; default: `HEIGHT` rows and as many columns as the hand needs.
+        unfelt: Taxels of each panel that cannot feel: they are crossed out.
 
     Returns:
         The path.
@@ -76,7 +81,7 @@ def render(
     """
     try:
         check_writable(out)
-        figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size)
+        figure = drawing(model, layouts, keyframe=keyframe, view=view, size=size, unfelt=unfelt)
         with atomic_open(with_folder(out)) as file:
             figure.savefig(file, format="png", pil_kwargs={"optimize": True})
     except FileError as error:
@@ -91,6 +96,7 @@ def drawing(
     keyframe: str | None = None,
     view: str = "front",
     size: tuple[int, int] | None = None,
+    unfelt: Mapping[str, Sequence[Unfelt]] | None = None,
 ) -> Figure:
     """Return the picture that `render` writes."""
     _check(layouts, view, size)
@@ -112,8 +118,9 @@ def drawing(
         left = _GAP * height + i * (columns + _GAP * height)
         axes = figure.add_axes((left / width, _FOOT, columns / width, rows / height), label=name)
         draw_image(axes, image, viewport)
-        _draw_taxels(axes, layout, taxels[i], viewport, fragments)
-        _draw_captions(axes, name, layout)
+        crossed = unfelt_ids((unfelt or {}).get(name, ()))
+        _draw_taxels(axes, layout, taxels[i], viewport, fragments, crossed)
+        _draw_captions(axes, name, layout, len(crossed))
     draw_scale_bar(figure.axes[0], viewport.scale, viewport.width, 1.03 * viewport.height)
     return figure
 
@@ -159,8 +166,13 @@ def _image(hand: Mesh, fragments: Fragments, viewport: Viewport) -> Float[Array,
 # The panels -----------------------------------------------------------------------------------------------------------
 
 
-def _draw_taxels(axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport, fragments: Fragments) -> None:
-    """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings."""
+def _draw_taxels(
+    axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport, fragments: Fragments, crossed: Int[Array, " unfelt"]
+) -> None:
+    """Draw those in view as discs with a tick along the normal, far ones first; those that are hidden as faint rings.
+
+    Those that cannot feel are crossed out, faintly where they are hidden.
+    """
     at = viewport.project(taxels.pos)
     seen, active = is_visible(taxels, at, fragments, viewport.camera), taxels.size > 0
     radius = radii(layout, taxels.pos)
@@ -177,9 +189,13 @@ def _draw_taxels(axes: Axes, layout: Layout, taxels: Taxels, viewport: Viewport,
     axes.add_collection(PolyCollection(list(rims[shown]), fc=list(lit[shown]), ec="white", lw=0.35, zorder=4, gid="shown"))
     ticks = list(np.stack([at[shown, :2], ends[shown, :2]], axis=1))
     axes.add_collection(LineCollection(ticks, colors=list(0.45 * colour[shown]), lw=0.6, zorder=5, gid="normals"))
+    if len(crossed):
+        ends = rims[np.repeat(crossed, 2)[:, None], np.tile(_DIAGONALS, (len(crossed), 1))]
+        colours = [(*to_rgb(_CROSS), 1.0 if is_seen else 0.3) for is_seen in np.repeat(seen[crossed], 2)]
+        axes.add_collection(LineCollection(list(ends), colors=colours, lw=1.0, zorder=6, gid="unfelt"))
 
 
-def _draw_captions(axes: Axes, name: str, layout: Layout) -> None:
+def _draw_captions(axes: Axes, name: str, layout: Layout, num_crossed: int) -> None:
     """Write the panel's name and its number of taxels above it, and the number of each group below."""
     count, fillers = int((layout.radius > 0).sum()), int((layout.radius == 0).sum())
     told = f"{count} taxels" + (f" and {fillers} inactive" if fillers else "")
@@ -191,6 +207,8 @@ def _draw_captions(axes: Axes, name: str, layout: Layout) -> None:
         Line2D([], [], marker="o", linestyle="", markersize=6, color=COLOURS[i % len(COLOURS)], label=f"{label} {number}")
         for i, (label, number) in enumerate(legend(layout).items())
     ]
+    if num_crossed:
+        handles.append(Line2D([], [], marker="x", linestyle="", color=_CROSS, label=f"cannot feel {num_crossed}"))
     style = {"frameon": False, "handletextpad": 0.1, "columnspacing": 1.1, "fontsize": 10, "labelcolor": INK}
     columns = len(handles) if len(handles) <= 3 else -(-len(handles) // 2)
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.005), ncols=columns, **style)

@@ -6,8 +6,8 @@ Every guess is written down in the file, for its reader to keep or to change.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float
 
 from tgdsl.errors import RobotError, SampleError, TgdslError
 from tgdsl.formats.model import Model
+from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
 from tgdsl.placement.propose.flexion import Flexion
-from tgdsl.placement.propose.hands import Hand, free_standing, hands, kinematic_tree
-from tgdsl.placement.sample import poisson
-from tgdsl.surfaces import meshlab
-from tgdsl.surfaces.region import Region
+from tgdsl.placement.propose.hands import Hand, KinematicTree, free_standing, hands, kinematic_tree
+from tgdsl.placement.reach import Colliders
+from tgdsl.placement.sample.poisson import Pool
 
 FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
 """Each resolution's share of the density."""
@@ -29,11 +29,10 @@ MIN_SHARE = 0.1
 """Least share of a link's surface that its inner side must hold to be believed."""
 COVERING = 0.75
 """Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
-MIN_AREA = 1e-8
-"""A surface smaller than this is degenerate [m²]."""
 MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
-_ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
+NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
+COVERED = "all of it is inside other links in the initial state"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +40,22 @@ class LinkSurface:
     """Samples of the outer surface of a body, in its frame.
 
     Attributes:
-        area: Its whole surface [m²].
-        centroid: Its centre [m].
-        normals: Outward unit normals of points.
-        shares: Share of the surface that each point stands for.
+        pool: Points on it.
+        options: Options of a placement that samples it.
     """
 
-    area: float
-    centroid: Float[np.ndarray, " 3"]
-    normals: Float[np.ndarray, "point 3"]
-    shares: Float[np.ndarray, " point"]
+    pool: Pool
+    options: Options = field(default_factory=dict)
+
+    @property
+    def area(self) -> float:
+        """Its whole surface [m²]."""
+        return self.pool.area
+
+    @property
+    def centroid(self) -> Float[np.ndarray, " 3"]:
+        """Its centre [m]."""
+        return self.pool.point_area @ self.pool.pos / self.pool.area
 
 
 @dataclass(frozen=True)
@@ -62,12 +67,14 @@ class LinkProposal:
         area: Surface to be covered [m²].
         facing: Direction of its inner side in the link's frame; None: it is covered all around.
         counts: Number of taxels at each resolution.
+        options: Options by which taxels are where they can feel.
     """
 
     name: str
     area: float
     facing: tuple[float, ...] | None
     counts: dict[str, int]
+    options: Options
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,7 @@ class Proposal:
         links: Links with taxels, in the robot's body order.
         left_out: Bodies without taxels, and why.
         shared: Names of links that other links' geoms or meshes have too.
+        is_collided: Whether the simulator collides its links; else none of them.
     """
 
     density: float
@@ -87,6 +95,7 @@ class Proposal:
     links: tuple[LinkProposal, ...]
     left_out: tuple[tuple[str, str], ...]
     shared: tuple[str, ...]
+    is_collided: bool
 
     def radius_mm(self, resolution: str) -> float:
         """Return the sensing radius at a resolution, to two digits [mm]."""
@@ -95,7 +104,7 @@ class Proposal:
     def placement(self, link: LinkProposal, resolution: str) -> dict[str, Any]:
         """Return how a link is sampled, as the grammar has it."""
         found: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
-        found["radius"] = f"{self.radius_mm(resolution):g} mm"
+        found |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
             found["region"] = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
         return found
@@ -119,7 +128,8 @@ def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
         TgdslError: If no link can be sampled, or if the density asks for more taxels than a link can have.
     """
     surfaces, left_out = _link_surfaces(robot)
-    tree = kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+    is_collided = _keep_what_feels(robot, surfaces, left_out, density)
+    tree = _tree(robot, surfaces)
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
     for body in free_standing(tree):
         del surfaces[names[body]]
@@ -135,7 +145,34 @@ def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
         facing |= {names[body]: flexion.direction(body) for body in wanted}
     links = tuple(_link(name, surfaces[name], facing.get(name), density) for name in robot.bodies if name in surfaces)
     groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
-    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)))
+    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)), is_collided)
+
+
+def _tree(robot: Model, surfaces: Mapping[str, LinkSurface]) -> KinematicTree:
+    return kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+
+
+def _keep_what_feels(robot: Model, surfaces: dict[str, LinkSurface], left_out: list[tuple[str, str]], density: float) -> bool:
+    """Leave of each link's surface what can be touched in the simulator, and leave out links of which nothing can be.
+
+    Links that the simulator does not collide are kept if it collides none, as those of a robot that is only seen.
+
+    Returns:
+        Whether it collides any that is no scenery.
+    """
+    colliders, radius = Colliders(robot), 0.95 * COVERING / np.sqrt(density * max(FACTORS.values()))
+    ids = {name: int(robot.compiled.body(name).id) for name in surfaces}
+    scenery = set(free_standing(_tree(robot, surfaces))) if surfaces else set()
+    links = [name for name in surfaces if ids[name] not in scenery]
+    collided = [name for name in links if colliders.collides(ids[name])]
+    for name in links if collided else []:
+        own = surfaces.pop(name)
+        pool, options = exposed_pool(robot, colliders, name, own.pool, radius) if name in collided else (None, {})
+        if pool is not None:
+            surfaces[name] = LinkSurface(pool, options)
+        else:
+            left_out.append((name, COVERED if name in collided else NOT_COLLIDED))
+    return bool(collided)
 
 
 def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str, str]]]:
@@ -152,10 +189,10 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
         except (RobotError, SampleError) as error:
             left_out.append((body, str(error).removeprefix(f"{robot.file}: ")))
             continue
-        if surface is None or surface.area < MIN_AREA:
-            left_out.append((body, "a surface without area" if surface else "nothing that can be touched from outside"))
-        else:
+        if isinstance(surface, LinkSurface):
             surfaces[body] = surface
+        else:
+            left_out.append((body, surface))
     model = robot.compiled
     unnamed = sum(not model.body(i).name and model.body_geomnum[i] > 0 for i in range(model.nbody))
     if unnamed:
@@ -163,25 +200,21 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
     return surfaces, left_out
 
 
-def _link_surface(robot: Model, body: str) -> LinkSurface | None:
+def _link_surface(robot: Model, body: str) -> LinkSurface | str:
+    """Return what can be touched of a body, or why nothing can."""
     surface = robot.surface(robot.touchable(body))
-    if not surface.face_areas.sum() > MIN_AREA:
-        return LinkSurface(0.0, np.zeros(3), np.zeros((0, 3)), np.zeros(0))
-    try:
-        shell = meshlab.outer_shell(surface)
-    except ImportError as error:
-        raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
-    pool = poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
+    pool = surface_pool(surface) if surface.face_areas.sum() > MIN_AREA else None
     if pool is None:
-        return None
-    shares = pool.point_area / pool.area
-    return LinkSurface(pool.area, shares @ pool.pos, pool.normal, shares)
+        has_area = surface.face_areas.sum() > MIN_AREA
+        return "nothing that can be touched from outside" if has_area else "a surface without area"
+    return LinkSurface(pool) if pool.area >= MIN_AREA else "a surface without area"
 
 
 def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
     share = 1.0
     if facing is not None:
-        share = float(surface.shares[_faces(surface.normals, facing)].sum())
+        pool = surface.pool
+        share = float(pool.point_area[_faces(pool.normal, facing)].sum()) / pool.area
         if share < MIN_SHARE:
             share, facing = 1.0, None
     area = share * surface.area
@@ -190,7 +223,7 @@ def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, den
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
-    return LinkProposal(name, area, facing, counts)
+    return LinkProposal(name, area, facing, counts, surface.options)
 
 
 def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:

@@ -33,6 +33,11 @@ _ABOUT = {
     "fingers": "all that moves against it",
     "hand": "every link with taxels",
 }
+_OPTIONS = {
+    "surface": "on the hull that the simulator collides: hollows of the mesh are deeper in it than taxels feel",
+    "exposed": "without what is inside other colliding geoms in the initial state",
+}
+_NOT_COLLIDED = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
 _NO_PALM = "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n"
 
 USUAL_DENSITY = (100.0, math.inf)
@@ -71,6 +76,8 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
         *(f"group {name}: {listed(members)}" for name, members in proposal.groups.items()),
         *(f"left out: {line}" for line in _left_out(proposal)),
+        *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _chosen(proposal)),
+        *([] if proposal.is_collided else [f"not collided: {_NOT_COLLIDED}"]),
         f"{out}: every guess in it is marked; please look at them",
     ]
 
@@ -84,6 +91,7 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     """
     parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _left_out(proposal)]
+    parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
     if proposal.groups and proposal.shared:
         names = ", ".join(map(quoted, proposal.shared))
         parts.append(f"# Mind: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
@@ -93,6 +101,12 @@ def layout_text(proposal: Proposal, robot: str) -> str:
         parts.append(f"  {resolution}:  # {total} taxels\n")
         parts += [_link_text(proposal, link, resolution) for link in proposal.links]
     return "".join(parts)
+
+
+def _chosen(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
+    """Return each option that some links need, as the grammar has it, and the links."""
+    found = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
+    return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in found if links]
 
 
 def _left_out(proposal: Proposal) -> list[str]:
@@ -125,12 +139,16 @@ def _link_text(proposal: Proposal, link: LinkProposal, resolution: str) -> str:
         if link.facing
         else "which side is the inner one is not clear: all around"
     )
-    return f"    # {1e4 * link.area:.3g} cm², {side}\n{text}"
+    notes = [f"    # {1e4 * link.area:.3g} cm², {side}\n"]
+    notes += [f"    # {_OPTIONS[option]}\n" for option in link.options]
+    return "".join(notes) + text
 
 
 def _flow(value: Any) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, list):
         return "[" + ", ".join(_flow(item) for item in value) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value)
