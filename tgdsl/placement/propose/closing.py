@@ -29,6 +29,8 @@ MIN_CLOSING = 0.03
 """Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
 MIN_BEND = np.radians(30.0)
 """A hinge that turns by less than this does not close a finger, but shapes a palm."""
+MAX_FINGER = 0.35
+"""A longer chain is an arm or a leg, of which nothing closes [m]."""
 PARALLEL = 0.7
 """Least cosine of the angle between two axes about which a finger curls."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -64,7 +66,8 @@ class Closing:
         """Look at each joint by itself, the others half closed and then closed."""
         self.tree, self.hand, self.poses = tree, hand, Poses(tree, hand)
         self.chain = {s: i for i, chain in enumerate(hand.chains) for s in chain}
-        candidates = [joint for joint in self.poses.independent if self._can_close(joint)]
+        independent = self.poses.independent if hand.length <= MAX_FINGER else ()
+        candidates = [joint for joint in independent if self._can_close(joint)]
         self.turned = {joint: self._turned(joint) for joint in candidates}
         self.lean = {joint: self._lean(joint) for joint in candidates}
         self.sense = self._curling()
@@ -197,7 +200,10 @@ class Closing:
         num = len(self.hand.tips)
         chains = [self.chain[self.tree.segment[tip]] for tip in self.hand.tips] + [-1] * (len(low) - num)
         pairs = [
-            (i, j) for i in range(num) for j in range(i + 1, len(low)) if chains[i] != chains[j] and (is_moved[i] or is_moved[j])
+            (i, j)
+            for i in range(num)
+            for j in range(i + 1, len(low))
+            if chains[i] != chains[j] and (is_moved[i] or is_moved[j])
         ]
         if not pairs:
             return 0.0

@@ -58,6 +58,11 @@ class Flexion:
         moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moved(step)}
         return len(moved)
 
+    @property
+    def tips(self) -> list[int]:
+        """Bodies at the ends of the fingers, those that are bars of linkages left out."""
+        return [tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars]
+
     def motion(self) -> dict[int, tuple[float, float]]:
         """Return the open and closed end of each hinge and slide that closes, those that others drive included."""
         poses = self.closing.poses
@@ -148,8 +153,8 @@ class Flexion:
     def _meeting(self, body: int) -> tuple[float, ...] | None:
         """Return where a body faces the tip of the other chain, of two that close on each other without curling."""
         segment, chain = self.tree.segment[body], self.closing.chain
-        tips = [tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars]
-        is_jaw = len({chain[self.tree.segment[tip]] for tip in tips}) == 2 and segment in {self.tree.segment[tip] for tip in tips}
+        tips, jaws = self.tips, {self.tree.segment[tip] for tip in self.tips}
+        is_jaw = segment in jaws and len({chain[jaw] for jaw in jaws}) == 2
         if not is_jaw or not self.closing.motions or any(motion.is_curling for motion in self.closing.motions.values()):
             return None
         own = [tip for tip in tips if self.tree.segment[tip] == segment]

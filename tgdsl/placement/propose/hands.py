@@ -125,11 +125,12 @@ class Hand:
 
     Attributes:
         base: Segment from which the chains part; 0 if they hang on the world.
-        mounts: Bodies of it that have surface and are not before the one that carries the chains.
+        mounts: Bodies of it that have surface; where chains part, without those before the one that carries them.
         palm: The largest of these, or None if there is none or only one chain.
         chains: Segments of each chain.
         tips: Bodies at the ends of the chains.
         fingers: All bodies that move against the base, tips included.
+        length: Length of the longest chain [m].
     """
 
     base: int
@@ -138,6 +139,7 @@ class Hand:
     chains: list[list[int]]
     tips: list[int]
     fingers: list[int]
+    length: float
 
 
 def kinematic_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, Float[np.ndarray, " 3"]]) -> KinematicTree:
@@ -227,13 +229,17 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
     middle = tree.centre(palm, tree.start) if palm is not None else tree.start.xpos[base]
     ends = [s for chain in chains for s in _ends(tree, chain, middle)]
     fingers = sorted(body for s in beyond for body in tree.bodies[s])
-    return Hand(base, mounts, palm, chains, sorted(body for s in ends for body in _last(tree, s)), fingers)
+    tips = sorted(body for s in ends for body in _last(tree, s))
+    first = [s for s in beyond if tree.parent[s] not in beyond]
+    return Hand(base, mounts, palm, chains, tips, fingers, max((_length(tree, s) for s in first), default=0.0))
 
 
 def _mounts(tree: KinematicTree, base: int) -> list[int]:
     """Return the bodies with surface of a segment that are not before the one that carries its chains."""
     above = [_within(tree, base, int(tree.model.body_parentid[child])) for child in tree.children(base)]
-    common = [body for body in above[0] if all(body in path for path in above)] if above else [base]
+    if len(above) < 2:
+        return tree.bodies[base]
+    common = [body for body in above[0] if all(body in path for path in above)]
     for body in common:  # upward, to the first with surface
         if own := [b for b in tree.bodies[base] if body in _within(tree, base, b)]:
             return own
