@@ -6,7 +6,7 @@ The evidence, in the order in which it decides:
    bends too, closes at the far end. That a tip then moves away from the others, as a thumb's may, is named but does not count:
    what is nearer depends on the pose of the rest of the hand, how a finger curls does not.
 2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
-   other chains and to the palm, with the other joints half closed and closed; of a slide, and of the only hinge of a chain, even
+   other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
    against its range. A hinge of a curling finger that has its range against it stays undecided.
 3. The range alone: the only hinge of a chain closes at the far end of a range that bends away from its start; that is weak.
 """
@@ -196,15 +196,10 @@ class Closing:
     def _gain(self, joint: int, others: Mapping[int, float]) -> float:
         """Return the share by which the tips draw nearer as a joint goes from the low to the high end of its range."""
         low, high = (self._points({**others, joint: end}) for end in self._range(joint))
-        is_moved = np.linalg.norm(high - low, axis=1) > 1e-6
-        num = len(self.hand.tips)
+        is_moved, num = np.linalg.norm(high - low, axis=1) > 1e-6, len(self.hand.tips)
         chains = [self.chain[self.tree.segment[tip]] for tip in self.hand.tips] + [-1] * (len(low) - num)
-        pairs = [
-            (i, j)
-            for i in range(num)
-            for j in range(i + 1, len(low))
-            if chains[i] != chains[j] and (is_moved[i] or is_moved[j])
-        ]
+        apart = [(i, j) for i in range(num) for j in range(i + 1, len(low)) if chains[i] != chains[j]]
+        pairs = [(i, j) for i, j in apart if is_moved[i] or is_moved[j]]
         if not pairs:
             return 0.0
         at_low, at_high = (float(np.mean([np.linalg.norm(p[i] - p[j]) for i, j in pairs])) for p in (low, high))

@@ -22,8 +22,8 @@ LINK_SNAP, PALM_SNAP = np.radians(30.0), np.radians(40.0)
 """A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken."""
 STEP = 0.02
 """Share of its way by which a joint closes to see where a link goes."""
-MIN_AGREEMENT = 0.5
-"""Least length of the mean of the unit vectors to which fingers curl for them to say where the palm faces."""
+ALIKE = 0.5
+"""Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
 UNCLEAR = "which side is the inner one is not clear"
 """Why a link has no inner side, where nothing better is known."""
 
@@ -185,13 +185,14 @@ class Flexion:
         return InnerSide(direction) if is_clear else InnerSide(None, UNCLEAR)
 
     def _curled(self) -> Float[np.ndarray, " 3"] | None:
-        """Return the mean direction, in the open pose, to which curling fingers carry their first links; None if they differ."""
+        """Return where most fingers, as they curl, carry their first links in the open pose; None if there is no such majority."""
         found = []
         for chain in self.hand.chains:
             carried = [self._carried(body) for s in chain for body in self.tree.bodies[s]]
             found += [c[1] for c in carried if c is not None and self.closing.motions[c[0]].is_curling][:1]
-        mean = np.mean(found, axis=0) if found else np.zeros(3)
-        return mean if 2 * len(found) > len(self.hand.chains) and float(np.linalg.norm(mean)) > MIN_AGREEMENT else None
+        alike = [[other for other in found if one @ other > ALIKE] for one in found]
+        most = max(alike, key=len, default=[])
+        return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
     def _toward(self, body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
         """Return the direction from the palm to the middle of tips in a body's frame, all joints closed by a share."""

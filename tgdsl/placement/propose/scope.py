@@ -46,7 +46,7 @@ def included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[st
         if not own:
             barred = [name for name in left_out if name == pattern or name in matching(pattern, [name])]
             why = [f'"{name}" can have no taxels: {left_out[name]}' for name in barred]
-            hint = did_you_mean(pattern, [*names], "links")
-            raise TgdslError(f"--include: {'; '.join(why) if why else f'no link matches "{pattern}"; {hint}'}")
+            what = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
+            raise TgdslError(f"--include: {what}")
         found |= own
     return found
