@@ -185,7 +185,7 @@ class Flexion:
         return InnerSide(direction) if is_clear else InnerSide(None, UNCLEAR)
 
     def _curled(self) -> Float[np.ndarray, " 3"] | None:
-        """Return where most fingers, as they curl, carry their first links in the open pose; None if there is no such majority."""
+        """Return where most fingers, as they curl, carry their first links in the open pose; None if no majority does."""
         found = []
         for chain in self.hand.chains:
             carried = [self._carried(body) for s in chain for body in self.tree.bodies[s]]
