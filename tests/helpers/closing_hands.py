@@ -37,10 +37,12 @@ def palm_and_fingers(thumb: str, side: int = 1, pos: str = "0 0 .2", name: str =
     return f'<body name="{name}palm" pos="{pos}">{joint}{palm}{fingers}{thumb}</body>'
 
 
-def thumb(side: int, turned: int = 0, name: str = "") -> str:
-    """Return a thumb that points away from the fingers' side; turned by 180 deg, it curls away from the palm."""
-    bends = {"axis": "0 1 0", "span": "0 80"} if side > 0 else {"axis": "0 -1 0", "span": "-80 0"}
-    return finger(f"{name}thumb", f"0 {-side * 0.045:.3g} .02", f"{side * 90} 0 {turned}", **bends)
+def thumb(side: int, is_away: bool = False, name: str = "") -> str:
+    """Return a thumb at the palm's edge that points away from it; or one that stands there and curls away from the palm."""
+    bends = {"axis": "0 1 0", "span": "0 50"} if side > 0 else {"axis": "0 -1 0", "span": "-50 0"}
+    if is_away:
+        return finger(f"{name}thumb", f"0 {-side * 0.055:.3g} .02", "0 0 180", **bends)
+    return finger(f"{name}thumb", f"0 {-side * 0.045:.3g} .02", f"{side * 90} 0 0", **bends)
 
 
 def slides(start: str = "closed", name: str = "") -> str:
@@ -121,11 +123,11 @@ _TWO_HANDS = "".join(
 )
 _HEAD = '<body name="head" pos="0 0 .3"><joint axis="0 0 1" range="-60 60"/><geom size=".08" pos="0 0 .05"/></body>'
 _BRANCHED = (
-    '<body name="meta" pos="0 .02 .085"><joint name="arch" axis="0 1 0" range="0 20"/><geom type="box" size=".01 .02 .012" '
+    '<body name="meta" pos="0 .07 .085"><joint name="arch" axis="0 1 0" range="0 20"/><geom type="box" size=".01 .02 .012" '
     f'pos="0 0 .015"/>{finger("a", "0 .012 .03")}{finger("b", "0 -.012 .03")}</body>'
 )
 _ARCH = (
-    '<body name="wrist"><geom type="box" size=".01 .02 .012"/>'
+    '<body name="wrist" pos="0 0 .2"><geom type="box" size=".01 .02 .012"/>'
     f'{finger("thumb", "0 -.03 0", "60 0 0", 2)}<body name="arch" pos="0 0 .02"><joint axis="0 1 0" range="-5 15"/>'
     '<geom type="box" size=".01 .04 .03" pos="0 0 .03"/>'
     f"{''.join(finger(f'f{i}_', f'0 {0.02 * i - 0.02:.3g} .065') for i in range(3))}</body></body>"
@@ -136,9 +138,9 @@ MADE = {
     "five_fingers": MadeHand(world(palm_and_fingers(thumb(1))), frozenset(_fingertips())),
     **{
         f"thumb_away_from_the_{'right' if side > 0 else 'left'}_palm": MadeHand(
-            world(palm_and_fingers(thumb(side, 180), side)),
+            world(palm_and_fingers(thumb(side, is_away=True), side)),
             frozenset(_fingertips()),
-            doubted=frozenset({"thumb1", "thumb2", "thumb3"}),
+            doubted=frozenset({"thumb1", "thumb2"}),
         )
         for side in (1, -1)
     },
