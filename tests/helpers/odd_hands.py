@@ -145,15 +145,14 @@ HANDS = {
         palm=("base",),
         fingers=tuple(f"{side}_{part}" for side in ("left", "right") for part in ("driver", "finger", "pad", "rocker")),
         others=("bracket",),
-        facing=(("left_pad", None), ("base", None)),
+        facing=(("left_pad", (1, 0, 0)), ("right_pad", (1, 0, 0)), ("base", (0, 0, 1))),
     ),
     "capsules": OddHand(
         CAPSULES,
         tips=("tips", "f[2] end", "thumb end"),
         palm=("palm",),
         fingers=("f[1]", "tips", "f[2]", "f[2] end", "thumb", "thumb end"),
-        others=("wrist",),
-        facing=(("tips", (-1, 0, 0)), ("f[2]", (-1, 0, 0)), ("thumb end", (1, 0, 0)), ("wrist", None)),
+        facing=(("tips", (-1, 0, 0)), ("f[2]", (-1, 0, 0)), ("thumb end", (1, 0, 0)), ("palm", (-1, 0, 0))),
     ),
     "visual": OddHand(
         VISUAL,

@@ -16,8 +16,9 @@ from jaxtyping import Bool, Float
 from tgdsl.errors import RobotError, SampleError, TgdslError
 from tgdsl.formats.model import Model
 from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
-from tgdsl.placement.propose.flexion import Flexion
-from tgdsl.placement.propose.hands import Hand, KinematicTree, free_standing, hands, kinematic_tree
+from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
+from tgdsl.placement.propose.hands import KinematicTree, free_standing, kinematic_tree
+from tgdsl.placement.propose.scope import chosen_hands, included, outside
 from tgdsl.placement.reach import Colliders
 from tgdsl.placement.sample.poisson import Pool
 
@@ -31,6 +32,8 @@ COVERING = 0.75
 """Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
 MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
+_USUAL = 4e4
+"""The density that `closing_motion` takes [1/m²]: 4/cm²."""
 NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
 COVERED = "all of it is inside other links in the initial state"
 
@@ -66,6 +69,7 @@ class LinkProposal:
         name: Its body.
         area: Surface to be covered [m²].
         facing: Direction of its inner side in the link's frame; None: it is covered all around.
+        doubt: What speaks against that side, or why there is none; empty if nothing does.
         counts: Number of taxels at each resolution.
         options: Options by which taxels are where they can feel.
     """
@@ -73,6 +77,7 @@ class LinkProposal:
     name: str
     area: float
     facing: tuple[float, ...] | None
+    doubt: str
     counts: dict[str, int]
     options: Options
 
@@ -116,36 +121,55 @@ class Proposal:
         return {"tgdsl": 1, **groups, "resolutions": resolutions}
 
 
-def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
+def propose(robot: Model, density: float, with_groups: bool = True, include: Sequence[str] = ()) -> Proposal:
     """Return a layout for a robot; the same robot gives the same layout.
 
     Args:
         robot: The robot.
         density: Taxels per area at `med` [1/m²].
         with_groups: Whether to propose link groups.
+        include: Names or shell wildcards of links outside its hands that are to have taxels too.
 
     Raises:
-        TgdslError: If no link can be sampled, or if the density asks for more taxels than a link can have.
+        TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include
+            matches no link that can have taxels.
     """
-    surfaces, left_out = _link_surfaces(robot)
-    is_collided = _keep_what_feels(robot, surfaces, left_out, density)
+    surfaces, left_out, is_collided = _touchable(robot, density)
+    asked = included(include, tuple(surfaces), dict(left_out))
     tree = _tree(robot, surfaces)
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
-    for body in free_standing(tree):
-        del surfaces[names[body]]
-        left_out.append((names[body], "stands or floats by itself: taken for scenery or an object"))
+    found = chosen_hands(tree)
+    for body, why in outside(tree, found).items():
+        if names[body] not in asked:
+            del surfaces[names[body]]
+            left_out.append((names[body], why))
     if not surfaces:
         what = "; ".join(f'"{name}": {why}' for name, why in left_out)
         raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({what})" if what else ""))
-    found = hands(tree)
-    facing: dict[str, tuple[float, ...] | None] = {}
-    for hand in found:
-        flexion = Flexion(tree, hand)
-        wanted = [*hand.fingers, *([hand.palm] if hand.palm is not None else [])]
-        facing |= {names[body]: flexion.direction(body) for body in wanted}
-    links = tuple(_link(name, surfaces[name], facing.get(name), density) for name in robot.bodies if name in surfaces)
+    sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
+    asked_for = InnerSide(None, "asked for with --include")
+    links = tuple(_link(name, surfaces[name], sides.get(name, asked_for), density) for name in robot.bodies if name in surfaces)
     groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
     return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)), is_collided)
+
+
+def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
+    """Return how the hands of a robot close: by name, each joint's open and closed end [rad, of slides m].
+
+    A joint that has no name, or of which it is not clear which end is the closed one, is not in it.
+    """
+    surfaces, _, _ = _touchable(robot, _USUAL)
+    motion: dict[str, tuple[float, float]] = {}
+    for flexion in chosen_hands(_tree(robot, surfaces)):
+        motion |= {robot.compiled.joint(joint).name: ends for joint, ends in flexion.motion().items()}
+    return {name: ends for name, ends in motion.items() if name}
+
+
+def _touchable(robot: Model, density: float) -> tuple[dict[str, LinkSurface], list[tuple[str, str]], bool]:
+    """Return what can be touched of each link, the others and why nothing can, and whether the simulator collides any."""
+    surfaces, left_out = _link_surfaces(robot)
+    is_collided = _keep_what_feels(robot, surfaces, left_out, density)
+    return surfaces, left_out, is_collided
 
 
 def _tree(robot: Model, surfaces: Mapping[str, LinkSurface]) -> KinematicTree:
@@ -210,20 +234,20 @@ def _link_surface(robot: Model, body: str) -> LinkSurface | str:
     return LinkSurface(pool) if pool.area >= MIN_AREA else "a surface without area"
 
 
-def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
-    share = 1.0
+def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> LinkProposal:
+    share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
         pool = surface.pool
         share = float(pool.point_area[_faces(pool.normal, facing)].sum()) / pool.area
         if share < MIN_SHARE:
-            share, facing = 1.0, None
+            share, facing, doubt = 1.0, None, UNCLEAR
     area = share * surface.area
     counts = {resolution: max(1, round(area * density * factor)) for resolution, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
-    return LinkProposal(name, area, facing, counts, surface.options)
+    return LinkProposal(name, area, facing, doubt, counts, surface.options)
 
 
 def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:
@@ -231,13 +255,13 @@ def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool
     return normals @ direction >= np.cos(np.radians(WITHIN_DEG))
 
 
-def _groups(found: Sequence[Hand], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Return the groups that have members; `fingers` and `hand` name those that they contain."""
     order = {name: i for i, name in enumerate(links)}
-    tips = {names[body] for hand in found for body in hand.tips}
-    palms = {names[hand.palm] for hand in found if hand.palm is not None}
-    fingers = {names[body] for hand in found for body in hand.fingers}
-    rest = set(links) - fingers - palms
+    tips = {names[body] for flexion in found for body in flexion.tips}
+    palms = {names[flexion.hand.palm] for flexion in found if flexion.hand.palm is not None}
+    fingers = {names[body] for flexion in found for body in flexion.hand.fingers}
+    mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}
 
     def members(*groups: str, bodies: set[str]) -> tuple[str, ...]:
@@ -248,7 +272,7 @@ def _groups(found: Sequence[Hand], names: dict[int, str], links: tuple[str, ...]
         "tips": members(bodies=tips),
         "palm": members(bodies=palms),
         "fingers": members("tips", bodies=fingers - tips) if fingers else (),
-        "hand": members("fingers", "palm", bodies=rest),
+        "hand": members("fingers", "palm", bodies=mounts),
     }
     return {name: group for name, group in wanted.items() if group}
 

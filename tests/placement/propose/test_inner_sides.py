@@ -1,0 +1,155 @@
+"""Inner sides, hands and closing motions of hands made so that these are known, and of our robots, whose pads are."""
+
+import mujoco
+import numpy as np
+import pytest
+from closing_hands import INNER, MADE, arm, parallel_jaws, slides, world
+from odd_hands import FOUR_BAR
+
+from tgdsl.errors import TgdslError
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.links import layout_of, open_robot
+from tgdsl.placement.propose.propose import closing_motion, propose
+from tgdsl.schema.load import load_layout
+from tgdsl.schema.select import matching
+
+DENSITY = 1e4
+
+
+def loaded(tmp_path, text: str, name: str = "hand.xml"):
+    (tmp_path / name).write_text(text)
+    return load_model(tmp_path / name)
+
+
+@pytest.fixture(scope="module", params=MADE)
+def made(request, tmp_path_factory):
+    """A hand, and the layout proposed for it."""
+    hand = MADE[request.param]
+    return hand, propose(loaded(tmp_path_factory.mktemp("made"), hand.text), DENSITY)
+
+
+def test_the_inner_side_is_where_it_was_made(made):
+    hand, proposal = made
+    found = {link.name: link.facing for link in proposal.links}
+    assert found == {name: hand.facing.get(name, INNER) for name in found}
+
+
+def test_what_is_before_or_beside_a_hand_is_left_out(made):
+    hand, proposal = made
+    assert {name for name, why in proposal.left_out if "--include" in why} == hand.left_out
+    assert {name for name, why in proposal.left_out} - hand.left_out <= {"world", "base"}
+    assert set(proposal.groups["tips"]) == hand.tips
+
+
+def test_what_speaks_against_a_guess_is_named(made):
+    hand, proposal = made
+    assert {link.name for link in proposal.links if link.doubt} == hand.doubted
+
+
+def test_links_that_are_asked_for(tmp_path):
+    robot = loaded(tmp_path, world(arm(slides()) + '<body name="f[1]" pos="2 0 0"><geom size=".01"/></body>'))
+    for include, names in ((("arm1",), {"arm1"}), (("arm[45]", "f[[]1]"), {"arm4", "arm5", "f[1]"}), (("f[1]",), {"f[1]"})):
+        proposal = propose(robot, DENSITY, include=include)
+        extra = {link.name: link for link in proposal.links if link.name not in ("gripper", "jaw0", "jaw1")}
+        assert extra.keys() == names
+        assert {(link.facing, link.doubt) for link in extra.values()} == {(None, "asked for with --include")}
+        assert not names & {name for group in proposal.groups.values() for name in group}
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("amr1", '--include: no link matches "amr1"; did you mean "arm1"?'),
+        ("frame*", '--include: "frame" can have no taxels: no geoms'),
+        ("", '--include: no link matches ""; known links: arm1, arm2, arm3, arm4, arm5, gripper, jaw0, jaw1'),
+    ],
+)
+def test_links_that_cannot_be_asked_for(tmp_path, pattern, message):
+    robot = loaded(tmp_path, world(arm(slides()) + '<body name="frame"/>'))
+    with pytest.raises(TgdslError) as caught:
+        propose(robot, DENSITY, include=(pattern,))
+    assert str(caught.value) == message
+
+
+def test_the_command_says_what_is_weak_and_takes_include(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(MADE["thumb_away_from_the_left_palm"].text)
+    code, said, _ = here(tmp_path, "layout", "new", "hand.xml")
+    text = (tmp_path / "layout.yaml").read_text()
+    assert code == 0
+    assert "weak guess of the inner side: thumb" in said and "away from the palm" in said
+    assert "inner side guessed from how the joints close; weak: as it curls, its tip goes" in text
+    (tmp_path / "hand.xml").write_text(MADE["arm_and_slides"].text)
+    code, said, _ = here(tmp_path, "layout", "new", "hand.xml", "--force", "--include", "arm5", "arm1")
+    text = (tmp_path / "layout.yaml").read_text()
+    assert code == 0
+    assert "left out: arm2, arm3, arm4: before the link from which the fingers part; --include adds it\n" in said
+    assert "all around: arm1, arm5: asked for with --include\n" in said
+    assert "# Left out: arm2, arm3, arm4: before" in text and "asked for with --include: all around\n    arm5: {" in text
+
+
+@pytest.mark.parametrize("robot", ["xhand1", "xhand1_left", "sharpa", "sharpa_left"])
+def test_our_robots_face_their_pads(robot):
+    """Each link with a pad of which a layout by hand says where it faces is guessed to face there, within 45 deg."""
+    model, layout = open_robot(robot), load_layout(layout_of(robot)).spec
+    found = {link.name: link.facing for link in propose(model, DENSITY).links}
+    for pattern, placement in layout.resolutions["med"].items():
+        for name in matching(pattern, list(model.bodies)):
+            known, guess = -np.array(placement.direction), np.array(found[name])
+            assert known @ guess / np.linalg.norm(known) / np.linalg.norm(guess) > np.cos(np.radians(45.0)), name
+
+
+def test_slides_close_to_where_they_meet(tmp_path):
+    assert closing_motion(loaded(tmp_path, world(slides()))) == {"slide0": (0.04, 0.0), "slide1": (0.04, 0.0)}
+    robot = loaded(tmp_path, world(arm(slides("open"))))
+    assert closing_motion(robot) == {"slide0": (0.0, -0.04), "slide1": (0.0, -0.04)}
+
+
+def test_a_thumb_closes_as_it_curls(tmp_path):
+    for side, sign in (("right", 1), ("left", -1)):
+        found = closing_motion(loaded(tmp_path, MADE[f"thumb_away_from_the_{side}_palm"].text))
+        assert len(found) == 15
+        for name, ends in found.items():
+            expected = (0.0, sign * np.radians(50.0)) if name.startswith("thumb") else (0.0, np.radians(90.0))
+            np.testing.assert_allclose(ends, expected, rtol=0, atol=1e-12)
+
+
+def test_mimicked_joints_close_along(tmp_path):
+    found = closing_motion(loaded(tmp_path, parallel_jaws()))
+    for name, (opened, closed) in found.items():
+        expected = -45.0 if name.endswith("_level") else 45.0
+        np.testing.assert_allclose((opened, np.degrees(closed)), (0.0, expected), rtol=0, atol=1e-3)
+    assert len(found) == 6
+
+
+def test_loops_hold_while_closing(tmp_path):
+    """Both poses satisfy MuJoCo's own residuals of the loops; the pads, twice as far in, face each other."""
+    text = FOUR_BAR
+    for side in ("left", "right"):
+        for part in ("driver", "finger", "rocker"):
+            start = text.index("<joint", text.index(f'name="{side}_{part}"'))
+            text = f'{text[:start]}<joint name="{side}_{part}"{text[start + 6 :]}'
+    coupled = '<joint joint1="right_driver" joint2="left_driver" polycoef="0 1 0 0 0"/></equality>'
+    for variant in (text, text.replace("</equality>", coupled)):
+        robot = loaded(tmp_path, variant)
+        found = closing_motion(robot)
+        assert found.keys() == {f"{side}_{part}" for side in ("left", "right") for part in ("driver", "finger", "rocker")}
+        model = robot.compiled
+        data, apart = mujoco.MjData(model), []
+        for end in (0, 1):
+            for name, ends in found.items():
+                data.joint(name).qpos[:] = ends[end]
+            mujoco.mj_forward(model, data)
+            is_loop = data.efc_type[: data.nefc] == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+            assert is_loop.any() and np.abs(data.efc_pos[: data.nefc][is_loop]).max() < 1e-4
+            apart.append(float(np.linalg.norm(data.body("left_pad").xpos - data.body("right_pad").xpos)))
+        assert apart[1] < 0.5 * apart[0]
+        facing = {link.name: link.facing for link in propose(robot, DENSITY).links}
+        assert {facing[name] for name in ("left_pad", "right_pad", "left_finger", "right_finger")} == {INNER}
+        assert facing["base"] == (0, 0, 1)
+
+
+def test_an_arm_alone_closes_nothing(tmp_path):
+    robot = loaded(tmp_path, world(arm("")))
+    assert closing_motion(robot) == {}
+    proposal = propose(robot, DENSITY)
+    assert len(proposal.links) == 5 and {link.facing for link in proposal.links} == {None}
