@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from tgdsl.errors import ArtifactError, RobotError, TgdslError
 from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
+from tgdsl.scene.mujoco_warnings import muted_mujoco
 
 INHERITED = (
     *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
@@ -26,23 +25,6 @@ INHERITED = (
 _STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 OFF_CENTER = 2e-6
 """Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
-
-
-@contextmanager
-def muted_mujoco() -> Iterator[None]:
-    """Turn what MuJoCo would print and log while it reads a model into Python warnings.
-
-    One is left out: a robot attached under its own names, with no prefix, is just what a scene of ours wants, and scenes are
-    never saved by MuJoCo, which is what it warns of.
-    """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: warnings.warn(f"MuJoCo: {message}", stacklevel=2))
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*Attaching a spec with an empty prefix")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:

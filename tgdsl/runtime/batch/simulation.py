@@ -25,6 +25,7 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices
 
@@ -92,6 +93,7 @@ class BatchSimulation(Simulation):
         self._touch = touch
         self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
+        self._warnings = StepWarnings()
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
@@ -183,6 +185,9 @@ class BatchSimulation(Simulation):
 
     def _run(self, call: Callable[[], None]) -> None:
         try:
-            call()
+            with collected_messages() as messages:
+                call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
+        if messages:
+            self._warnings.tell(messages)
