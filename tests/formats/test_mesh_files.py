@@ -52,7 +52,8 @@ def urdf_of(folder: Path, *meshes: str) -> Path:
         for i, mesh in enumerate(meshes)
     )
     joints = "".join(
-        f"<joint name='j{i}' type='continuous'><parent link='link0'/><child link='link{i}'/></joint>" for i in range(1, len(meshes))
+        f"<joint name='j{i}' type='continuous'><parent link='link0'/><child link='link{i}'/></joint>"
+        for i in range(1, len(meshes))
     )
     path = folder / "my hand.urdf"
     path.write_text(f"<robot name='hand'>{links}{joints}</robot>")
@@ -71,7 +72,9 @@ def test_urdf_meshes_are_at_their_place(tmp_path, ending, scale):
     scene, points = two_nodes()
     written(scene, tmp_path, f"a part.{ending.lower()}")
     (tmp_path / f"a part.{ending.lower()}").rename(tmp_path / f"a part.{ending}")
-    path = urdf_of(tmp_path, f"<mesh filename='a part.{ending}' scale='{' '.join(map(str, scale))}'/>", "<sphere radius='.01'/>")
+    path = urdf_of(
+        tmp_path, f"<mesh filename='a part.{ending}' scale='{' '.join(map(str, scale))}'/>", "<sphere radius='.01'/>"
+    )
     model, said = loaded(path)
     rotation = Rotation.from_euler("z", 1.5).as_matrix()
     assert nearest(trimesh_of(model, "link0").vertices, (points * scale) @ rotation.T + [0.1, 0, 0]) < MESH_TOLERANCE
@@ -82,7 +85,9 @@ def test_urdf_meshes_are_at_their_place(tmp_path, ending, scale):
 def test_a_mesh_is_as_closed_as_its_file_says_whatever_its_seams(tmp_path):
     """glTF stores a vertex once for each normal at it; as a solid it is one."""
     mesh = small()
-    seams = trimesh.Trimesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False)
+    seams = trimesh.Trimesh(
+        mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
+    )
     trimesh.Scene(seams).export(tmp_path / "a.glb")
     model, _ = loaded(urdf_of(tmp_path, "<mesh filename='a.glb'/>"))
     found = trimesh_of(model, "link0")
@@ -128,7 +133,7 @@ def test_an_artefact_carries_them_by_content(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.warns(UserWarning, match="read by trimesh"):
         touch = tgdsl.compile(document)
-    touch.save("touch.safetensors")
+    tgdsl.save(touch, "touch.safetensors")
     (tmp_path / "a.glb").unlink()
     sim = tgdsl.simulate(tgdsl.load("touch.safetensors"), 1)
     sim.step()
@@ -146,7 +151,11 @@ def _draco(folder: Path) -> None:
     [
         ("a.glb", lambda folder: (folder / "a.glb").write_bytes(b"glTF, but no more"), "not glTF 2.0"),
         ("a.gltf", _draco, "this mesh is stored by KHR_draco_mesh_compression, which cannot be read"),
-        ("a.gltf", lambda folder: written(two_nodes()[0], folder, "a.gltf") or (folder / "gltf_buffer_0.bin").unlink(), "trimesh cannot read"),
+        (
+            "a.gltf",
+            lambda folder: written(two_nodes()[0], folder, "a.gltf") or (folder / "gltf_buffer_0.bin").unlink(),
+            "trimesh cannot read",
+        ),
         ("a.off", lambda folder: (folder / "a.off").write_text("OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n"), "this mesh"),
         ("a.step", lambda folder: (folder / "a.step").write_text(""), 'mesh "a.step": expected one of .stl, .obj, .msh, .glb'),
     ],
@@ -162,7 +171,9 @@ def test_what_cannot_be_read_is_named(tmp_path, name, write, what):
 def test_collada_says_which_package_it_needs(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "collada", None)
     (tmp_path / "a.dae").write_text("<COLLADA/>")
-    with pytest.raises(RobotError, match=r"a\.dae: this mesh needs another package: .*collada.*; or convert it to \.stl or \.obj"):
+    with pytest.raises(
+        RobotError, match=r"a\.dae: this mesh needs another package: .*collada.*; or convert it to \.stl or \.obj"
+    ):
         load_model(urdf_of(tmp_path, "<mesh filename='a.dae'/>"))
 
 

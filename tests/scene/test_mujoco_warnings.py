@@ -22,7 +22,9 @@ MIMIC = f"""<robot name='r'><link name='world'/><link name='b'>{INERTIAL}</link>
 DEPRECATED = "<mujoco><compiler settotalmass='3'/><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
 
 
-@pytest.mark.parametrize(("name", "text", "what"), [("r.urdf", MIMIC, "<mimic> on joint 'j'"), ("r.xml", DEPRECATED, "settotalmass")])
+@pytest.mark.parametrize(
+    ("name", "text", "what"), [("r.urdf", MIMIC, "<mimic> on joint 'j'"), ("r.xml", DEPRECATED, "settotalmass")]
+)
 def test_a_model_s_are_told_once(tmp_path, monkeypatch, capfd, name, text, what):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / name
@@ -41,7 +43,9 @@ def test_they_end_no_process(tmp_path, filters):
     (tmp_path / "r.urdf").write_text(MIMIC)
     environment = {**os.environ, "PYTHONWARNINGS": filters, "PYTHONPATH": str(REPOSITORY)}
     code = "from pathlib import Path\nfrom tgdsl.formats.robot import load_model\nload_model(Path('r.urdf'))"
-    ran = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == (1 if filters == "error" else 0), ran.stderr
     assert "UserWarning: r.urdf: MuJoCo: <mimic> on joint 'j' ignored" in ran.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["r.urdf"]
@@ -64,7 +68,10 @@ def test_others_keep_their_words_and_kind():
         warnings.warn("old", DeprecationWarning, stacklevel=1)
         warnings.warn("hand.xml: a reader's own", stacklevel=1)
         warnings.warn("Attaching a spec with an empty prefix", stacklevel=1)
-    assert [(w.category, str(w.message)) for w in caught] == [(DeprecationWarning, "old"), (UserWarning, "hand.xml: a reader's own")]
+    assert [(w.category, str(w.message)) for w in caught] == [
+        (DeprecationWarning, "old"),
+        (UserWarning, "hand.xml: a reader's own"),
+    ]
 
 
 def test_a_simulation_that_diverges_prints_and_logs_nothing(tmp_path, monkeypatch, capfd):
@@ -82,7 +89,9 @@ def test_a_step_s_are_told_once_each_whatever_their_numbers():
     told = StepWarnings()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        told.tell(["Pre-allocated constraint buffer is full (12). Time = 0.1000.\n\n", "Nan, Inf or huge value in QACC at DOF 0."])
+        told.tell(
+            ["Pre-allocated constraint buffer is full (12). Time = 0.1000.\n\n", "Nan, Inf or huge value in QACC at DOF 0."]
+        )
         told.tell(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
     assert [str(w.message) for w in caught] == [
         "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; this is said once",
