@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -174,8 +174,12 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
 class SceneModels:
     """The models of a scene whose objects differ between environments, all of one layout, each compiled once while in use."""
 
-    def __init__(self, scene: SceneFile):
+    def __init__(self, scene: SceneFile, prepare: Callable[[mujoco.MjSpec], None] | None = None):
         """Read the assets.
+
+        Args:
+            scene: The scene.
+            prepare: Changes the scene before anything of it is compiled.
 
         Raises:
             ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
@@ -183,6 +187,8 @@ class SceneModels:
         self.objects = {target.name: target for target in scene.objects}
         with muted_mujoco():
             self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
+            if prepare is not None:
+                prepare(self._base)
         self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}
         self._off_center: tuple[str, ...] = ()
         for target in scene.objects:
@@ -192,6 +198,11 @@ class SceneModels:
                 self._off_center += (target.body,)
         if self._off_center:
             self._models.clear()
+
+    def first(self) -> mujoco.MjSpec:
+        """Return the scene with the first variant of each object, to read or to compile."""
+        with muted_mujoco():
+            return with_choices(self._base.copy(), list(self.objects.values()), {})
 
     def model(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
         """Return the scene with some choices of objects; the others have their first variant.

@@ -58,6 +58,7 @@ class BatchSimulation(Simulation):
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
         on_fault: OnFault = "raise",
+        prepare: Callable[[mujoco.MjSpec], None] | None = None,
     ):
         """Start all environments.
 
@@ -72,6 +73,7 @@ class BatchSimulation(Simulation):
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
                 them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
                 with controls that are not finite, which "raise" refuses.
+            prepare: Changes the artefact's scene before it is compiled; bodies and contact sensors must stay.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -81,7 +83,7 @@ class BatchSimulation(Simulation):
         """
         refuse_unfit(touch, num_envs, substeps, model)
         if model is None:
-            scenes = SceneModels(touch.plan.scene)
+            scenes = SceneModels(touch.plan.scene, prepare)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = EnvObjects(scenes, touch.inputs, num_envs)
