@@ -83,7 +83,7 @@ def test_urdf_meshes_are_at_their_place(tmp_path, ending, scale):
 
 
 def test_a_mesh_is_as_closed_as_its_file_says_whatever_its_seams(tmp_path):
-    """glTF stores a vertex once for each normal at it; as a solid it is one."""
+    """GlTF stores a vertex once for each normal at it; as a solid it is one."""
     mesh = small()
     seams = trimesh.Trimesh(
         mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
@@ -163,7 +163,7 @@ def _draco(folder: Path) -> None:
 def test_what_cannot_be_read_is_named(tmp_path, name, write, what):
     write(tmp_path)
     path = urdf_of(tmp_path, f"<mesh filename='{name}'/>")
-    with pytest.raises(RobotError, match="my hand.urdf|a\\.") as caught:
+    with pytest.raises(RobotError, match=r"my hand\.urdf|a\.") as caught:
         load_model(path)
     assert what in str(caught.value) and name in str(caught.value)
 

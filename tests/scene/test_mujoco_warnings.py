@@ -64,10 +64,12 @@ def test_a_handler_of_the_user_s_is_given_back():
 
 
 def test_others_keep_their_words_and_kind():
-    with pytest.warns(Warning) as caught, told_of("hand.xml"):
-        warnings.warn("old", DeprecationWarning, stacklevel=1)
-        warnings.warn("hand.xml: a reader's own", stacklevel=1)
-        warnings.warn("Attaching a spec with an empty prefix", stacklevel=1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with told_of("hand.xml"):
+            warnings.warn("old", DeprecationWarning, stacklevel=1)
+            warnings.warn("hand.xml: a reader's own", stacklevel=1)
+            warnings.warn("Attaching a spec with an empty prefix", stacklevel=1)
     assert [(w.category, str(w.message)) for w in caught] == [
         (DeprecationWarning, "old"),
         (UserWarning, "hand.xml: a reader's own"),

@@ -60,20 +60,21 @@ class Run:
             if self.compiled:
                 touch.compile()
             progress(f"starting {self.num_envs} environments" if self.num_envs > 1 else "starting the simulation")
-            sim, controls = self._start(touch)
+            sim, controls = self._start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 
-    def _start(self, touch: TactileModule) -> tuple[Simulator, Controls]:
+    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[Simulator, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
         from tgdsl.runtime.rollout import default_keyframes, recorded_controls, scripted_controls
         from tgdsl.runtime.simulate import simulate
         from tgdsl.scene.scene import scene_model
 
         if self.controls is None and self.keyframes is None and not default_keyframes(scene_model(touch.plan.scene)):
+            progress("finding out how the hand closes")
             return self._closing(touch)
         sim = simulate(touch, self.num_envs, substeps=self.substeps)
         if self.controls is not None:
@@ -92,8 +93,8 @@ class Run:
 
         closing = closing_of(touch)
         if isinstance(closing, str):
-            print(f"no keyframes rest and squeeze, and the hand does not close: {closing}")
-            print(f"the scene's initial state is held for {self.seconds:g} s")
+            why = f"no keyframes rest and squeeze, and the hand does not close ({closing})"
+            print(f"{why}: its initial state is held for {self.seconds:g} s")
             sim = simulate(touch, self.num_envs, substeps=self.substeps)
             return sim, held_controls(sim.model, self.seconds, sim.control_step)
         print(f"no keyframes rest and squeeze: {closing}")

@@ -111,8 +111,8 @@ def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
 
 
 def test_forces_are_bounded_on_a_heavy_object(tmp_path):
-    touch = module(tmp_path, "gripper.xml", GRIPPER, {"ball": {"geom": {"type": "sphere", "size": [0.012], "density": 7e5}}})
-    _, sim, _ = closed(touch)
+    text = scene("<body name='ball' pos='1 0 0'><freejoint/><geom size='.012' mass='5'/></body>")
+    _, sim, _ = closed(module(tmp_path, "gripper.xml", GRIPPER, {"ball": {"body": "ball"}}, text))
     assert 0 < max(forces_on(sim, "ball").values()) < MOST
 
 
@@ -142,8 +142,10 @@ def scene(bodies: str, rest: str = "") -> str:
 
 
 def test_what_is_between_the_fingers_stays_there(tmp_path):
-    text = scene("<body name='egg' pos='.002 .003 .435'><freejoint/><geom type='ellipsoid' size='.01 .012 .014' mass='.02'/></body>")
-    closing, sim, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"egg": {"body": "egg"}}, text))
+    text = scene(
+        "<body name='egg' pos='.002 .003 .435'><freejoint/><geom type='ellipsoid' size='.01 .012 .014' mass='.02'/></body>"
+    )
+    closing, _, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"egg": {"body": "egg"}}, text))
     assert closing.place is None
     assert str(closing) == "the hand closes on `egg`, which stays where it is; 1 of 1 joints"
     np.testing.assert_allclose(closing.start[-7:-4], [0.002, 0.003, 0.435])
@@ -163,7 +165,11 @@ def test_the_first_object_that_fits_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("bodies", "name", "why"),
     [
-        ("<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>", "table", "table is fixed out of its reach"),
+        (
+            "<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>",
+            "table",
+            "table is fixed out of its reach",
+        ),
         (
             "<body name='crate' pos='1 0 .3'><freejoint/><geom type='box' size='.3 .3 .3'/></body>",
             "crate",
@@ -202,7 +208,9 @@ def test_objects_that_differ_between_environments(tmp_path):
 
 
 def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path):
-    bodies = "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
+    bodies = (
+        "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
+    )
     rest = "<option actuatorgroupdisable='0 3'/><actuator><velocity joint='spin' kv='1' group='2'/><motor joint='spin' group='3'/></actuator>"
     objects = {"ball": BALL, "fan": {"body": "fan"}}
     touch = module(tmp_path, "gripper.xml", GRIPPER, objects, scene(bodies, rest))

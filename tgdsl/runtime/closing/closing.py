@@ -1,10 +1,10 @@
 """A hand that closes on an object: servos on its joints, what does not close held in place, the object between the fingers.
 
 Nothing is asked of the hand's own actuators, which may be of any kind, act through tendons or not be there: they, springs and
-dry friction rest. Each joint that closes has a servo whose force is limited to what presses about `GRIP` times the object's
-weight on it at the fingertips; so a joint that is loaded stops, however far its target is. What the scene lacks for such forces to be
-passed on by soft contacts is added: rotor inertia of the joints. The robot and the object weigh nothing, and the object moves as
-through oil, so that it waits for the last finger.
+dry friction rest. Each joint that closes has a servo whose force is limited to what presses with about `GRIP` times the
+object's weight at the fingertips; so a joint that is loaded stops, however far its target is. Joints get the rotor inertia
+that MuJoCo's soft contacts need to pass such forces on. The robot and the object weigh nothing, links do not collide with one
+another, and the object moves as through oil, so that it waits for the last finger.
 """
 
 from __future__ import annotations
@@ -122,15 +122,15 @@ class Closing:
             spec.add_exclude(bodyname1=name, bodyname2=other)
         if self.body is not None:
             spec.body(self.body).joints[0].damping = [self.drag, 0, 0]
-        spec.add_key(name=START, qpos=self.start, ctrl=self._controls([servo.opened for servo in self.servos], len(spec.actuators)))
+        spec.add_key(
+            name=START, qpos=self.start, ctrl=self._controls([servo.opened for servo in self.servos], len(spec.actuators))
+        )
 
     def targets(self, num_actuators: int) -> list[Float[np.ndarray, " actuator"]]:
         """Return the controls of the open and of the closed hand; the scene's own actuators come first and have zero."""
+        rest = [0.0] * (num_actuators - len(self.servos))
         ends = [servo.opened for servo in self.servos], [servo.closed for servo in self.servos]
-        return [self._controls(own, num_actuators) for own in ends]
-
-    def _controls(self, ends: list[float], num_actuators: int) -> Float[np.ndarray, " actuator"]:
-        return np.concatenate([np.zeros(num_actuators - len(ends)), ends])
+        return [np.array([*rest, *own]) for own in ends]
 
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
@@ -167,7 +167,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
             left.append(f"{target.name} is part of it")
             continue
         grip = sweep.grip()
-        if grip.holds and grip.overlap < OVERLAP * sweep.radius or not sweep.is_free and len(grip.links) > 0:
+        if (grip.holds and grip.overlap < OVERLAP * sweep.radius) or (not sweep.is_free and len(grip.links) > 0):
             return _closing(scene, moving, sweep, target.name, None)
         if not sweep.is_free:
             left.append(f"{target.name} is fixed out of its reach")
@@ -185,9 +185,7 @@ def name_all(spec: mujoco.MjSpec) -> None:
             element.name = element.name or f"tgdsl/{kind}/{i}"
 
 
-def _closing(
-    scene: Model, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None
-) -> Closing:
+def _closing(scene: Model, moving: Movement, sweep: Sweep, target: str, place: Float[np.ndarray, " 3"] | None) -> Closing:
     model, start = moving.model, moving.pose(0.0)
     mass = float(model.body_subtreemass[sweep.body])
     force = min(GRIP * mass * _EARTH, MOST) if sweep.is_free else FIXED_GRIP
@@ -195,7 +193,9 @@ def _closing(
         address = int(model.jnt_qposadr[model.body_jntadr[sweep.body]])
         start[address : address + 3] = place
     names = {joint: model.joint(joint).name for joint in moving.own}
-    bodies = [b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees or sweep.is_free and b == sweep.body]
+    bodies = [
+        b for b in range(1, model.nbody) if int(model.body_rootid[b]) in moving.trees or (sweep.is_free and b == sweep.body)
+    ]
     free = [int(model.jnt_bodyid[joint]) for joint in moving.held if not moving.is_scalar(joint)]
     return Closing(
         servos=tuple(_servo(moving, joint, force) for joint in moving.ends),
@@ -269,9 +269,7 @@ def _acting(model: mujoco.MjModel, moving: Movement) -> tuple[int, ...]:
     mujoco.mj_fwdPosition(model, data)
     moments = np.zeros((model.nu, model.nv))
     if model.nu:
-        mujoco.mju_sparse2dense(
-            moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )
+        mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
     own = np.isin(model.dof_jntid, moving.own)
     return tuple(np.flatnonzero((moments[:, own] != 0).any(axis=1)).tolist())
 
@@ -280,7 +278,9 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo, group: int) -> None:
     joint = spec.joint(servo.joint)
     _slacken(joint)
     joint.damping, joint.armature = [servo.damping, 0, 0], servo.armature
-    actuator = spec.add_actuator(name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=group)
+    actuator = spec.add_actuator(
+        name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=group
+    )
     actuator.set_to_position(kp=servo.stiffness)
     actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-servo.limit, servo.limit]
 

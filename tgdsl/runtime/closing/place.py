@@ -69,8 +69,8 @@ class Sweep:
     def place(self) -> Float[np.ndarray, " 3"] | None:
         """Return where the object's frame lies for a grip as good as any, in the world [m]; None if nowhere clear of the hand.
 
-        First between all fingertips; if it cannot be held there, such as what is smaller than the gaps, between one and the palm
-        or two.
+        First between all fingertips; if it cannot be held there, such as what is smaller than the gaps, between one fingertip
+        and the palm, or two.
         """
         best, found = (False, 0, -np.inf), None
         tips = self.movement.tips
