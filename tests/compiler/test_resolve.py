@@ -65,9 +65,9 @@ def test_links_that_no_sensor_has_are_not_sampled(folder):
     )
     assert found.layout.num_taxels == 1
     assert found.unused == (
-        ("link index_1", "no sensor is on it"),
-        ("link index_2", "no sensor is on it"),
-        ("link thumb_pad", "no sensor is on it"),
+        ("link index_1", "no sensor is on its taxels"),
+        ("link index_2", "no sensor is on its taxels"),
+        ("link thumb_pad", "no sensor is on its taxels"),
         ("object rest", "no sensor feels it"),
     )
 

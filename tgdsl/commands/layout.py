@@ -22,6 +22,8 @@ class Layout:
     """Taxels per area at the resolution `med`, such as 4/cm2 or 1e4/m2; `low` has a quarter of it, `high` four times it."""
     groups: Literal["auto", "none"] = "auto"
     """Whether to guess the link groups tips, palm, fingers and hand."""
+    include: tuple[str, ...] = ()
+    """Names or wildcards of links outside the hand, such as an arm's, that are to have taxels too."""
     out: Annotated[Path, OUT] = Path("layout.yaml")
     """The file to write."""
     force: Replace = False
@@ -31,5 +33,6 @@ class Layout:
         from tgdsl.placement.links import open_robot
         from tgdsl.placement.propose.text import new_layout
 
-        for line in new_layout(open_robot(self.robot), self.density, self.groups == "auto", self.out, self.force):
+        robot, with_groups = open_robot(self.robot), self.groups == "auto"
+        for line in new_layout(robot, self.density, with_groups, self.out, self.force, self.include):
             print(line)

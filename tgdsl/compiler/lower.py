@@ -14,6 +14,7 @@ from tgdsl.compiler.observed import Observed, observed
 from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.compiler.sensed import contact_parts
+from tgdsl.compiler.unfelt import unfelt_taxels, warn_of_unfelt
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import BakeError, LowerError, TgdslError, did_you_mean
 from tgdsl.plan import tree
@@ -71,6 +72,8 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     planned = tuple(_sensor(sensor, joined, shared, parts, asked) for sensor in sensors)
     seen = observed(loaded, resolved, planned, {sensor.name: sensor.layout for sensor in sensors})
     loaded.raise_problems()
+    unfelt = unfelt_taxels(resolved, sensors, pruned)
+    warn_of_unfelt(loaded.source.file, unfelt, resolved.layout.num_taxels)
     never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
     made = Plan(
         origin=origin,
@@ -83,6 +86,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         proprioception=seen.proprioception,
         observations=seen.terms,
         dropped=(*resolved.unused, *never),
+        unfelt=unfelt,
         scene=SceneFile("", {}, ()),
     )
     return tree.mapped(made, tree.frozen)

@@ -17,9 +17,10 @@ from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
+from tgdsl.placement.reach import Colliders, Reach, reach
 from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.loaded import Loaded, LoadedLayout
-from tgdsl.schema.placement import Placement
+from tgdsl.schema.placement import Placement, Points
 from tgdsl.schema.select import Report, is_plain, matching, select
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors.base import SensorSpec
@@ -38,6 +39,11 @@ class Patch:
     placement: Placement
     path: Path
 
+    @property
+    def as_collided(self) -> bool:
+        """Whether its taxels are on the convex hulls that the simulator collides."""
+        return not isinstance(self.placement, Points) and self.placement.surface == "collision"
+
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
@@ -52,6 +58,8 @@ class Resolved:
         robot: The robot's own model.
         unused: What has taxels or can be felt but is not needed, and why.
         patches: The links that carry taxels.
+        colliders: What the simulator collides of the robot.
+        reach: What that leaves of each taxel.
         on_links: The sensors that have a place on each link, whatever its taxels.
     """
 
@@ -63,6 +71,8 @@ class Resolved:
     robot: Model
     unused: tuple[tuple[str, str], ...]
     patches: Mapping[str, Patch]
+    colliders: Colliders
+    reach: Reach
     on_links: frozenset[str] = frozenset()
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
@@ -71,16 +81,17 @@ class Resolved:
         Raises:
             LowerError: If the region holds nothing of the link.
         """
-        surface = self.robot.surface(self.patches[link].geoms)
+        surface = self.robot.surface(self.patches[link].geoms, self.patches[link].as_collided)
         try:
             return clip(surface, region) if region else surface
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
-        """Return the geoms that a link's taxels sit on: meshes as they are, not their convex hulls."""
+        """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
+        triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh
         geoms = self.patches[link].geoms
-        return tuple(SurfaceGeom(geom, self.robot.mesh(geom) if geom.shape == "mesh" else None) for geom in geoms)
+        return tuple(SurfaceGeom(geom, triangles(geom) if geom.shape == "mesh" else None) for geom in geoms)
 
     def layout_on(self, sensor: str) -> tuple[np.ndarray, Layout]:
         """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
@@ -124,17 +135,24 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     on_links = frozenset(name for name, sensor in loaded.spec.sensors.items() if not sensor.is_on_taxels)
     needed = {link for name, own in links.items() for link in own if name not in on_links}
     needed = needed if links else {patch.link.name for patch in patches}
-    layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
+    colliders, felt = Colliders(robot), _object_bodies(loaded, robot)
+    placed = [patch for patch in patches if patch.link.name in needed]
+    layout = _sampled(loaded, loaded.layout, colliders, placed, felt, progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
     unused += [(f"body {body}", why) for body, why in _unlisted(loaded, robot, scene, objects)]
-    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {p.link.name: p for p in patches}, on_links)
+    by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
+    return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, on_links)
 
 
-def _unlisted(
-    loaded: Loaded, robot: Model, scene: Model, objects: Mapping[str, SensedObject]
-) -> Iterator[tuple[str, str]]:
+def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
+    """Return the bodies of the robot's file that are a document's objects, or parts of them: they are no links."""
+    named = {target.body_of(name) for name, target in loaded.spec.objects.items()} & set(robot.bodies)
+    return tuple(sorted({i for body in named for i in robot.rigid_bodies(body, named - {body})}))
+
+
+def _unlisted(loaded: Loaded, robot: Model, scene: Model, objects: Mapping[str, SensedObject]) -> Iterator[tuple[str, str]]:
     """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them."""
     model = scene.compiled
     known = {*robot.bodies[1:], *(target.body_of(name) for name, target in loaded.spec.objects.items())}
@@ -312,12 +330,20 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
 
 
-def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[Patch], progress: Progress) -> Layout:
+def _sampled(
+    loaded: Loaded,
+    layout: LoadedLayout,
+    colliders: Colliders,
+    patches: list[Patch],
+    objects: Sequence[int],
+    progress: Progress,
+) -> Layout:
     parts: list[Samples] = []
     for i, patch in enumerate(patches):
         progress(f"placing taxels on {patch.link.name} ({i + 1} of {len(patches)} links)")
         try:
-            parts.append(sample(robot.surface(patch.geoms), patch.placement, layout.folder))
+            covered = colliders.cover_of(patch.link.body, patch.geoms, objects)
+            parts.append(sample(_surface(colliders.robot, patch), patch.placement, layout.folder, covered))
         except SampleError as error:
             what = f'link "{patch.link.name}": {error.what}'
             loaded.problems.append(layout.problem(patch.path, what, error.hint))
@@ -336,6 +362,18 @@ def _sampled(loaded: Loaded, layout: LoadedLayout, robot: Model, patches: list[P
         area=np.concatenate([part.area for part in parts]),
         cell=np.concatenate([part.cell for part in parts]),
     )
+
+
+def _surface(robot: Model, patch: Patch) -> Surface:
+    """Return the triangles that a link's taxels are sampled on.
+
+    Raises:
+        SampleError: If they shall be on colliding geoms, and one of the link's does not collide.
+    """
+    if patch.as_collided and not all(geom.is_colliding for geom in patch.geoms):
+        apart = next(geom for geom in patch.geoms if not geom.is_colliding)
+        raise SampleError(f"the simulator does not collide {apart.shown}", "expected `surface: mesh`")
+    return robot.surface(patch.geoms, patch.as_collided)
 
 
 def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, ...]]:

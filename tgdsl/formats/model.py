@@ -163,13 +163,17 @@ class Model:
         parent_one, parent_two = (model.body_weldid[model.body_parentid[i]] for i in (one, two))
         return bool(one == parent_two or two == parent_one)
 
-    def surface(self, geoms: tuple[Geom, ...]) -> Surface:
+    def surface(self, geoms: tuple[Geom, ...], as_collided: bool = False) -> Surface:
         """Return the triangles of some geoms of one body, in that body's frame.
+
+        Args:
+            geoms: The geoms.
+            as_collided: Whether meshes are their convex hulls, as MuJoCo collides them.
 
         Raises:
             RobotError: If a geom has no bounded surface.
         """
-        return Surface.joined([self._triangles(geom) for geom in geoms])
+        return Surface.joined([self._triangles(geom, as_collided) for geom in geoms])
 
     def mesh(self, geom: Geom) -> Surface:
         """Return the triangles of a mesh geom, in the geom's own frame."""
@@ -193,9 +197,9 @@ class Model:
         faces = np.asarray(hull.faces, dtype=np.int64)
         return Surface(np.asarray(hull.vertices, dtype=np.float64), faces, np.zeros(len(faces), dtype=np.int64), (geom.names,))
 
-    def _triangles(self, geom: Geom) -> Surface:
+    def _triangles(self, geom: Geom, as_collided: bool) -> Surface:
         if geom.shape == "mesh":
-            own = self.mesh(geom)
+            own = self.hull(geom) if as_collided else self.mesh(geom)
             vertices, faces = own.vertices, own.faces
         else:
             vertices, faces = self._tessellated(geom)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
+from tgdsl.layout.unfelt import num_unfelt
 from tgdsl.module.example import example_state
 from tgdsl.module.memory.memory import Memory
 from tgdsl.module.outputs import outputs_of
@@ -94,6 +95,8 @@ def explain(touch: Explained) -> str:
     lines += [""] + _observations(touch) + _inputs(touch)
     lines += ["left out"] + [f"  {what}: {why}" for what, why in plan.dropped] if plan.dropped else []
     lines += [""] if plan.dropped else []
+    if plan.unfelt:
+        lines += [f"{num_unfelt(plan.unfelt)} taxels cannot feel", *(f"  {own}" for own in plan.unfelt), ""]
     return "\n".join(lines + _costs(touch))
 
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
-from tgdsl.files.find import layout_file, robot_file, robot_names
+from tgdsl.files.find import robot_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.schema.load import load_layout
@@ -46,12 +46,6 @@ def open_robot(robot: str) -> Model:
         RobotError: If the file cannot be read.
     """
     return load_model(robot_path(robot))
-
-
-def layout_of(robot: str) -> Path | None:
-    """Return the layout of a robot given by name; a file has none."""
-    known = robot_names().get(robot)
-    return None if known is None else layout_file(known)
 
 
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:

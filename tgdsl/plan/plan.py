@@ -19,6 +19,7 @@ import numpy as np
 
 from tgdsl.errors import ArtifactError
 from tgdsl.layout.layout import Layout
+from tgdsl.layout.unfelt import Unfelt
 from tgdsl.plan import tree
 from tgdsl.plan.inputs import Inputs
 from tgdsl.plan.scene import SceneFile
@@ -27,7 +28,7 @@ from tgdsl.quantities.base import Quantity
 from tgdsl.quantities.known import QUANTITIES
 from tgdsl.quantities.pairs import PairedObject, PairTable
 
-FORMAT = 11
+FORMAT = 12
 """Version of the Plan; a reader refuses any other."""
 
 
@@ -57,6 +58,7 @@ class Plan:
         proprioception: Readings of joints and actuators, which are fields of the state, handed out by the same names.
         observations: Observation terms, in the document's order.
         dropped: What the scene or the document has and the module does not need, and why.
+        unfelt: Taxels that cannot feel what their sensors are to feel, and why.
         scene: The instrumented scene.
     """
 
@@ -70,6 +72,7 @@ class Plan:
     proprioception: tuple[PlannedReading, ...]
     observations: tuple[PlannedObservation[np.ndarray], ...]
     dropped: tuple[tuple[str, str], ...]
+    unfelt: tuple[Unfelt, ...]
     scene: SceneFile
 
     @cached_property

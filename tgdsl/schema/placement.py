@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictInt, Tag, model_validator
+from pydantic import Field, StrictBool, StrictInt, Tag, model_validator
 
 from tgdsl.fields.models import (
     TEXT_OR_OTHER,
@@ -29,6 +29,12 @@ class _Sampled(SpecModel):
     """Sensing radius of each probe [m]; 0 makes it an inactive filler."""
     region: Region = ()
     """Part of the surface to sample: a region, or a list of regions that means their intersection; default: all of it."""
+    surface: Literal["mesh", "collision"] = "mesh"
+    """`mesh`: meshes as they are; `collision`: as the simulator collides them, by their convex hulls, which on a concave mesh
+    keep objects away from what is inside."""
+    exposed: StrictBool = False
+    """Whether to leave out what is inside other colliding geoms of the robot in the model's initial state, such as the part of
+    a link that the next one covers."""
 
 
 class Grid(_Sampled):

@@ -5,7 +5,7 @@ Shapes: `n` faces or points, `m` corners of polygons or points on them, `k` what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -21,6 +21,8 @@ LENGTH_TOLERANCE = 1e-7
 """Points this close to a region's border belong to it [m]: float32 mesh files round by about as much."""
 ANGLE_TOLERANCE = 1e-9
 """The same for angles [rad]."""
+Covered = Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]]
+"""Returns which points of the body frame [m] are covered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,16 +34,18 @@ class Region:
         facings: Unit direction and largest angle [rad] between it and the outward normal.
         boxes: Lower and upper corner [m].
         spheres: Centre and radius [m].
+        is_covered: Returns which points are no part of it, as other solids cover them; None: none are.
     """
 
     is_geom: Bool[np.ndarray, " geom"] | None
     facings: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
     boxes: tuple[tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]], ...]
     spheres: tuple[tuple[Float[np.ndarray, " 3"], float], ...]
+    is_covered: Covered | None = None
 
     @staticmethod
-    def of(surface: Surface, parts: Sequence[RegionPart]) -> Region:
-        """Return what a user wrote, on a link's surface.
+    def of(surface: Surface, parts: Sequence[RegionPart], is_covered: Covered | None = None) -> Region:
+        """Return what a user wrote, on a link's surface, without what other solids cover.
 
         Raises:
             SampleError: If the link has no such geom.
@@ -56,12 +60,13 @@ class Region:
             facings=tuple((unit(np.array(part.facing)), part.within) for part in parts if isinstance(part, Facing)),
             boxes=tuple((np.array(part.box.min), np.array(part.box.max)) for part in parts if isinstance(part, InBox)),
             spheres=tuple((np.array(part.sphere.center), part.sphere.radius) for part in parts if isinstance(part, InSphere)),
+            is_covered=is_covered,
         )
 
     @property
     def is_everything(self) -> bool:
         """Whether nothing is left out."""
-        return self.is_geom is None and not (self.facings or self.boxes or self.spheres)
+        return self.is_geom is None and self.is_covered is None and not (self.facings or self.boxes or self.spheres)
 
     def has_faces(self, normals: Float[np.ndarray, "n 3"], geom: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return which faces may belong, by their outward unit normals (body frame) and geoms."""
@@ -78,6 +83,8 @@ class Region:
             is_in &= ((pos >= low - LENGTH_TOLERANCE) & (pos <= high + LENGTH_TOLERANCE)).all(axis=-1)
         for center, radius in self.spheres:
             is_in &= np.linalg.norm(pos - center, axis=-1) <= radius + LENGTH_TOLERANCE
+        if self.is_covered is not None:
+            is_in[is_in] = ~self.is_covered(pos[is_in])
         return is_in
 
     def clipped(self, corners: Float[np.ndarray, "n 3 3"]) -> tuple[Float[np.ndarray, "k m 3"], Int[np.ndarray, " k"]]:

@@ -1,141 +1,206 @@
-"""The palmar side of each link, guessed from how the joints flex; None where that is not clear.
+"""Where the inner side of each link of a hand faces: None where that is not clear.
 
-A joint that moves one way only closes toward the end of its range at which the fingertips are nearer to one another and to
-the palm. A link's palmar side faces where its own joint then carries it; the palm's faces the fingertips as they close.
+A link's inner side faces where it is carried, in the open pose, as the nearest joint above it that has a lever on it closes. A
+link before all joints that close takes the side of the nearest link beyond. The last links of two chains that close on each
+other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.placement.propose.closing import Closing
 from tgdsl.placement.propose.hands import Hand, KinematicTree
 
-ONE_SIDED = 3.0
-"""A joint bends one way if its range from the start is this many times longer on one side than on the other."""
-MIN_CLOSING = 0.03
-"""Least share by which the fingertips must draw nearer for an end of a joint's range to count as closed."""
-MIN_BEND = np.radians(30.0)
-"""A hinge that turns by less than this does not close a finger, but shapes a palm."""
 MIN_LEVER = 0.25
 """A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place."""
 LINK_SNAP, PALM_SNAP = np.radians(30.0), np.radians(40.0)
 """A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken."""
+STEP = 0.02
+"""Share of its way by which a joint closes to see where a link goes."""
+ALIKE = 0.5
+"""Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
+UNCLEAR = "which side is the inner one is not clear"
+"""Why a link has no inner side, where nothing better is known."""
 
-_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+@dataclass(frozen=True)
+class InnerSide:
+    """Where a link's inner side faces.
+
+    Attributes:
+        facing: Direction in the link's frame; None if it is not clear.
+        doubt: What speaks against it, or why it is not clear; empty if nothing does.
+    """
+
+    facing: tuple[float, ...] | None
+    doubt: str = ""
 
 
 class Flexion:
-    """Which way each joint of a hand flexes."""
+    """How a hand closes, and which side of each link is the inner one."""
 
     def __init__(self, tree: KinematicTree, hand: Hand):
-        """Look at each joint of the fingers by itself, the others half closed and then closed."""
+        """Find which end of each joint's range is the closed one."""
         self.tree, self.hand = tree, hand
-        self.data = mujoco.MjData(tree.model)
-        inner = {s for body in hand.fingers for s in tree.path(tree.segment[body])} - set(tree.path(hand.base))
-        self.bending = {s: joint for s in sorted(inner - hand.looped) if (joint := _bending(tree, s)) is not None}
-        self.others = tree.model.qpos0.copy()
-        for joint in self.bending.values():
-            self.others[tree.model.jnt_qposadr[joint]] = tree.model.jnt_range[joint].mean()
-        half = {joint: self._gain(joint) for joint in self.bending.values()}
-        for joint, gain in half.items():
-            self.others[tree.model.jnt_qposadr[joint]] = _end(tree, joint, gain)
-        gains = {joint: (gain, self._gain(joint)) for joint, gain in half.items()}
-        self.closed = {joint: _end(tree, joint, sum(pair)) for joint, pair in gains.items() if _is_clear(*pair)}
+        self.closing = Closing(tree, hand)
+        self.open, self.shut = self.closing.posed(0.0), self.closing.posed(1.0)
+        self.steps = {joint: self._stepped(joint) for joint in self.closing.motions}
+        self.bars = self._bars()
 
-    def direction(self, body: int) -> tuple[float, ...] | None:
-        """Return where the palmar side of a body faces, in its frame; None if that is not clear."""
-        if body == self.hand.palm:
-            return self._palm_direction()
-        joint = self.bending.get(self.tree.segment[body])
-        if joint is None or joint not in self.closed:
-            return None
-        model, data = self.tree.model, self._posed(self.tree.model.qpos0)
-        along = data.xaxis[joint]
-        if int(model.jnt_type[joint]) == _HINGE:
-            along = np.cross(along, self._centre(body) - data.xanchor[joint])
-            if np.linalg.norm(along) < MIN_LEVER * np.sqrt(self.tree.area[body]):
-                return None
-        low, high = model.jnt_range[joint]
-        along = along * (1.0 if self.closed[joint] > 0.5 * (low + high) else -1.0)
-        return _snapped(data.xmat[body].reshape(3, 3).T @ along, LINK_SNAP, keeps_oblique=True)
+    @property
+    def num_closing(self) -> int:
+        """How many chains close."""
+        moved = {self.closing.chain[self.closing.segment(j)] for step in self.steps.values() for j in self._moved(step)}
+        return len(moved)
 
-    def _palm_direction(self) -> tuple[float, ...] | None:
-        palm = self.hand.palm
-        tips = [tip for tip in self.hand.tips if self._is_closing(tip)]
-        if palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
+    @property
+    def tips(self) -> list[int]:
+        """Bodies at the ends of the fingers, those that are bars of linkages left out."""
+        return [tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars]
+
+    def motion(self) -> dict[int, tuple[float, float]]:
+        """Return the open and closed end of each hinge and slide that closes, those that others drive included."""
+        poses = self.closing.poses
+        moved = {j for step in self.steps.values() for j in self._moved(step)}
+        return {j: (float(self.open[poses.at(j)]), float(self.shut[poses.at(j)])) for j in sorted(moved)}
+
+    def inner_side(self, body: int) -> InnerSide:
+        """Return where the inner side of a body faces."""
+        if body in self.hand.mounts:
+            return self._palm_side(body)
+        if (facing := self._meeting(body)) is not None:
+            return InnerSide(facing, self._doubt(self.tree.segment[body]))
+        if (carried := self._carried(body)) is not None:
+            joint, along = carried
+            turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ along
+            return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
+        return self._taken_over(body)
+
+    def _bars(self) -> set[int]:
+        """Return the segments that are alone in their chain and turn just as the first one of a longer chain does.
+
+        They are the second bars of parallel linkages, whose loop a tree of links leaves open.
+        """
+        chains, turns = self.hand.chains, {}
+        joints = {s: [j for j in self.tree.joints(s) if j in self.closing.poses.joints] for chain in chains for s in chain[:1]}
+        for joint, pose in self.steps.items():
+            for s, own in joints.items():
+                at = [self.closing.poses.at(j) for j in own]
+                axes = self._frames(self.open).xaxis[own]
+                turns[joint, s] = (pose[at] - self.open[at]) @ axes if own else np.zeros(3)
+        single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
+
+        def is_bar(s: int, other: int) -> bool:
+            both = [(turns[j, s], turns[j, other]) for j in self.steps if self.closing.is_opposed(j)]
+            return any(np.linalg.norm(a) > 1e-6 for a, _ in both) and all(np.allclose(a, b, atol=1e-6) for a, b in both)
+
+        return {s for s in single if any(is_bar(s, other) for other in longer)}
+
+    def _stepped(self, joint: int) -> Float[np.ndarray, " qpos"]:
+        """Return the open pose with one joint a small step closed."""
+        values = {other: motion.opened for other, motion in self.closing.motions.items()}
+        values[joint] += STEP * (self.closing.motions[joint].closed - values[joint])
+        return self.closing.poses.posed(values)
+
+    def _moved(self, pose: Float[np.ndarray, " qpos"]) -> list[int]:
+        poses = self.closing.poses
+        moved = {joint: abs(float(pose[poses.at(joint)] - self.open[poses.at(joint)])) for joint in poses.joints}
+        return [joint for joint, by in moved.items() if by > 1e-3 * max(moved.values(), default=0.0)]
+
+    def _frames(self, pose: Float[np.ndarray, " qpos"]) -> mujoco.MjData:
+        return self.closing.poses.kinematics(pose)
+
+    def _nearest(self, segment: int) -> list[int]:
+        """Return the joints that move a segment, the one that moves it nearest to itself first."""
+        path, found = self.tree.path(segment), {}
+        for joint, pose in self.steps.items():
+            depths = [path.index(s) for s in map(self.closing.segment, self._moved(pose)) if s in path]
+            if depths:
+                found[joint] = min(depths)
+        return sorted(found, key=lambda joint: (found[joint], joint))
+
+    def _carried(self, body: int) -> tuple[int, Float[np.ndarray, " 3"]] | None:
+        """Return the joint that carries a body, and where to in the world in the open pose."""
+        data = self._frames(self.open)
+        centre, rotation = self.tree.centre(body, data), data.xmat[body].reshape(3, 3).copy()
+        for joint in self._nearest(self.tree.segment[body]):
+            data = self._frames(self.steps[joint])
+            along = self.tree.centre(body, data) - centre
+            cosine = 0.5 * (np.trace(data.xmat[body].reshape(3, 3) @ rotation.T) - 1.0)
+            angle, size = float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(np.linalg.norm(along))
+            if size > 1e-9 and size >= MIN_LEVER * np.sqrt(self.tree.area[body]) * angle:
+                return joint, along / size
+        return None
+
+    def _taken_over(self, body: int) -> InnerSide:
+        """Return the side of the nearest link beyond, as it faces in the open pose."""
+        start = self.tree.segment[body]
+        beyond = [b for s in self.tree.below(start) for b in self.tree.bodies[s]]
+        for other in sorted(beyond, key=lambda b: (len(self.tree.path(self.tree.segment[b])), b)):
+            if (carried := self._carried(other)) is not None:
+                turned = self._frames(self.open).xmat[body].reshape(3, 3).T @ carried[1]
+                return InnerSide(_snapped(turned, LINK_SNAP, keeps_oblique=True), self.closing.motions[carried[0]].doubt)
+        return InnerSide(None, UNCLEAR)
+
+    def _doubt(self, segment: int) -> str:
+        return next((self.closing.motions[joint].doubt for joint in self._nearest(segment)), "")
+
+    def _meeting(self, body: int) -> tuple[float, ...] | None:
+        """Return where a body faces the tip of the other chain, of two that close on each other without curling."""
+        segment, chain = self.tree.segment[body], self.closing.chain
+        tips, jaws = self.tips, {self.tree.segment[tip] for tip in self.tips}
+        is_jaw = segment in jaws and len({chain[jaw] for jaw in jaws}) == 2
+        if not is_jaw or not self.closing.motions or any(motion.is_curling for motion in self.closing.motions.values()):
             return None
-        half, nearly, whole = (self._toward(palm, tips, share) for share in (0.5, 0.75, 1.0))
+        own = [tip for tip in tips if self.tree.segment[tip] == segment]
+        others = [tip for tip in tips if chain[self.tree.segment[tip]] != chain[segment]]
+        apart = []
+        for pose in (self.open, self.closing.posed(1.0 - STEP), self.shut):
+            data = self._frames(pose)
+            mean = [np.mean([self.tree.centre(tip, data) for tip in some], axis=0) for some in (others, own)]
+            apart.append(mean[0] - mean[1])
+        along = apart[1] - apart[2]
+        if float(np.linalg.norm(along)) < 1e-9 or along @ apart[0] < 0.5 * np.linalg.norm(along) * np.linalg.norm(apart[0]):
+            return None
+        rotation = self._frames(self.shut).xmat[body].reshape(3, 3)
+        return _snapped(rotation.T @ along, LINK_SNAP, keeps_oblique=True)
+
+    def _palm_side(self, body: int) -> InnerSide:
+        turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()
+        curled = self._curled()
+        if curled is not None and (direction := _snapped(turned.T @ curled, PALM_SNAP, keeps_oblique=False)) is not None:
+            return InnerSide(direction)
+        tips = [tip for tip in self.hand.tips if self._nearest(self.tree.segment[tip])]
+        if self.hand.palm is None or not tips or 2 * len(tips) < len(self.hand.tips):
+            return InnerSide(None, UNCLEAR)
+        half, nearly, whole = (self._toward(body, tips, share) for share in (0.5, 0.75, 1.0))
         direction = _snapped(nearly, PALM_SNAP, keeps_oblique=False)
         # Fingers that curl around cross the palm's plane where no palm is modelled in their way: no side is clear then.
         is_clear = direction is not None and min(half @ direction, whole @ direction) > 0.5
-        return direction if is_clear else None
+        return InnerSide(direction) if is_clear else InnerSide(None, UNCLEAR)
 
-    def _toward(self, palm: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
-        """Return the direction from the palm to the middle of tips in the palm's frame, all joints closed by a share."""
-        pose = self.tree.model.qpos0.copy()
-        for joint, end in self.closed.items():
-            opened = self.tree.model.jnt_range[joint].sum() - end
-            pose[self.tree.model.jnt_qposadr[joint]] = (1.0 - share) * opened + share * end
-        data = self._posed(pose)
-        toward = data.xmat[palm].reshape(3, 3).T @ (np.mean([self._centre(tip) for tip in tips], axis=0) - self._centre(palm))
-        return toward / max(float(np.linalg.norm(toward)), 1e-9)
+    def _curled(self) -> Float[np.ndarray, " 3"] | None:
+        """Return where most fingers, as they curl, carry their first links in the open pose; None if there is no such majority."""
+        found = []
+        for chain in self.hand.chains:
+            carried = [self._carried(body) for s in chain for body in self.tree.bodies[s]]
+            found += [c[1] for c in carried if c is not None and self.closing.motions[c[0]].is_curling][:1]
+        alike = [[other for other in found if one @ other > ALIKE] for one in found]
+        most = max(alike, key=len, default=[])
+        return np.mean(most, axis=0) if 2 * len(most) > len(self.hand.chains) else None
 
-    def _is_closing(self, tip: int) -> bool:
-        """Return whether all joints that bend a tip's finger are known to close, and there is one."""
-        joints = {self.bending[s] for s in self.tree.path(self.tree.segment[tip]) if s in self.bending}
-        return bool(joints) and joints <= self.closed.keys()
-
-    def _gain(self, joint: int) -> float:
-        """Return the share by which the tips draw nearer as a joint goes from the low to the high end of its range."""
-        at_low, at_high = (self._openness(joint, float(end)) for end in self.tree.model.jnt_range[joint])
-        return (at_low - at_high) / max(at_low, at_high, 1e-9)
-
-    def _openness(self, joint: int, value: float) -> float:
-        """Return the mean distance of the tips that a joint moves from those that it does not, and from the palm [m]."""
-        pose = self.others.copy()
-        pose[self.tree.model.jnt_qposadr[joint]] = value
-        self._posed(pose)
-        segment = self.tree.segment[int(self.tree.model.jnt_bodyid[joint])]
-        is_moved = {tip: segment in self.tree.path(self.tree.segment[tip]) for tip in self.hand.tips}
-        fixed = [self._centre(tip) for tip in self.hand.tips if not is_moved[tip]]
-        fixed += [self._centre(self.hand.palm)] if self.hand.palm is not None else []
-        moved = [self._centre(tip) for tip in self.hand.tips if is_moved[tip]]
-        return float(np.mean([np.linalg.norm(one - two) for one in moved for two in fixed])) if moved and fixed else 0.0
-
-    def _posed(self, qpos: Float[np.ndarray, " qpos"]) -> mujoco.MjData:
-        self.data.qpos[:] = qpos
-        mujoco.mj_kinematics(self.tree.model, self.data)
-        return self.data
-
-    def _centre(self, body: int) -> Float[np.ndarray, " 3"]:
-        return self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ self.tree.centroid[body]
-
-
-def _end(tree: KinematicTree, joint: int, gain: float) -> float:
-    return float(tree.model.jnt_range[joint, 1 if gain > 0 else 0])
-
-
-def _is_clear(half: float, whole: float) -> bool:
-    """Return whether two gains, with the other joints half closed and closed, agree, or one by far outweighs the other."""
-    small, large = sorted((abs(half), abs(whole)))
-    return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)
-
-
-def _bending(tree: KinematicTree, segment: int) -> int | None:
-    """Return the only joint of a segment that moves one way from the start, within limits."""
-    found = []
-    for joint in tree.joints(segment):
-        model = tree.model
-        if int(model.jnt_type[joint]) not in (_HINGE, _SLIDE) or not model.jnt_limited[joint]:
-            continue
-        if int(model.jnt_type[joint]) == _HINGE and np.ptp(model.jnt_range[joint]) < MIN_BEND:
-            continue
-        down, up = np.abs(model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]])
-        if max(down, up) >= ONE_SIDED * min(down, up):
-            found.append(joint)
-    return found[0] if len(found) == 1 else None
+    def _toward(self, body: int, tips: list[int], share: float) -> Float[np.ndarray, " 3"]:
+        """Return the direction from the palm to the middle of tips in a body's frame, all joints closed by a share."""
+        palm = self.hand.palm
+        assert palm is not None
+        data = self._frames(self.closing.posed(share))
+        toward = np.mean([self.tree.centre(tip, data) for tip in tips], axis=0) - self.tree.centre(palm, data)
+        return data.xmat[body].reshape(3, 3).T @ toward / max(float(np.linalg.norm(toward)), 1e-9)
 
 
 def _snapped(direction: Float[np.ndarray, " 3"], angle: float, keeps_oblique: bool) -> tuple[float, ...] | None:

@@ -1,16 +1,18 @@
 """Which link of a robot is a palm, a finger or a fingertip: guessed from its tree of joints, never from its names.
 
-A segment is what moves as one: a body with all that is fixed to it. A palm is the segment nearest to its tree's root from
-which two or more chains with surface branch off; what moves against it is its fingers; a tip is the end of a chain, or, of
-a loop closed by an equality, the link farthest from the palm.
+A segment is what moves as one: a body with all that is fixed to it. A chain is what moves against a segment as a whole: a
+child with all below it, and with the siblings that an equality binds to it in a loop. A hand begins at the last segment from
+which two or more chains part; but where chains part again within a finger's length (a metacarpal with two fingers, an arch
+that carries the fingers while the thumb hangs on the wrist), it begins at the first of these. What is before it, such as an
+arm, and what hangs elsewhere, such as a head, is no part of it.
 
 Shapes: bodies and segments are MuJoCo's body indices; a segment's is that of its first body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import mujoco
@@ -21,6 +23,8 @@ from scipy.sparse.csgraph import connected_components
 
 from tgdsl.formats.model import Model
 
+MAX_STEM = 1.5
+"""Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
@@ -76,6 +80,10 @@ class KinematicTree:
         """Return the segments with surface that hang on one."""
         return [child for child, parent in self.parent.items() if parent == segment and child in self.carries]
 
+    def below(self, segment: int) -> list[int]:
+        """Return the segments that hang on one, directly or not; all segments for the world."""
+        return [s for s in self.parent if s != segment and (not segment or segment in self.path(s))]
+
     def joints(self, segment: int) -> list[int]:
         """Return the joints that move a segment against its parent."""
         first, count = int(self.model.body_jntadr[segment]), int(self.model.body_jntnum[segment])
@@ -83,16 +91,32 @@ class KinematicTree:
 
     @cached_property
     def loops(self) -> set[tuple[int, int]]:
-        """Pairs of segments of one tree that an equality holds together."""
+        """Pairs of segments of one tree that an active equality holds together."""
         found = set()
-        for i in np.flatnonzero(np.isin(self.model.eq_type, _LOOPS)):
-            ids = int(self.model.eq_obj1id[i]), int(self.model.eq_obj2id[i])
-            if int(self.model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
-                ids = tuple(int(self.model.site_bodyid[site]) for site in ids)
-            one, two = (self.segment[body] for body in ids)
+        for i in np.flatnonzero(np.isin(self.model.eq_type, _LOOPS) & (self.model.eq_active0 != 0)):
+            one, two = (self.segment[body] for body in self.bound_bodies(int(i)))
             if one and two and one != two and self.path(one)[-1] == self.path(two)[-1]:
                 found.add((one, two))
         return found
+
+    def bound_bodies(self, equality: int) -> tuple[int, int]:
+        """Return the bodies that a connect or weld holds together."""
+        model = self.model
+        ids = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        if int(model.eq_objtype[equality]) == int(mujoco.mjtObj.mjOBJ_SITE):
+            return int(model.site_bodyid[ids[0]]), int(model.site_bodyid[ids[1]])
+        return ids
+
+    @cached_property
+    def start(self) -> mujoco.MjData:
+        """The robot's start."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_kinematics(self.model, data)
+        return data
+
+    def centre(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, " 3"]:
+        """Return the centre of a body's surface in the world [m]."""
+        return data.xpos[body] + data.xmat[body].reshape(3, 3) @ self.centroid[body]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +124,22 @@ class Hand:
     """Palm, fingers and tips found in a kinematic tree.
 
     Attributes:
-        base: Segment from which the fingers branch off; 0 if they hang on the world.
-        palm: The largest body of it, or None if it has no surface.
-        tips: Bodies at the ends of the fingers.
+        base: Segment from which the chains part; 0 if they hang on the world.
+        mounts: Bodies of it that have surface; where chains part, without those before the one that carries them.
+        palm: The largest of these, or None if there is none or only one chain.
+        chains: Segments of each chain.
+        tips: Bodies at the ends of the chains.
         fingers: All bodies that move against the base, tips included.
-        looped: Segments in chains that are closed to loops.
-        others: The rest, such as a wrist.
+        length: Length of the longest chain [m].
     """
 
     base: int
+    mounts: list[int]
     palm: int | None
+    chains: list[list[int]]
     tips: list[int]
     fingers: list[int]
-    looped: set[int]
-    others: list[int] = field(default_factory=list)
+    length: float
 
 
 def kinematic_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, Float[np.ndarray, " 3"]]) -> KinematicTree:
@@ -142,74 +168,115 @@ def _is_driven(tree: KinematicTree, segment: int) -> bool:
 
 
 def hands(tree: KinematicTree) -> list[Hand]:
-    """Return the hand found in each kinematic tree; trees that hang on the world by a hinge or slide make up one hand."""
+    """Return what may be a hand; trees that hang on the world by a hinge or slide make up one.
+
+    A tree without two chains that part is one as a whole, without a palm.
+    """
     left_out = set(free_standing(tree))
     roots = [s for s in tree.children(0) if not left_out.issuperset(tree.bodies[s]) or tree.children(s)]
-    straight = [root for root in roots if _is_driven(tree, root) and len(_branchings(tree, root)) == 0]
-    found = [_hand(tree, root, [s for s in tree.parent if root in tree.path(s)]) for root in roots if root not in straight]
+    bases = {root: _bases(tree, [root, *tree.below(root)]) for root in roots}
+    straight = [root for root in roots if _is_driven(tree, root) and not bases[root]]
+    found = [_hand(tree, base) for root in roots if root not in straight for base in bases[root] or [root]]
     if straight:
-        found.append(_hand(tree, 0, [s for s in tree.parent if _root(tree, s) in straight]))
+        found.append(_hand(tree, 0, [s for root in straight for s in (root, *tree.below(root))]))
     return found
 
 
-def _root(tree: KinematicTree, segment: int) -> int:
-    return tree.path(segment)[-1]
+def _bases(tree: KinematicTree, segments: Sequence[int]) -> list[int]:
+    """Return the segments at which hands begin, the deepest first."""
+    parting = [s for s in segments if len(_chains(tree, s, tree.below(s))) > 1]
+    parting = parting or [s for s in segments if len(tree.children(s)) > 1][:1]  # a rod that moves all fingers binds them
+    found: list[int] = []
+    for s in sorted(parting, key=lambda s: len(tree.path(s)), reverse=True):
+        below = [base for base in found if s in tree.path(base)]
+        if all(_parts_within(tree, s, base) for base in below):
+            found = [s, *(base for base in found if base not in below)]
+    return found
 
 
-def _branchings(tree: KinematicTree, root: int) -> list[int]:
-    return [s for s in tree.parent if root in tree.path(s) and len(tree.children(s)) > 1]
+def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
+    """Return whether chains part at another segment within a hand that begins at a base."""
+    stem = tree.path(other)[: tree.path(other).index(base)]
+    starts = [_anchor(tree, child) for child in tree.children(other)]
+    points = [*(_anchor(tree, s) for s in reversed(stem)), np.mean(starts, axis=0)]
+    longest = max(_length(tree, child) for child in tree.children(other))
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()) <= MAX_STEM * longest
 
 
-def _hand(tree: KinematicTree, root: int, segments: list[int]) -> Hand:
-    branchings = _branchings(tree, root) if root else []
-    base = min(branchings, key=lambda s: (len(tree.path(s)), -_area(tree, s)), default=root)
-    beyond = [s for s in segments if s != base and (not base or base in tree.path(s))]
-    own = tree.bodies[base] if base in branchings else []
-    palm = max(own, key=lambda body: (tree.area[body], -body), default=None)
-    ends, looped = _ends(tree, base, palm, beyond)
-    fingers = [body for s in beyond for body in tree.bodies[s]]
-    tips = [body for s in ends for body in _last(tree, s)]
-    known = {palm, *fingers}
-    others = [body for s in segments for body in tree.bodies[s] if body not in known]
-    return Hand(base, palm, sorted(tips), sorted(fingers), looped, sorted(others))
+def _length(tree: KinematicTree, segment: int) -> float:
+    """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
+    own = [float(np.linalg.norm(tree.centre(b, tree.start) - _anchor(tree, segment))) for b in tree.bodies[segment]]
+    reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(own, tree.bodies[segment], strict=True)]
+    for child in tree.children(segment):
+        stem = float(np.linalg.norm(_anchor(tree, child) - _anchor(tree, segment)))
+        reach.append(stem + _length(tree, child))
+    return max(reach, default=0.0)
 
 
-def _area(tree: KinematicTree, segment: int) -> float:
-    return sum(tree.area[body] for body in tree.bodies[segment])
+def _anchor(tree: KinematicTree, segment: int) -> Float[np.ndarray, " 3"]:
+    joints = tree.joints(segment)
+    return tree.start.xanchor[joints[0]] if joints else tree.start.xpos[segment]
+
+
+def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None) -> Hand:
+    beyond = tree.below(base) if segments is None else list(segments)
+    mounts = _mounts(tree, base) if base else []
+    chains = _chains(tree, base, beyond)
+    if len(tree.children(base)) > 1 or not base:
+        palm = max(mounts, key=lambda body: (tree.area[body], -body), default=None)
+    else:
+        palm = None
+    middle = tree.centre(palm, tree.start) if palm is not None else tree.start.xpos[base]
+    ends = [s for chain in chains for s in _ends(tree, chain, middle)]
+    fingers = sorted(body for s in beyond for body in tree.bodies[s])
+    tips = sorted(body for s in ends for body in _last(tree, s))
+    first = [s for s in beyond if tree.parent[s] not in beyond]
+    return Hand(base, mounts, palm, chains, tips, fingers, max((_length(tree, s) for s in first), default=0.0))
+
+
+def _mounts(tree: KinematicTree, base: int) -> list[int]:
+    """Return the bodies with surface of a segment that are not before the one that carries its chains."""
+    above = [_within(tree, base, int(tree.model.body_parentid[child])) for child in tree.children(base)]
+    if len(above) < 2:
+        return tree.bodies[base]
+    common = [body for body in above[0] if all(body in path for path in above)]
+    for body in common:  # upward, to the first with surface
+        if own := [b for b in tree.bodies[base] if body in _within(tree, base, b)]:
+            return own
+    return []
+
+
+def _within(tree: KinematicTree, segment: int, body: int) -> list[int]:
+    """Return a body of a segment and those above it in the same segment, upward."""
+    found = []
+    while body and tree.segment[body] == segment:
+        found.append(body)
+        body = int(tree.model.body_parentid[body])
+    return found
 
 
 def _last(tree: KinematicTree, segment: int) -> list[int]:
     """Return the bodies with surface of a segment that have no other such below them."""
     own = tree.bodies[segment]
-    above = set()
-    for body in own:
-        while (body := int(tree.model.body_parentid[body])) and tree.segment[body] == segment:
-            above.add(body)
+    above = {over for body in own for over in _within(tree, segment, body)[1:]}
     return [body for body in own if body not in above]
 
 
-def _ends(tree: KinematicTree, base: int, palm: int | None, beyond: list[int]) -> tuple[list[int], set[int]]:
-    """Return the last segments of all chains, and the segments of chains that are closed to loops."""
-    leaves = [s for s in beyond if tree.bodies[s] and not tree.children(s)]
-    bound = {s for pair in tree.loops for s in pair}
+def _chains(tree: KinematicTree, base: int, beyond: Sequence[int]) -> list[list[int]]:
+    """Return the segments of each chain that has surface."""
     place = {s: i for i, s in enumerate(beyond)}
     pairs = [(place[s], place[tree.parent[s]]) for s in beyond if tree.parent[s] in place]
     pairs += [(place[a], place[b]) for a, b in tree.loops if a in place and b in place]
     edges = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     shape = (len(beyond), len(beyond))
-    _, chain = connected_components(coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape), directed=False)
-    looped = {s for s in beyond if any(chain[place[b]] == chain[place[s]] for b in bound & place.keys())}
-    data = mujoco.MjData(tree.model)
-    mujoco.mj_kinematics(tree.model, data)
-    middle = _world(tree, data, palm) if palm is not None else data.xpos[base]
-    ends = []
-    for number in range(chain.max(initial=-1) + 1):
-        own = [s for s in leaves if chain[place[s]] == number]
-        free = [s for s in own if s not in bound]
-        far = {s: max(float(np.linalg.norm(_world(tree, data, body) - middle)) for body in tree.bodies[s]) for s in own}
-        ends += free or [s for s in own if far[s] > max(far.values()) - 1e-6]
-    return sorted(ends), looped
+    count, chain = connected_components(coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape), directed=False)
+    found = [[s for s in beyond if chain[place[s]] == number] for number in range(count)]
+    return [segments for segments in found if tree.carries.intersection(segments)]
 
 
-def _world(tree: KinematicTree, data: mujoco.MjData, body: int) -> Float[np.ndarray, " 3"]:
-    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ tree.centroid[body]
+def _ends(tree: KinematicTree, chain: Sequence[int], middle: Float[np.ndarray, " 3"]) -> list[int]:
+    """Return the last segments of a chain; of one that is closed to loops, those that are in none, or the farthest."""
+    leaves = [s for s in chain if tree.bodies[s] and not tree.children(s)]
+    bound = {s for pair in tree.loops for s in pair}
+    far = {s: max(float(np.linalg.norm(tree.centre(b, tree.start) - middle)) for b in tree.bodies[s]) for s in leaves}
+    return [s for s in leaves if s not in bound] or [s for s in leaves if far[s] > max(far.values()) - 1e-6]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float
 
 from tgdsl.errors import RobotError, SampleError, TgdslError
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.flexion import Flexion
-from tgdsl.placement.propose.hands import Hand, free_standing, hands, kinematic_tree
-from tgdsl.placement.sample import poisson
-from tgdsl.surfaces import meshlab
-from tgdsl.surfaces.region import Region
+from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
+from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
+from tgdsl.placement.propose.hands import KinematicTree, free_standing, kinematic_tree
+from tgdsl.placement.propose.scope import chosen_hands, included, outside
+from tgdsl.placement.reach import Colliders
+from tgdsl.placement.sample.poisson import Pool
 
 FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
 """Each resolution's share of the density."""
@@ -29,11 +30,12 @@ MIN_SHARE = 0.1
 """Least share of a link's surface that its inner side must hold to be believed."""
 COVERING = 0.75
 """Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
-MIN_AREA = 1e-8
-"""A surface smaller than this is degenerate [m²]."""
 MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
-_ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
+_USUAL = 4e4
+"""The density that `closing_motion` takes [1/m²]: 4/cm²."""
+NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
+COVERED = "all of it is inside other links in the initial state"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +43,22 @@ class LinkSurface:
     """Samples of the outer surface of a body, in its frame.
 
     Attributes:
-        area: Its whole surface [m²].
-        centroid: Its centre [m].
-        normals: Outward unit normals of points that stand for equal areas.
+        pool: Points that stand for equal areas of it.
+        options: Options of a placement that samples it.
     """
 
-    area: float
-    centroid: Float[np.ndarray, " 3"]
-    normals: Float[np.ndarray, "point 3"]
+    pool: Pool
+    options: Options = field(default_factory=dict)
+
+    @property
+    def area(self) -> float:
+        """Its whole surface [m²]."""
+        return self.pool.area
+
+    @property
+    def centroid(self) -> Float[np.ndarray, " 3"]:
+        """Its centre [m]."""
+        return self.pool.pos.mean(axis=0)
 
 
 @dataclass(frozen=True)
@@ -59,13 +69,17 @@ class LinkProposal:
         name: Its body.
         area: Surface to be covered [m²].
         facing: Direction of its inner side in the link's frame; None: it is covered all around.
+        doubt: What speaks against that side, or why there is none; empty if nothing does.
         counts: Number of taxels at each resolution.
+        options: Options by which taxels are where they can feel.
     """
 
     name: str
     area: float
     facing: tuple[float, ...] | None
+    doubt: str
     counts: dict[str, int]
+    options: Options
 
 
 @dataclass(frozen=True)
@@ -78,6 +92,7 @@ class Proposal:
         links: Links with taxels, in the robot's body order.
         left_out: Bodies without taxels, and why.
         shared: Names of links that other links' geoms or meshes have too.
+        is_collided: Whether the simulator collides its links; else none of them.
     """
 
     density: float
@@ -85,6 +100,7 @@ class Proposal:
     links: tuple[LinkProposal, ...]
     left_out: tuple[tuple[str, str], ...]
     shared: tuple[str, ...]
+    is_collided: bool
 
     def radius_mm(self, resolution: str) -> float:
         """Return the sensing radius at a resolution, to two digits [mm]."""
@@ -93,7 +109,7 @@ class Proposal:
     def placement(self, link: LinkProposal, resolution: str) -> dict[str, Any]:
         """Return how a link is sampled, as the grammar has it."""
         found: dict[str, Any] = {"method": "poisson", "count": link.counts[resolution]}
-        found["radius"] = f"{self.radius_mm(resolution):g} mm"
+        found |= {"radius": f"{self.radius_mm(resolution):g} mm", **link.options}
         if link.facing is not None:
             found["region"] = {"facing": [float(x) for x in link.facing], "within": f"{WITHIN_DEG} deg"}
         return found
@@ -105,35 +121,36 @@ class Proposal:
         return {"tgdsl": 1, **groups, "resolutions": resolutions}
 
 
-def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
+def propose(robot: Model, density: float, with_groups: bool = True, include: Sequence[str] = ()) -> Proposal:
     """Return a layout for a robot; the same robot gives the same layout.
 
     Args:
         robot: The robot.
         density: Taxels per area at `med` [1/m²].
         with_groups: Whether to propose link groups.
+        include: Names or shell wildcards of links outside its hands that are to have taxels too.
 
     Raises:
-        TgdslError: If no link can be sampled, or if the density asks for more taxels than a link can have.
+        TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include
+            matches no link that can have taxels.
     """
-    surfaces, left_out = _link_surfaces(robot)
-    tree = kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+    surfaces, left_out, is_collided = _touchable(robot, density)
+    asked = included(include, tuple(surfaces), dict(left_out))
+    tree = _tree(robot, surfaces)
     names = {int(robot.compiled.body(name).id): name for name in surfaces}
-    for body in free_standing(tree):
-        del surfaces[names[body]]
-        left_out.append((names[body], "stands or floats by itself: taken for scenery or an object"))
+    found = chosen_hands(tree)
+    for body, why in outside(tree, found).items():
+        if names[body] not in asked:
+            del surfaces[names[body]]
+            left_out.append((names[body], why))
     if not surfaces:
         what = "; ".join(f'"{name}": {why}' for name, why in left_out)
         raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({what})" if what else ""))
-    found = hands(tree)
-    facing: dict[str, tuple[float, ...] | None] = {}
-    for hand in found:
-        flexion = Flexion(tree, hand)
-        wanted = [*hand.fingers, *([hand.palm] if hand.palm is not None else [])]
-        facing |= {names[body]: flexion.direction(body) for body in wanted}
-    links = tuple(_link(name, surfaces[name], facing.get(name), density) for name in robot.bodies if name in surfaces)
+    sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
+    asked_for = InnerSide(None, "asked for with --include")
+    links = tuple(_link(name, surfaces[name], sides.get(name, asked_for), density) for name in robot.bodies if name in surfaces)
     groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
-    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)))
+    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)), is_collided)
 
 
 def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
@@ -141,14 +158,45 @@ def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
 
     A joint that has no name, or of which it is not clear which end is the closed one, is not in it.
     """
-    surfaces, _ = _link_surfaces(robot)
-    tree = kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
-    model, motion = robot.compiled, {}
-    for hand in hands(tree):
-        for joint, closed in Flexion(tree, hand).closed.items():
-            low, high = model.jnt_range[joint].tolist()
-            motion[model.joint(joint).name] = (low if closed > 0.5 * (low + high) else high, closed)
+    surfaces, _, _ = _touchable(robot, _USUAL)
+    motion: dict[str, tuple[float, float]] = {}
+    for flexion in chosen_hands(_tree(robot, surfaces)):
+        motion |= {robot.compiled.joint(joint).name: ends for joint, ends in flexion.motion().items()}
     return {name: ends for name, ends in motion.items() if name}
+
+
+def _touchable(robot: Model, density: float) -> tuple[dict[str, LinkSurface], list[tuple[str, str]], bool]:
+    """Return what can be touched of each link, the others and why nothing can, and whether the simulator collides any."""
+    surfaces, left_out = _link_surfaces(robot)
+    is_collided = _keep_what_feels(robot, surfaces, left_out, density)
+    return surfaces, left_out, is_collided
+
+
+def _tree(robot: Model, surfaces: Mapping[str, LinkSurface]) -> KinematicTree:
+    return kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+
+
+def _keep_what_feels(robot: Model, surfaces: dict[str, LinkSurface], left_out: list[tuple[str, str]], density: float) -> bool:
+    """Leave of each link's surface what can be touched in the simulator, and leave out links of which nothing can be.
+
+    Links that the simulator does not collide are kept if it collides none, as those of a robot that is only seen.
+
+    Returns:
+        Whether it collides any that is no scenery.
+    """
+    colliders, radius = Colliders(robot), 0.95 * COVERING / np.sqrt(density * max(FACTORS.values()))
+    ids = {name: int(robot.compiled.body(name).id) for name in surfaces}
+    scenery = set(free_standing(_tree(robot, surfaces))) if surfaces else set()
+    links = [name for name in surfaces if ids[name] not in scenery]
+    collided = [name for name in links if colliders.collides(ids[name])]
+    for name in links if collided else []:
+        own = surfaces.pop(name)
+        pool, options = exposed_pool(robot, colliders, name, own.pool, radius) if name in collided else (None, {})
+        if pool is not None:
+            surfaces[name] = LinkSurface(pool, options)
+        else:
+            left_out.append((name, COVERED if name in collided else NOT_COLLIDED))
+    return bool(collided)
 
 
 def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str, str]]]:
@@ -165,41 +213,39 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
         except (RobotError, SampleError) as error:
             left_out.append((body, str(error).removeprefix(f"{robot.file}: ")))
             continue
-        if surface is None or surface.area < MIN_AREA:
-            left_out.append((body, "a surface without area" if surface else "nothing that can be touched from outside"))
-        else:
+        if isinstance(surface, LinkSurface):
             surfaces[body] = surface
+        else:
+            left_out.append((body, surface))
     model = robot.compiled
     unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
     left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
     return surfaces, left_out
 
 
-def _link_surface(robot: Model, body: str) -> LinkSurface | None:
+def _link_surface(robot: Model, body: str) -> LinkSurface | str:
+    """Return what can be touched of a body, or why nothing can."""
     surface = robot.surface(robot.touchable(body))
-    if not surface.face_areas.sum() > MIN_AREA:
-        return LinkSurface(0.0, np.zeros(3), np.zeros((0, 3)))
-    try:
-        shell = meshlab.outer_shell(surface)
-    except ImportError as error:
-        raise SampleError(f"sampling needs pymeshlab: {error}", "pip install pymeshlab") from error
-    pool = poisson.pool(shell, _ANYWHERE, seed=0, count=1, spacing=None)
-    return None if pool is None else LinkSurface(pool.area, pool.pos.mean(axis=0), pool.normal)
+    pool = surface_pool(surface) if surface.face_areas.sum() > MIN_AREA else None
+    if pool is None:
+        has_area = surface.face_areas.sum() > MIN_AREA
+        return "nothing that can be touched from outside" if has_area else "a surface without area"
+    return LinkSurface(pool) if pool.area >= MIN_AREA else "a surface without area"
 
 
-def _link(name: str, surface: LinkSurface, facing: tuple[float, ...] | None, density: float) -> LinkProposal:
-    share = 1.0
+def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> LinkProposal:
+    share, facing, doubt = 1.0, side.facing, side.doubt
     if facing is not None:
-        share = float(_faces(surface.normals, facing).mean())
+        share = float(_faces(surface.pool.normal, facing).mean())
         if share < MIN_SHARE:
-            share, facing = 1.0, None
+            share, facing, doubt = 1.0, None, UNCLEAR
     area = share * surface.area
     counts = {resolution: max(1, round(area * density * factor)) for resolution, factor in FACTORS.items()}
     if max(counts.values()) > MAX_COUNT:
         raise TgdslError(
             f'link "{name}" would have {max(counts.values())} taxels, expected at most {MAX_COUNT}; lower the density'
         )
-    return LinkProposal(name, area, facing, counts)
+    return LinkProposal(name, area, facing, doubt, counts, surface.options)
 
 
 def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool[np.ndarray, " n"]:
@@ -207,13 +253,13 @@ def _faces(normals: Float[np.ndarray, "n 3"], facing: tuple[float, ...]) -> Bool
     return normals @ direction >= np.cos(np.radians(WITHIN_DEG))
 
 
-def _groups(found: Sequence[Hand], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+def _groups(found: Sequence[Flexion], names: dict[int, str], links: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """Return the groups that have members; `fingers` and `hand` name those that they contain."""
     order = {name: i for i, name in enumerate(links)}
-    tips = {names[body] for hand in found for body in hand.tips}
-    palms = {names[hand.palm] for hand in found if hand.palm is not None}
-    fingers = {names[body] for hand in found for body in hand.fingers}
-    rest = set(links) - fingers - palms
+    tips = {names[body] for flexion in found for body in flexion.tips}
+    palms = {names[flexion.hand.palm] for flexion in found if flexion.hand.palm is not None}
+    fingers = {names[body] for flexion in found for body in flexion.hand.fingers}
+    mounts = {names[body] for flexion in found for body in flexion.hand.mounts} - palms
     known = {name for name, members in (("tips", tips), ("palm", palms), ("fingers", fingers), ("hand", links)) if members}
 
     def members(*groups: str, bodies: set[str]) -> tuple[str, ...]:
@@ -224,7 +270,7 @@ def _groups(found: Sequence[Hand], names: dict[int, str], links: tuple[str, ...]
         "tips": members(bodies=tips),
         "palm": members(bodies=palms),
         "fingers": members("tips", bodies=fingers - tips) if fingers else (),
-        "hand": members("fingers", "palm", bodies=rest),
+        "hand": members("fingers", "palm", bodies=mounts),
     }
     return {name: group for name, group in wanted.items() if group}
 

@@ -29,17 +29,24 @@ _HEADER = """\
 """
 _ABOUT = {
     "tips": "guessed: the last links of all chains",
-    "palm": "guessed: the largest link from which the chains branch off",
+    "palm": "guessed: the largest link from which the chains part",
     "fingers": "all that moves against it",
-    "hand": "every link with taxels",
+    "hand": "the fingers, the palm and what is fixed to it",
 }
-_NO_PALM = "  # no palm: the chains branch off from nothing that has a surface, or there is only one chain\n"
+_OPTIONS = {
+    "surface": "on the hull that the simulator collides: hollows of the mesh are deeper in it than taxels feel",
+    "exposed": "without what is inside other colliding geoms in the initial state",
+}
+_NOT_COLLIDED = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
+_NO_PALM = "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n"
 
 USUAL_DENSITY = (100.0, math.inf)
 """Taxels per area below which another unit was most likely meant [1/m²]: one per square decimetre."""
 
 
-def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool) -> list[str]:
+def new_layout(
+    robot: Model, density: str, with_groups: bool, out: Path, is_forced: bool, include: Sequence[str] = ()
+) -> list[str]:
     """Propose a layout for a robot and write it; return what to tell the user.
 
     Args:
@@ -48,10 +55,11 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
         with_groups: Whether to propose link groups.
         out: The file.
         is_forced: Whether it may be replaced.
+        include: Names or shell wildcards of links outside the hands that are to have taxels too.
 
     Raises:
-        TgdslError: If the density is none, the file is there already or cannot be written, or the robot has no link that can
-            carry taxels.
+        TgdslError: If the density is none, the file is there already or cannot be written, the robot has no link that can carry
+            taxels, or a name to include matches none.
     """
     try:
         per_area = units.parse(density, "density")
@@ -64,13 +72,17 @@ def new_layout(robot: Model, density: str, with_groups: bool, out: Path, is_forc
     if out.is_file() and not is_forced:
         raise TgdslError(f"{out}: this file is there already; give --force to replace it, or --out for another")
     check_writable(out)
-    proposal = propose(robot, per_area, with_groups)
+    proposal = propose(robot, per_area, with_groups, include)
     atomic_write(with_folder(out), layout_text(proposal, robot.file.name).encode())
     totals = {r: sum(link.counts[r] for link in proposal.links) for r in FACTORS}
     return [
         f"{len(proposal.links)} links: " + ", ".join(f"{total} taxels at {r}" for r, total in totals.items()),
         *(f"group {name}: {listed(members)}" for name, members in proposal.groups.items()),
         *(f"left out: {line}" for line in _left_out(proposal)),
+        *(f"weak guess of the inner side: {line}" for line in _doubts(proposal, has_side=True)),
+        *(f"all around: {line}" for line in _doubts(proposal, has_side=False)),
+        *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _chosen(proposal)),
+        *([] if proposal.is_collided else [f"not collided: {_NOT_COLLIDED}"]),
         f"{out}: every guess in it is marked; please look at them",
     ]
 
@@ -84,6 +96,7 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     """
     parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _left_out(proposal)]
+    parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
     if proposal.groups and proposal.shared:
         names = ", ".join(map(quoted, proposal.shared))
         parts.append(f"# Mind: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
@@ -95,10 +108,27 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     return "".join(parts)
 
 
+def _chosen(proposal: Proposal) -> list[tuple[str, str, list[LinkProposal]]]:
+    """Return each option that some links need, as the grammar has it, and the links."""
+    found = [(key, [link for link in proposal.links if key in link.options]) for key in _OPTIONS]
+    return [(key, f"{key}: {_flow(links[0].options[key])}", links) for key, links in found if links]
+
+
 def _left_out(proposal: Proposal) -> list[str]:
     """Return the bodies without taxels, one line per reason."""
-    reasons = dict.fromkeys(why for _, why in proposal.left_out)
-    names = {reason: [quoted(name) for name, why in proposal.left_out if why == reason] for reason in reasons}
+    return _by_reason(proposal.left_out)
+
+
+def _doubts(proposal: Proposal, has_side: bool) -> list[str]:
+    """Return the links with an inner side that something speaks against, or without one, one line per reason."""
+    return _by_reason(
+        [(link.name, link.doubt) for link in proposal.links if link.doubt and (link.facing is not None) == has_side]
+    )
+
+
+def _by_reason(named: Sequence[tuple[str, str]]) -> list[str]:
+    reasons = dict.fromkeys(why for _, why in named)
+    names = {reason: [quoted(name) for name, why in named if why == reason] for reason in reasons}
     return [f"{', '.join(names[reason])}: {_one_line(reason)}" for reason in reasons]
 
 
@@ -120,17 +150,20 @@ def _link_text(proposal: Proposal, link: LinkProposal, resolution: str) -> str:
     text = f"    {quoted(escaped(link.name))}: {_flow(entry)}\n"
     if resolution != "med":
         return text
-    side = (
-        "inner side guessed from how the joints close"
-        if link.facing
-        else "which side is the inner one is not clear: all around"
-    )
-    return f"    # {1e4 * link.area:.3g} cm², {side}\n{text}"
+    if link.facing is not None:
+        side = "inner side guessed from how the joints close" + (f"; weak: {link.doubt}" if link.doubt else "")
+    else:
+        side = f"{link.doubt}: all around"
+    notes = [f"    # {1e4 * link.area:.3g} cm², {side}\n"]
+    notes += [f"    # {_OPTIONS[option]}\n" for option in link.options]
+    return "".join(notes) + text
 
 
 def _flow(value: Any) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, list):
         return "[" + ", ".join(_flow(item) for item in value) + "]"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -17,7 +17,7 @@ from tgdsl.placement.sample.points import point_table
 from tgdsl.schema.placement import Grid, Placement, Points, Poisson
 from tgdsl.surfaces import meshlab
 from tgdsl.surfaces.rays import OrthographicView, first_hits, frame, reference_axes, visible_rectangle
-from tgdsl.surfaces.region import Region, unit
+from tgdsl.surfaces.region import Covered, Region, unit
 from tgdsl.surfaces.surface import Surface
 
 MIN_COSINE = 0.1
@@ -47,25 +47,26 @@ class Samples:
     cell: Int[np.ndarray, "taxel 2"]
 
 
-def sample(surface: Surface, placement: Placement, folder: Path) -> Samples:
+def sample(surface: Surface, placement: Placement, folder: Path, is_covered: Covered | None = None) -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
 
     Args:
         surface: The link's triangles, in the body frame.
         placement: How to sample them.
         folder: Where a file of points is looked up.
+        is_covered: Returns which points other solids cover; an `exposed` placement leaves them out.
 
     Raises:
         SampleError: If the surface, or the file of points, cannot satisfy the placement.
     """
     if isinstance(placement, Grid):
-        return _grid(surface, placement)
+        return _grid(surface, placement, is_covered if placement.exposed else None)
     if isinstance(placement, Poisson):
-        return _poisson(surface, placement)
+        return _poisson(surface, placement, is_covered if placement.exposed else None)
     return _points(placement, folder)
 
 
-def _grid(surface: Surface, placement: Grid) -> Samples:
+def _grid(surface: Surface, placement: Grid, is_covered: Covered | None) -> Samples:
     """Project rows × columns onto the surface.
 
     Columns, rows and direction are a right-handed frame (rows run along direction × columns): seen from where the rays
@@ -74,10 +75,10 @@ def _grid(surface: Surface, placement: Grid) -> Samples:
     frame is left-handed, as the mirror image of a grid is.
     """
     view = OrthographicView.of(surface, _grid_axes(placement))
-    region = Region.of(surface, placement.region)
+    region = Region.of(surface, placement.region, is_covered)
     rectangle = visible_rectangle(view, region)
     if rectangle is None:
-        what = "the link's surface" if region.is_everything else "the region"
+        what = "the region" if placement.region else "the link's exposed surface" if is_covered else "the link's surface"
         raise SampleError(f"no part of {what} is seen along {_shown(placement.direction)}", "turn `direction`")
     cell = np.stack(np.divmod(np.arange(placement.rows * placement.columns), placement.columns), axis=-1)
     num = np.array([placement.columns, placement.rows])
@@ -135,19 +136,20 @@ def _central(placement: Grid, cell: Int[np.ndarray, "hit 2"], pitch: Float[np.nd
     return np.sort(np.lexsort((cell[:, 1], cell[:, 0], tier))[: placement.count])
 
 
-def _poisson(surface: Surface, placement: Poisson) -> Samples:
+def _poisson(surface: Surface, placement: Poisson, is_covered: Covered | None) -> Samples:
     """Poisson-disk samples: an exact count by sample elimination, or as many as fit at a spacing by dart throwing."""
     try:
         shell = meshlab.outer_shell(surface)
     except ImportError as error:
         raise SampleError(f"`poisson` needs pymeshlab: {error}", "pip install pymeshlab") from error
-    region = Region.of(surface, placement.region)
+    region = Region.of(surface, placement.region, is_covered)
     pool = poisson.pool(shell, region, placement.seed, placement.count, placement.spacing)
+    part, hint = "exposed outer surface" if placement.exposed else "outer surface", "widen `region`"
+    hint = "other links cover it: place none here" if placement.exposed and not placement.region else hint
     if pool is None:
-        raise SampleError("no part of the link's outer surface is in the region", "widen `region`")
+        raise SampleError(f"no part of the link's {part} is in the region", hint)
     if placement.count is not None and len(pool.pos) < placement.count:
-        what = f"the region holds too little of the link's outer surface for `count` {placement.count}"
-        raise SampleError(what, "widen `region`")
+        raise SampleError(f"the region holds too little of the link's {part} for `count` {placement.count}", hint)
     if placement.spacing is not None and pool.area / placement.spacing**2 > MAX_DENSITY:
         least = np.sqrt(pool.area / MAX_DENSITY)
         what = f"a spacing of {placement.spacing:g} m is too fine for a surface of {pool.area:.3g} m²"

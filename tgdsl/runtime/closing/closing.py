@@ -122,9 +122,7 @@ class Closing:
             spec.add_exclude(bodyname1=name, bodyname2=other)
         if self.body is not None:
             spec.body(self.body).joints[0].damping = [self.drag, 0, 0]
-        spec.add_key(
-            name=START, qpos=self.start, ctrl=self._controls([servo.opened for servo in self.servos], len(spec.actuators))
-        )
+        spec.add_key(name=START, qpos=self.start, ctrl=self.targets(len(spec.actuators))[0])
 
     def targets(self, num_actuators: int) -> list[Float[np.ndarray, " actuator"]]:
         """Return the controls of the open and of the closed hand; the scene's own actuators come first and have zero."""

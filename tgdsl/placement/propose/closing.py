@@ -1,0 +1,218 @@
+"""Which end of each joint's range closes a hand, and what speaks against it.
+
+The evidence, in the order in which it decides:
+
+1. A finger curls: a hinge whose range bends away from its start, in the sense of rotation of another hinge of its finger that
+   bends too, closes at the far end. That a tip then moves away from the others, as a thumb's may, is named but does not count:
+   what is nearer depends on the pose of the rest of the hand, how a finger curls does not.
+2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
+   other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
+   against its range. A hinge of a curling finger that has its range against it stays undecided.
+3. The range alone: the only hinge of a chain closes at the far end of a range that bends away from its start; that is weak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.placement.propose.hands import Hand, KinematicTree
+from tgdsl.placement.propose.poses import Poses
+
+ONE_SIDED, LEANING = 3.0, 1.5
+"""A joint bends one way, or leans to one, if its range from the start is this many times longer on one side."""
+MIN_CLOSING = 0.03
+"""Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
+MIN_BEND = np.radians(30.0)
+"""A hinge that turns by less than this does not close a finger, but shapes a palm."""
+MAX_FINGER = 0.35
+"""A longer chain is an arm or a leg, of which nothing closes [m]."""
+PARALLEL = 0.7
+"""Least cosine of the angle between two axes about which a finger curls."""
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a joint that can be set by itself closes a hand.
+
+    Attributes:
+        opened: Its value when open [rad, of slides m].
+        closed: Its value when closed.
+        is_curling: Whether it bends a finger of several joints.
+        doubt: What speaks against it; empty if nothing does.
+    """
+
+    opened: float
+    closed: float
+    is_curling: bool
+    doubt: str = ""
+
+
+class Closing:
+    """The joints that close a hand.
+
+    Attributes:
+        poses: The hand's poses.
+        motions: How each joint closes; one that is not clear is not in it.
+        turned: Per joint, the hinges that turn as it moves to the high end, and the axes of these rotations in the world.
+    """
+
+    def __init__(self, tree: KinematicTree, hand: Hand):
+        """Look at each joint by itself, the others half closed and then closed."""
+        self.tree, self.hand, self.poses = tree, hand, Poses(tree, hand)
+        self.chain = {s: i for i, chain in enumerate(hand.chains) for s in chain}
+        independent = self.poses.independent if hand.length <= MAX_FINGER else ()
+        candidates = [joint for joint in independent if self._can_close(joint)]
+        self.turned = {joint: self._turned(joint) for joint in candidates}
+        self.lean = {joint: self._lean(joint) for joint in candidates}
+        self.sense = self._curling()
+        self.bending = self._bending(candidates)
+        others = {joint: float(np.mean(self._range(joint))) for joint in self.bending}
+        half = {joint: self._gain(joint, others) for joint in self.bending}
+        others = {joint: self._end(joint, self.sense.get(joint) or half[joint]) for joint in self.bending}
+        whole = {joint: self._gain(joint, others) for joint in self.bending}
+        found = {joint: self._motion(joint, half[joint], whole[joint]) for joint in self.bending}
+        self.motions = {joint: motion for joint, motion in found.items() if motion is not None}
+
+    def posed(self, share: float) -> Float[np.ndarray, " qpos"]:
+        """Return the pose in which all joints that close are closed by a share; the others are as at the start."""
+        values = {joint: (1.0 - share) * m.opened + share * m.closed for joint, m in self.motions.items()}
+        return self.poses.posed(values)
+
+    def segment(self, joint: int) -> int:
+        """Return the segment that a joint moves against its parent."""
+        return self.tree.segment[int(self.tree.model.jnt_bodyid[joint])]
+
+    def _can_close(self, joint: int) -> bool:
+        model = self.tree.model
+        if not model.jnt_limited[joint] or not self.tree.carries & {self.segment(joint)}:
+            return False
+        return int(model.jnt_type[joint]) != _HINGE or bool(np.ptp(model.jnt_range[joint]) >= MIN_BEND)
+
+    def _range(self, joint: int) -> tuple[float, float]:
+        low, high = self.tree.model.jnt_range[joint].tolist()
+        return low, high
+
+    def _end(self, joint: int, sense: float) -> float:
+        return self._range(joint)[1 if sense > 0 else 0]
+
+    def _sides(self, joint: int) -> tuple[float, float]:
+        """Return how far a joint can go from its start to the low and to the high end."""
+        start = float(self.poses.start[self.poses.at(joint)])
+        low, high = self._range(joint)
+        return max(start - low, 0.0), max(high - start, 0.0)
+
+    def _lean(self, joint: int) -> float:
+        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide."""
+        down, up = self._sides(joint)
+        if int(self.tree.model.jnt_type[joint]) != _HINGE or max(down, up) < LEANING * min(down, up):
+            return 0.0
+        return float(np.sign(up - down)) * (1.0 if max(down, up) >= ONE_SIDED * min(down, up) else 0.5)
+
+    def _turned(self, joint: int) -> dict[int, Float[np.ndarray, " 3"]]:
+        model, start = self.tree.model, self.poses.start
+        step = 0.05 * float(np.ptp(model.jnt_range[joint]))
+        down, up = self._sides(joint)
+        sign = 1.0 if up > down else -1.0
+        moved = (self.poses.posed({joint: float(start[self.poses.at(joint)]) + sign * step}) - start) * sign
+        axes = self.poses.kinematics(start).xaxis.copy()
+        hinges = [j for j in self.poses.joints if int(model.jnt_type[j]) == _HINGE]
+        turned = {j: float(moved[self.poses.at(j)]) for j in hinges if abs(moved[self.poses.at(j)]) > 1e-2 * step}
+        return {j: float(np.sign(angle)) * axes[j] for j, angle in turned.items()}
+
+    def _curling(self) -> dict[int, float]:
+        """Return the joints that curl a finger, and toward which end (±1) they do."""
+        sense: dict[int, float] = {}
+        for joint, lean in self.lean.items():
+            if lean and not self.is_opposed(joint):
+                agreeing = [other for other in self.lean if self._is_agreeing(joint, lean, other, self.lean[other])]
+                if any(max(abs(lean), abs(self.lean[other])) == 1.0 for other in agreeing):
+                    sense[joint] = float(np.sign(lean))
+        for joint, lean in self.lean.items():  # a hinge that leans to no side goes with those that it is parallel to
+            if not lean and self.turned[joint]:
+                votes = [s for s in (1.0, -1.0) if any(self._is_agreeing(joint, s, other, sense[other]) for other in sense)]
+                sense |= {joint: votes[0]} if len(votes) == 1 else {}
+        return sense
+
+    def _is_agreeing(self, one: int, sense: float, two: int, other: float) -> bool:
+        """Return whether two joints, or one that turns several hinges, turn hinges of a finger in the same sense."""
+        if sense * other == 0.0 or self.is_opposed(two):
+            return False
+        sign = float(np.sign(sense * other))
+        return any(sign * cosine > PARALLEL for cosine in self._cosines(one, two))
+
+    def is_opposed(self, joint: int) -> bool:
+        """Return whether a joint turns hinges of one finger in opposite senses, as that of a parallel linkage does."""
+        return any(cosine < -PARALLEL for cosine in self._cosines(joint, joint))
+
+    def _cosines(self, one: int, two: int) -> list[float]:
+        """Return the cosines between the axes of hinges of one finger that two joints turn."""
+        found = []
+        for i, axis in self.turned[one].items():
+            for j, other in self.turned[two].items():
+                paths = (self.tree.path(self.segment(i)), self.tree.path(self.segment(j)))
+                if i != j and (paths[0][0] in paths[1] or paths[1][0] in paths[0]):
+                    found.append(float(axis @ other))
+        return found
+
+    def _bending(self, candidates: list[int]) -> list[int]:
+        """Return the joints of which to find the closed end: those that spread a curling finger are not among them."""
+        curled = {self.chain[self.segment(joint)] for joint in self.sense}
+        one_way = {joint for joint in candidates if abs(self.lean[joint]) == 1.0}
+        found = []
+        for joint in candidates:
+            segment = self.segment(joint)
+            own = [other for other in candidates if self.segment(other) == segment]
+            rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
+            is_hinge = int(self.tree.model.jnt_type[joint]) == _HINGE
+            spreads = is_hinge and joint not in self.sense and joint not in one_way and self.chain[segment] in curled
+            if rivals == [joint] and not spreads:
+                found.append(joint)
+        return found
+
+    def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
+        gain = half + whole if _is_clear(half, whole) else 0.0
+        sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
+        siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
+        doubt = ""
+        if sense:
+            if gain * sense < 0:
+                doubt = f"as it curls, its tip goes {abs(gain) / 2:.0%} away from the palm and the other tips"
+        elif gain and (not siblings or gain * lean >= 0):
+            sense = gain
+            if gain * lean < 0:
+                doubt = "it starts closed: the tips part along its range"
+        elif lean and not siblings and not gain and len(self.hand.chains) > 1:
+            sense, doubt = lean, "the tips hardly draw nearer; only its range says where it bends"
+        if not sense:
+            return None
+        return Motion(self._end(joint, -sense), self._end(joint, sense), joint in self.sense, doubt)
+
+    def _gain(self, joint: int, others: Mapping[int, float]) -> float:
+        """Return the share by which the tips draw nearer as a joint goes from the low to the high end of its range."""
+        low, high = (self._points({**others, joint: end}) for end in self._range(joint))
+        is_moved, num = np.linalg.norm(high - low, axis=1) > 1e-6, len(self.hand.tips)
+        chains = [self.chain[self.tree.segment[tip]] for tip in self.hand.tips] + [-1] * (len(low) - num)
+        apart = [(i, j) for i in range(num) for j in range(i + 1, len(low)) if chains[i] != chains[j]]
+        pairs = [(i, j) for i, j in apart if is_moved[i] or is_moved[j]]
+        if not pairs:
+            return 0.0
+        at_low, at_high = (float(np.mean([np.linalg.norm(p[i] - p[j]) for i, j in pairs])) for p in (low, high))
+        return (at_low - at_high) / max(at_low, at_high, 1e-9)
+
+    def _points(self, values: Mapping[int, float]) -> Float[np.ndarray, "point 3"]:
+        """Return the centres of the tips, and of the palm if there is one, in the world [m]."""
+        data = self.poses.kinematics(self.poses.posed(values))
+        bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
+        return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
+
+
+def _is_clear(half: float, whole: float) -> bool:
+    """Return whether two gains, with the other joints half closed and closed, agree, or one by far outweighs the other."""
+    small, large = sorted((abs(half), abs(whole)))
+    return large > MIN_CLOSING and (half * whole > 0 or small < 0.5 * large)

@@ -1,0 +1,52 @@
+"""Which of what may be a hand are taken for hands, and which links a layout leaves out: an arm, a forearm, a base, a head."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.placement.propose.flexion import Flexion
+from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands
+from tgdsl.schema.select import matching
+
+BEFORE = "before the link from which the fingers part; --include adds it"
+BESIDE = "no part of a hand; --include adds it"
+SCENERY = "stands or floats by itself: taken for scenery or an object; --include adds it"
+
+
+def chosen_hands(tree: KinematicTree) -> list[Flexion]:
+    """Return the hands of a robot: those of which two chains or more are known to close, or else all that may be one."""
+    found = [Flexion(tree, hand) for hand in hands(tree)]
+    return [flexion for flexion in found if flexion.num_closing > 1] or found
+
+
+def outside(tree: KinematicTree, found: Sequence[Flexion]) -> dict[int, str]:
+    """Return the bodies with surface that are in no hand, and why a layout leaves them out."""
+    within = {body for flexion in found for body in (*flexion.hand.mounts, *flexion.hand.fingers)}
+    before = {s for flexion in found for s in tree.path(flexion.hand.base)}
+    scenery = set(free_standing(tree))
+    reasons = {body: BEFORE if tree.segment[body] in before else BESIDE for body in sorted(tree.area)}
+    return {body: SCENERY if body in scenery else why for body, why in reasons.items() if body not in within}
+
+
+def included(patterns: Sequence[str], names: Sequence[str], left_out: Mapping[str, str]) -> set[str]:
+    """Return the links that some patterns ask for.
+
+    Args:
+        patterns: Names of links, or shell wildcards.
+        names: Links that can have taxels.
+        left_out: Other links, and why they cannot.
+
+    Raises:
+        TgdslError: If a pattern matches no link that can have taxels.
+    """
+    found: set[str] = set()
+    for pattern in patterns:
+        own = {pattern} & {*names} or {*matching(pattern, names)}
+        if not own:
+            barred = [name for name in left_out if name == pattern or name in matching(pattern, [name])]
+            why = [f'"{name}" can have no taxels: {left_out[name]}' for name in barred]
+            what = "; ".join(why) or f'no link matches "{pattern}"; {did_you_mean(pattern, names, "links")}'
+            raise TgdslError(f"--include: {what}")
+        found |= own
+    return found

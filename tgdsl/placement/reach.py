@@ -1,0 +1,211 @@
+"""Which taxels nothing can touch: not collided by the simulator, buried in their own link, or covered by another at rest.
+
+MuJoCo collides convex solids: primitives, and the convex hulls of meshes. A taxel on a concave mesh may lie so deep inside its
+own link's hull that no object comes within its radius. All is in the model's initial state.
+
+Shapes: `taxel` taxels of a layout, `n` points of one body, `solid` colliding geoms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from tgdsl.formats.model import Model
+from tgdsl.layout.layout import Layout
+from tgdsl.layout.unfelt import BURIED, COVERED, NOT_COLLIDED, Unfelt
+from tgdsl.surfaces.convex import ConvexSolid, hull_planes
+from tgdsl.surfaces.geom import Geom
+from tgdsl.surfaces.region import Covered
+
+INSIDE = 1e-6
+"""Depth from which a point counts as inside a solid [m]: links that touch face to face overlap by rounding."""
+DIRECTIONS = 100
+"""Directions in which it is looked whether a ball reaches out of several solids together."""
+_UNBOUNDED = ("plane", "hfield", "sdf", "unknown")
+"""Types of geoms that are no convex solid: the ground, and shapes that MuJoCo collides otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What the colliding geoms of a robot leave of each taxel.
+
+    Attributes:
+        is_collided: Whether any geom of the taxel's body can be in a contact; of a contact sensor only these count.
+        depth: How deep the taxel is inside one geom of its own rigid link [m]; at most 0 if it is inside none.
+        is_buried: Whether its whole ball is inside its own rigid link.
+        cover: The body of another link that it is inside of, by MuJoCo's index; −1 if it is inside none.
+    """
+
+    is_collided: Bool[np.ndarray, " taxel"]
+    depth: Float[np.ndarray, " taxel"]
+    is_buried: Bool[np.ndarray, " taxel"]
+    cover: Int[np.ndarray, " taxel"]
+
+
+class Colliders:
+    """The colliding geoms of a robot as convex solids in the world, in its initial state."""
+
+    def __init__(self, robot: Model):
+        """Pose the solids; planes, height fields and signed distance fields are none."""
+        self.robot, model = robot, robot.compiled
+        self.state = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self.state)
+        geoms = (robot.geom(i) for i in range(model.ngeom))
+        self.geom = np.array([g.id for g in geoms if g.is_colliding and g.shape not in _UNBOUNDED], dtype=np.int64)
+        self.body = model.geom_bodyid[self.geom].astype(np.int64)
+        self.solids = [self._solid(int(i)) for i in self.geom]
+        weld, root = model.body_weldid, model.body_rootid
+        self.segment = np.where(weld > 0, weld, root).astype(np.int64)
+        roots = np.arange(model.nbody)[root]
+        self.is_loose = np.array([self._floats(int(i)) for i in roots])
+
+    def collides(self, body: int) -> bool:
+        """Return whether any geom of a body can be in a contact."""
+        first, count = int(self.robot.compiled.body_geomadr[body]), int(self.robot.compiled.body_geomnum[body])
+        return any(self.robot.geom(i).is_colliding for i in range(first, first + count))
+
+    def in_world(self, body: int, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return points of a body's frame in the world."""
+        return self.state.xpos[body] + pos @ self.state.xmat[body].reshape(3, 3).T
+
+    def own(self, body: int) -> Int[np.ndarray, " own"]:
+        """Return the solids of a body's rigid link: what is welded to it moves with it; what is fixed to the world does not."""
+        return np.flatnonzero(self.segment[self.body] == self.segment[body])
+
+    def others(self, body: int, ignored: Collection[int] = ()) -> Int[np.ndarray, " other"]:
+        """Return the solids of other links; bodies that float by themselves are objects, and the world is no link.
+
+        Args:
+            body: The body.
+            ignored: Bodies that are no links, such as objects, by their indices.
+        """
+        is_near = (self.robot.compiled.body_rootid == self.robot.compiled.body_rootid[body]) | ~self.is_loose
+        is_link = is_near & (self.segment != self.segment[body])
+        is_link[[0, *ignored]] = False
+        return np.flatnonzero(is_link[self.body])
+
+    def depths(self, solids: Int[np.ndarray, " own"], pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "own n"]:
+        """Return how deep points of the world are inside each of some solids [m], see `ConvexSolid.depth`."""
+        found = [self.solids[i].depth(pos) for i in solids]
+        return np.stack(found) if found else np.zeros((0, len(pos)))
+
+    def is_buried(
+        self, body: int, pos: Float[np.ndarray, "n 3"], radius: Float[np.ndarray, " n"]
+    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return which balls about points of a body's frame are wholly inside its rigid link, and the points' depths [m].
+
+        A ball that is inside none of the solids may be inside all of them together: every one of its points that is looked
+        at is then inside one.
+        """
+        own, at = self.own(body), self.in_world(body, pos)
+        depths = self.depths(own, at)
+        depth = depths.max(axis=0, initial=-np.inf)
+        is_buried = depth > radius + INSIDE
+        several = (depth > INSIDE) & ~is_buried & ((depths > -radius).sum(axis=0) > 1)
+        for direction in _sphere(DIRECTIONS):
+            doubtful = np.flatnonzero(several)
+            if not len(doubtful):
+                break
+            rim = at[doubtful] + radius[doubtful, None] * direction
+            several[doubtful] = self.depths(own, rim).max(axis=0) > INSIDE
+        return is_buried | several, depth
+
+    def cover_of(self, body: str, geoms: Sequence[Geom], ignored: Collection[int] = ()) -> Covered:
+        """Return a function that says which points of a body's frame are inside other colliding geoms, of its link or others.
+
+        Args:
+            body: The body's name.
+            geoms: Geoms that do not count: those that the points are on.
+            ignored: Bodies that are no links, such as objects, by their indices.
+        """
+        own = int(self.robot.compiled.body(body).id)
+        solids = np.concatenate([self.own(own), self.others(own, ignored)])
+        solids = solids[~np.isin(self.geom[solids], [geom.id for geom in geoms])]
+
+        def is_covered(pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+            return self.depths(solids, self.in_world(own, pos)).max(axis=0, initial=-np.inf) > INSIDE
+
+        return is_covered
+
+    def _solid(self, i: int) -> ConvexSolid:
+        model, geom = self.robot.compiled, self.robot.geom(i)
+        centre, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
+        planes = hull_planes(self.robot.hull(geom)) if geom.shape == "mesh" else np.zeros((0, 4))
+        pos, rotation = self.state.geom_xpos[i].copy(), self.state.geom_xmat[i].reshape(3, 3).copy()
+        return ConvexSolid(geom.shape, geom.size, pos, rotation, planes, centre - half, centre + half)
+
+    def _floats(self, root: int) -> bool:
+        """Return whether a tree's first body goes anywhere: by a free joint, or as a mocap body."""
+        model = self.robot.compiled
+        first, count = int(model.body_jntadr[root]), int(model.body_jntnum[root])
+        kinds = model.jnt_type[first : first + count] if count else []
+        return bool(model.body_mocapid[root] >= 0 or int(mujoco.mjtJoint.mjJNT_FREE) in kinds)
+
+
+def reach(colliders: Colliders, layout: Layout, ignored: Collection[int] = ()) -> Reach:
+    """Return what the colliding geoms of a robot leave of each taxel; inactive fillers (radius 0) are left as they are.
+
+    Args:
+        colliders: The robot's.
+        layout: The taxels.
+        ignored: Bodies that are no links, such as objects, by their indices.
+    """
+    count, model = layout.num_taxels, colliders.robot.compiled
+    found = Reach(np.ones(count, bool), np.full(count, -np.inf), np.zeros(count, bool), np.full(count, -1))
+    for place, name in enumerate(layout.bodies):
+        taxels = np.flatnonzero((layout.body_id == place) & (layout.radius > 0))
+        body, pos = int(model.body(name).id), layout.pos[taxels]
+        found.is_collided[taxels] = colliders.collides(body)
+        found.is_buried[taxels], found.depth[taxels] = colliders.is_buried(body, pos, layout.radius[taxels])
+        others = colliders.others(body, ignored)
+        depths = colliders.depths(others, colliders.in_world(body, pos))
+        if len(others):
+            deepest = depths.argmax(axis=0)
+            is_inside = depths.max(axis=0) > INSIDE
+            found.cover[taxels] = np.where(is_inside, colliders.body[others[deepest]], -1)
+    return found
+
+
+def unfelt(colliders: Colliders, layout: Layout, found: Reach) -> tuple[Unfelt, ...]:
+    """Return the taxels that cannot feel by link and reason; each taxel is in one record.
+
+    Args:
+        colliders: The robot's.
+        layout: The taxels.
+        found: Their reach; whoever knows better which are collided may have replaced that.
+    """
+    records: list[Unfelt] = []
+    is_buried = found.is_collided & found.is_buried
+    is_covered = found.is_collided & ~found.is_buried & (found.cover >= 0)
+    for i, link in enumerate(layout.links):
+        own = layout.link_id == i
+        if len(taxels := np.flatnonzero(own & ~found.is_collided)):
+            why = "on a body that the simulator does not collide"
+            records.append(Unfelt(link.name, NOT_COLLIDED, why, taxels, int(own.sum())))
+        if len(taxels := np.flatnonzero(own & is_buried)):
+            why = f"buried in the link's own colliding geoms, up to {_mm(found.depth[taxels])} deep, beyond their radius"
+            records.append(Unfelt(link.name, BURIED, why, taxels, int(own.sum())))
+        for body in np.unique(found.cover[own & is_covered]).tolist():
+            taxels = np.flatnonzero(own & is_covered & (found.cover == body))
+            name = colliders.robot.compiled.body(body).name
+            other = f'"{name}"' if name else f"unnamed body {body}"
+            records.append(Unfelt(link.name, COVERED, f"inside {other} in the initial state", taxels, int(own.sum())))
+    return tuple(records)
+
+
+def _mm(depth: Float[np.ndarray, " n"]) -> str:
+    return f"{1e3 * depth.max():.2g} mm"
+
+
+def _sphere(count: int) -> Float[np.ndarray, "n 3"]:
+    """Return a Fibonacci lattice of unit vectors, in an order that meets every side early."""
+    place = 37 * np.arange(count) % count
+    height = 1.0 - (2.0 * place + 1.0) / count
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * place
+    ring = np.sqrt(1.0 - height**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=-1)

@@ -1,0 +1,81 @@
+"""Convex solids: primitives and convex hulls, as a simulator collides them, and how deep points are inside.
+
+Shapes: `n` points, `k` half-spaces of a hull.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.surfaces.surface import Surface
+
+CHUNK = 1 << 21
+"""Distances from half-spaces that are in memory at once."""
+SLACK = 1e-6
+"""Widening of a bounding box [m]: what is just outside is a small distance away, not infinitely far."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexSolid:
+    """A primitive or a convex hull, somewhere in a frame.
+
+    Attributes:
+        shape: The primitive's type, or `mesh`.
+        size: Its size as MuJoCo defines it [m].
+        pos: Its frame's origin [m].
+        rotation: Rotates vectors of its frame into the frame that it is in.
+        planes: Outward unit normals and offsets [m] of a hull's faces, in its own frame; of a primitive none.
+        low: Lower corner of its bounding box, in its own frame [m].
+        high: Upper corner.
+    """
+
+    shape: str
+    size: Float[np.ndarray, " 3"]
+    pos: Float[np.ndarray, " 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    planes: Float[np.ndarray, "k 4"]
+    low: Float[np.ndarray, " 3"]
+    high: Float[np.ndarray, " 3"]
+
+    def depth(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return the distance of points inside to the surface [m].
+
+        Outside it is negative: the point is at least as far away, and −∞ says that it is outside the bounding box.
+        """
+        own = (pos - self.pos) @ self.rotation
+        depth = np.full(len(own), -np.inf)
+        near = np.flatnonzero(((own >= self.low - SLACK) & (own <= self.high + SLACK)).all(axis=1))
+        if len(near):
+            depth[near] = self._from_planes(own[near]) if len(self.planes) else -self._distance(own[near])
+        return depth
+
+    def _from_planes(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Return the distance from the nearest face's plane: that is the surface's for points inside."""
+        rows = max(1, CHUNK // len(self.planes))
+        parts = (pos[start : start + rows] for start in range(0, len(pos), rows))
+        return np.concatenate([(self.planes[:, 3] - part @ self.planes[:, :3].T).min(axis=1) for part in parts])
+
+    def _distance(self, pos: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        import torch  # takes seconds, and hulls do not need it
+
+        from tgdsl.geometry.shapes import SHAPES
+
+        x, y, z = torch.from_numpy(pos.T.copy())
+        a, b, c = torch.from_numpy(self.size.astype(np.float64))
+        return SHAPES[self.shape]((x, y, z), (a, b, c))[0].numpy()
+
+
+def hull_planes(hull: Surface) -> Float[np.ndarray, "k 4"]:
+    """Return outward unit normals and offsets of the planes that support a convex surface at its faces.
+
+    The offset is the farthest vertex', not the face's own: the plane of a face that is next to nothing may be turned anyhow,
+    and would cut the solid.
+    """
+    normals = np.unique(hull.face_normals[hull.face_areas > 0].round(12), axis=0)
+    rows = max(1, CHUNK // len(hull.vertices))
+    parts = (normals[start : start + rows] for start in range(0, len(normals), rows))
+    offsets = np.concatenate([(part @ hull.vertices.T).max(axis=1) for part in parts])
+    return np.column_stack([normals, offsets])
