@@ -5,7 +5,7 @@ GRIPPER = """
   <default><joint type="slide" axis="0 1 0" range="0 .04" damping="20"/></default>
   <worldbody>
     <body name="arm" pos="0 0 .5"><joint name="lift" axis="0 0 1" range="-.2 .2" type="slide" damping="1"/>
-      <geom type="box" size=".03 .03 .05" pos="0 0 .1" mass="2"/>
+      <geom type="box" size=".03 .03 .05" pos="0 0 .13" mass="2"/>
       <body name="elbow" pos="0 0 .05"><joint name="turn" type="hinge" axis="1 0 0" range="-2 2"/><geom size=".02" mass="1"/>
         <body name="hand" pos="0 0 -.05"><geom type="box" size=".02 .06 .02" mass=".5"/>
           <body name="left" pos="0 0 -.03"><joint name="left slide"/>

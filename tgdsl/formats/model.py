@@ -60,7 +60,7 @@ class Model:
         return tuple(name for name in names if name)
 
     def body_path(self, i: int) -> str:
-        """Return what to call a body: its name, or, of one without, how it is found: `forearm/[2]`, the forearm's second child."""
+        """Return what to call a body: its name, or how one without is found: `forearm/[2]`, the forearm's second child."""
         if name := self.compiled.body(i).name:
             return name
         parent = int(self.compiled.body_parentid[i])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from closing_hands import GRIPPER, URDF
-from odd_hands import CAPSULES, TENDON
+from odd_hands import CAPSULES, FOUR_BAR, TENDON
 
 import tgdsl
 from tgdsl.formats.robot import load_model
@@ -18,7 +18,13 @@ from tgdsl.runtime.closing.closing import GRIP, MOST, START, Closing, closing_of
 from tgdsl.runtime.rollout import controls_between, rollout
 
 BALL = {"geom": {"type": "sphere", "size": [0.012]}}
-HANDS = {"gripper.xml": GRIPPER, "tendon.xml": TENDON, "three fingers.urdf": URDF, "capsules.xml": CAPSULES}
+HANDS = {
+    "gripper.xml": GRIPPER,
+    "tendon.xml": TENDON,
+    "three fingers.urdf": URDF,
+    "capsules.xml": CAPSULES,
+    "four_bar.xml": FOUR_BAR,
+}
 SECONDS = 1.0
 HELD_ATOL = 2e-3
 """How far soft constraints let held joints go under the forces of a grip [rad, m]."""
@@ -37,7 +43,11 @@ def module(
         "tgdsl": 1,
         "robot": {
             "model": str(folder / name),
-            "layout": {"resolutions": {"r": {escaped(b): {"method": "poisson", "count": 4, "radius": "4 mm"} for b in links}}},
+            "layout": {
+                "resolutions": {
+                    "r": {escaped(b): {"method": "poisson", "count": 4, "radius": "4 mm", "exposed": True} for b in links}
+                }
+            },
         },
         "objects": objects or {"ball": BALL},
         "sensors": {"load": {"kind": "link_contact", "links": "*", "feels": list(objects or {"ball": BALL})}},
