@@ -26,7 +26,7 @@ class Movement:
     Attributes:
         model: The scene.
         trees: Topmost bodies of the kinematic trees that carry taxels.
-        ends: Open and closed end of each joint that closes the hand and follows no other [rad, of slides m].
+        ends: Open and closed end of each joint that closes the hand and follows no other such [rad, of slides m].
         follows: By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
     """
 
@@ -38,7 +38,8 @@ class Movement:
     @cached_property
     def closing(self) -> tuple[int, ...]:
         """Joints that close the hand, those that follow such included."""
-        return (*self.ends, *(joint for joint, (leader, _) in self.follows.items() if leader in self.ends))
+        followers = (joint for joint, (leader, _) in self.follows.items() if leader in self.ends)
+        return tuple(dict.fromkeys((*self.ends, *followers)))
 
     @cached_property
     def hand(self) -> frozenset[int]:
@@ -53,8 +54,9 @@ class Movement:
 
     @cached_property
     def num_joints(self) -> int:
-        """Number of the hand's hinges and slides that no equality has follow another."""
-        return sum(self.is_scalar(j) and int(self.model.jnt_bodyid[j]) in self.hand for j in self.own if j not in self.follows)
+        """Number of the hand's hinges and slides, of those that follow another only the ones that close it."""
+        wanted = [joint for joint in self.own if joint in self.ends or joint not in self.follows]
+        return sum(self.is_scalar(joint) and int(self.model.jnt_bodyid[joint]) in self.hand for joint in wanted)
 
     @cached_property
     def own(self) -> tuple[int, ...]:
@@ -63,11 +65,11 @@ class Movement:
 
     @cached_property
     def held(self) -> tuple[int, ...]:
-        """Joints of the trees that neither close the hand nor follow another, nor are in a closed loop."""
+        """Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop."""
         looped = self._looped()
-        return tuple(
-            j for j in self.own if not (j in self.ends or j in self.follows or int(self.model.jnt_bodyid[j]) in looped)
-        )
+        led = {leader for joint, (leader, _) in self.follows.items() if joint in self.ends}
+        coupled = {*self.ends, *self.follows, *led}
+        return tuple(j for j in self.own if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
 
     @cached_property
     def tips(self) -> tuple[int, ...]:
@@ -130,4 +132,4 @@ def movement(scene: Model, bodies: frozenset[str]) -> Movement:
     ends = {int(model.joint(name).id): pair for name, pair in closing_motion(scene).items()}
     ends = {joint: pair for joint, pair in ends.items() if int(model.body_rootid[model.jnt_bodyid[joint]]) in trees}
     driven = {joint: pair for joint, pair in ends.items() if joint not in follows or follows[joint][0] not in ends}
-    return Movement(model, trees, driven, {joint: own for joint, own in follows.items() if joint not in driven})
+    return Movement(model, trees, driven, follows)
