@@ -65,11 +65,29 @@ def test_links_that_no_sensor_has_are_not_sampled(folder):
     )
     assert found.layout.num_taxels == 1
     assert found.unused == (
-        ("link index_1", "no sensor is on it"),
-        ("link index_2", "no sensor is on it"),
-        ("link thumb_pad", "no sensor is on it"),
+        ("link index_1", "no sensor is on its taxels"),
+        ("link index_2", "no sensor is on its taxels"),
+        ("link thumb_pad", "no sensor is on its taxels"),
         ("object rest", "no sensor feels it"),
     )
+
+
+def test_bodies_of_the_scene_that_nothing_feels_are_named_by_their_way(folder):
+    """Those of the robot are not listed, nor are those that an object is made of."""
+    hand = HAND.replace('<body name="frame" pos="0 0 .1"/>', '<body pos="0 0 .1"><geom size=".001"/></body>')
+    (folder / "hand.xml").write_text(hand)
+    lid = '<body><geom size=".01"/></body>'
+    bodies = f'<body name="box" pos="9 0 0"><freejoint/><geom size=".1"/>{lid}</body>'
+    bodies += '<body name="lamp" pos="8 0 0"><geom size=".1"/><body/><body pos="0 0 1"><geom size=".1"/></body></body>'
+    bodies += '<body pos="7 0 0"><geom size=".1"/></body>'
+    (folder / "scene.xml").write_text(f'<mujoco><include file="hand.xml"/><worldbody>{bodies}</worldbody></mujoco>')
+    text = DOCUMENT.replace("resolution: low", "scene: {model: scene.xml}\nresolution: low")
+    text = text.replace("objects: {", "objects: {box: {body: box}, ").replace("feels: [", "feels: [box, ")
+    assert dict(resolved(folder, text).unused) == {
+        "body lamp": "not listed under `objects`",
+        "body lamp/[2]": "no name, so `objects` cannot list it",
+        "body world/[8]": "no name, so `objects` cannot list it",
+    }
 
 
 def test_a_body_is_sampled_where_it_collides_a_geom_where_it_is(folder):

@@ -124,7 +124,7 @@ def test_only_what_is_needed_is_planned(touch):
     depth = touch.plan.quantities["contact_depth"]
     assert list(touch.plan.quantities) == ["contact_depth"] and len(depth.queries) == len(depth.uses) == 1
     assert not any("far" in name or "tip" in name for name in touch.plan.arrays)
-    assert dict(touch.plan.dropped) == {"link tip": "no sensor is on it", "object far": "no sensor feels it"}
+    assert dict(touch.plan.dropped) == {"link tip": "no sensor is on its taxels", "object far": "no sensor feels it"}
 
 
 def test_a_shared_query_costs_once(document):
@@ -138,7 +138,7 @@ def test_explain_names_counts_inputs_and_what_was_dropped(touch):
     text = touch.explain()
     for part in (
         "12 taxels",
-        "link tip: no sensor is on it",
+        "link tip: no sensor is on its taxels",
         "pad – item",
         "asks for depth of 12 probes (query 0) with motion and normal in item (box), where MuJoCo has the pair in contact "
         "(found once for contact too)",

@@ -1,5 +1,7 @@
 """The table of a robot's links: areas against closed forms, columns, groups."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -56,15 +58,15 @@ def test_links_table(shapes, here):
     assert (
         said
         == """\
-body                  joints                     geoms                     area [cm²]  mass [g]  groups
-world                                            ground: plane, colliding   unbounded
-  box                 base: free                 b: box, colliding              88.00     100.0  first, all
-                                                 shown: sphere, visual
-    ball              turn: hinge -45 to 90 deg  sphere, colliding              50.21     200.0  others, all
-                      slide 0 to 20 mm
-      rod             ball unlimited             cylinder, colliding            43.97     300.0  others, all
-    (unnamed body 4)  -                          box, visual                        -       8.0
-    frame             -                          -                                  -       0.0
+body         joints                     geoms                     area [cm²]  mass [g]  groups
+world                                   ground: plane, colliding   unbounded
+  box        base: free                 b: box, colliding              88.00     100.0  first, all
+                                        shown: sphere, visual
+    ball     turn: hinge -45 to 90 deg  sphere, colliding              50.21     200.0  others, all
+             slide 0 to 20 mm
+      rod    ball unlimited             cylinder, colliding            43.97     300.0  others, all
+    box/[2]  -                          box, visual                        -       8.0
+    frame    -                          -                                  -       0.0
 """
     )
 
@@ -86,3 +88,29 @@ def test_links_tells_the_mistakes_of_a_layout(shapes, here):
     assert error.splitlines()[0] == 'layout.yaml:1:17: groups.first: no link matches "bux"; did you mean "box"?'
     code, _, error = here(shapes, "links", "shapes.xml", "--layout", "none.yaml")
     assert (code, error) == (2, "none.yaml: cannot read this file: No such file or directory\n1 mistake\n")
+
+
+def test_links_shows_the_groups_of_the_layout_beside_a_file(shapes, here):
+    rest = "resolutions: {low: {box: {method: poisson, count: 3, radius: 1 mm}}}\n"
+    (shapes / "layout.yaml").write_text("groups: {first: box}\n" + rest)
+    code, said, error = here(shapes.parent, "links", f"{shapes.name}/shapes.xml")
+    assert (code, error) == (0, "")
+    assert next(line for line in said.splitlines() if line.startswith("  box ")).endswith("  first")
+    (shapes / "layout.yaml").write_text("groups: {first: bux}\n" + rest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        code, said, error = here(shapes, "links", "shapes.xml")
+    assert code == 0 and "ball unlimited" in said and "first" not in said
+    what = "this layout lies beside the robot but does not fit it, so no groups are shown"
+    assert error.startswith('tgdsl: warning: layout.yaml:1:17: groups.first: no link matches "bux"') and error.endswith(
+        f"; {what}\n"
+    )
+
+
+def test_bodies_without_a_name_are_called_by_their_way(tmp_path):
+    inner = "<body><geom size='.01'/><body name='{}'/><body><geom size='.01'/></body></body>"
+    bodies = f"<body name='a'/>{inner.format('b')}<body name='c'>{inner.format('d')}</body>"
+    (tmp_path / "r.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    robot = load_model(tmp_path / "r.xml")
+    found = [robot.body_path(i) for i in range(robot.compiled.nbody)]
+    assert found == ["world", "a", "world/[2]", "b", "world/[2]/[2]", "c", "c/[1]", "d", "c/[1]/[2]"]

@@ -43,7 +43,7 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
     Raises:
         TgdslError: If it names nothing, or a robot that comes without a layout.
     """
-    from tgdsl.files.find import is_file, layout_file, robot_names
+    from tgdsl.files.find import is_file, layout_of, robot_names
 
     path, names = Path(hand), robot_names()
     if path.suffix in (".yaml", ".yml"):
@@ -52,7 +52,7 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
         return path
     if hand not in names and not is_file(path):
         raise TgdslError(f'there is no document, artefact or robot "{hand}"; {did_you_mean(hand, names, "robots")}')
-    own = layout or layout_file(names.get(hand, path))
+    own = layout or layout_of(hand)
     if own is None:
         raise TgdslError(f"{hand}: there is no layout.yaml beside this robot; name its layout with --layout")
     return {"tgdsl": 1, "robot": {"model": hand, "layout": str(own)}}

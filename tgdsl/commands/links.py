@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 from tgdsl.commands.arguments import OptionalFile, Robot
+from tgdsl.errors import SpecError
 
 
 @dataclass(frozen=True)
@@ -13,10 +15,20 @@ class Links:
 
     robot: Robot
     layout: OptionalFile = None
-    """A layout whose groups are shown; default: that of a robot given by name."""
+    """A layout whose groups are shown; default: the robot's own, which lies beside it."""
 
     def run(self) -> None:
         """Print the table."""
-        from tgdsl.placement.links import layout_of, links_table, open_robot
+        from tgdsl.files.find import layout_of
+        from tgdsl.placement.links import links_table, open_robot
 
-        print("\n".join(links_table(open_robot(self.robot), self.layout or layout_of(self.robot))))
+        robot, beside = open_robot(self.robot), layout_of(self.robot)
+        try:
+            lines = links_table(robot, self.layout or beside)
+        except SpecError as error:
+            if self.layout is not None:
+                raise
+            what = "this layout lies beside the robot but does not fit it, so no groups are shown"
+            warnings.warn(f"{error.problems[0]}; {what}", stacklevel=2)
+            lines = links_table(robot)
+        print("\n".join(lines))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -145,15 +145,13 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
         placed = [patch for patch in patches if patch.link.name in needed]
         layout = _sampled(loaded, loaded.layout, colliders, placed, felt, progress)
     loaded.raise_problems()
-    unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
+    unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
     listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
     carrying = {patch.link.body for patch in patches}.union(*(links[name] for name in on_links))
     parts_of = link_bodies(scene, carrying, listed_bodies)
-    rigid = [*(felt.bodies for felt in objects.values()), *parts_of.values()]
-    welded = {scene.compiled.body(i).name for bodies in rigid for i in bodies}
-    others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
-    unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
+    rigid = {i for bodies in (*(sensed.bodies for sensed in objects.values()), *parts_of.values()) for i in bodies}
+    unused += [(f"body {body}", why) for body, why in _unlisted(robot, scene, listed_bodies, rigid)]
     by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
     own_links = (on_links, parts_of)
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
@@ -180,6 +178,24 @@ def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
     """Return the bodies of the robot's file that are a document's objects, or parts of them: they are no links."""
     named = {target.body_of(name) for name, target in loaded.spec.objects.items()} & set(robot.bodies)
     return tuple(sorted({i for body in named for i in robot.rigid_bodies(body, named - {body})}))
+
+
+def _unlisted(robot: Model, scene: Model, listed: Collection[str], rigid: Collection[int]) -> Iterator[tuple[str, str]]:
+    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them.
+
+    Args:
+        robot: The robot.
+        scene: The scene.
+        listed: Names of the objects' bodies.
+        rigid: Indices of bodies that are parts of objects or links.
+    """
+    model, known = scene.compiled, {*robot.bodies[1:], *listed}
+    own = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
+    for i in range(model.nbody):
+        name = scene.body_path(i)
+        is_known = name in known or i in rigid or (not model.body(i).name and name in own)
+        if model.body_geomnum[i] and not is_known:
+            yield name, "not listed under `objects`" if model.body(i).name else "no name, so `objects` cannot list it"
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:

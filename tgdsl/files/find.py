@@ -45,3 +45,9 @@ def layout_file(model: Path) -> Path | None:
     side = model.stem.removeprefix(f"{model.parent.name}_")
     names = (f"layout_{side}.yaml", "layout.yaml")
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
+
+
+def layout_of(robot: str) -> Path | None:
+    """Return the layout that lies beside a robot, which is given by name or by its file."""
+    model = robot_file(robot, Path())
+    return None if model is None else layout_file(model)

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import Problem, RobotError, SpecError, TgdslError, did_you_mean
-from tgdsl.files.find import layout_file, robot_file, robot_names
+from tgdsl.files.find import robot_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.schema.load import load_layout
@@ -48,12 +48,6 @@ def open_robot(robot: str) -> Model:
     return load_model(robot_path(robot))
 
 
-def layout_of(robot: str) -> Path | None:
-    """Return the layout of a robot given by name; a file has none."""
-    known = robot_names().get(robot)
-    return None if known is None else layout_file(known)
-
-
 def links_table(robot: Model, layout: Path | None = None) -> list[str]:
     """Return the lines of the table: one body after another in depth-first order, children indented.
 
@@ -72,14 +66,14 @@ def links_table(robot: Model, layout: Path | None = None) -> list[str]:
     depth = {0: 0}
     for body in range(model.nbody):
         depth[body] = depth[int(model.body_parentid[body])] + 1 if body else 0
-        name = model.body(body).name or f"(unnamed body {body})"
+        name = robot.body_path(body)
         cells = (
             ("  " * depth[body] + name,),
             _joints(model, body) or ("-" if body else "",),
             _geoms(robot, body) or ("-",),
             (_area(robot, body),),
             (f"{1e3 * model.body_mass[body]:.1f}" if body else "",),
-            (", ".join(groups.get(name, ())),),
+            (", ".join(groups.get(model.body(body).name, ())),),
         )
         blocks.append(list(cells))
     return _aligned(blocks)

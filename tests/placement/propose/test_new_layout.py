@@ -17,7 +17,7 @@ def test_the_file_says_what_was_left_out_and_what_is_a_guess(tmp_path, here):
     text = (tmp_path / "layout.yaml").read_text()
     for line in (
         "# Left out: floor: unnamed plane geom 4 of body floor has no bounded surface to put taxels on\n",
-        '# Left out: "1 more": bodies with geoms but no name\n',
+        '# Left out: "world/[6]": no name, so no document can mean it\n',
         "# Left out: table, target: stands or floats by itself: taken for scenery or an object; --include adds it\n",
         "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n",
         '  tips: ["jaw a", "jaw b"]\n',

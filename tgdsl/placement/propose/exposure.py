@@ -67,5 +67,5 @@ def exposed_pool(robot: Model, colliders: Colliders, body: str, pool: Pool, radi
         pool, covered = on_hulls, is_covered(on_hulls.pos)
     if covered.any():
         options["exposed"] = True
-        pool = Pool(pool.pos[~covered], pool.normal[~covered], pool.point_area)
+        pool = Pool(pool.pos[~covered], pool.normal[~covered], pool.point_area[~covered])
     return (pool if pool.area > MIN_AREA else None), options

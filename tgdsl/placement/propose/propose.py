@@ -218,9 +218,8 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
         else:
             left_out.append((body, surface))
     model = robot.compiled
-    unnamed = sum(not model.body(i).name and model.body_geomnum[i] > 0 for i in range(model.nbody))
-    if unnamed:
-        left_out.append((f"{unnamed} more", "bodies with geoms but no name"))
+    unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
+    left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
     return surfaces, left_out
 
 
