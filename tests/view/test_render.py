@@ -12,7 +12,6 @@ import tgdsl
 from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.layout.unfelt import BURIED, COVERED, Unfelt
 from tgdsl.view.cameras import VIEWS, camera_of, pose_of
 from tgdsl.view.discs import discs, group_of, legend, radii
 from tgdsl.view.render import FEWEST, HEIGHT, drawing, render
@@ -372,42 +371,3 @@ def test_mistakes_of_the_command(command, folder: Path, tmp_path: Path) -> None:
     }
     for arguments, message in cases.items():
         assert command(*arguments) == (2, "", message)
-
-
-# Taxels that cannot feel ---------------------------------------------------------------------------------------------
-
-
-def test_taxels_that_cannot_feel_are_crossed_out(hand: Drawn) -> None:
-    """Two bars per taxel, which cross at its disc's middle: in full colour in view, faint where hidden; the legend counts them."""
-    model, layouts = hand
-    layout = layouts["many"]
-    palm, finger = layout.taxels_of(("palm",)), layout.taxels_of(("finger",))
-    records = (Unfelt("palm", BURIED, "", palm[:5], len(palm)), Unfelt("finger", COVERED, "", finger[:2], len(finger)))
-    plain, crossed = (drawing(model, layouts, size=SMALL, unfelt=own) for own in (None, {"many": records}))
-    few, many = crossed.axes
-    assert [part.get_gid() for part in few.collections] == [part.get_gid() for part in plain.axes[0].collections]
-    bars = next(part for part in many.collections if part.get_gid() == "unfelt")
-    segments = np.array([path.vertices for path in bars.get_paths()]).reshape(-1, 2, 2, 2)  # taxel, bar, end, pixel
-    assert len(segments) == 7
-    middles = np.concatenate([marks(many, name).reshape(-1, 2) for name in ("shown", "hidden")])
-    first, second = segments[:, 0].mean(axis=1), segments[:, 1].mean(axis=1)
-    np.testing.assert_allclose(first, second, atol=1e-6)
-    apart = np.linalg.norm(first[:, None] - middles[None], axis=2)
-    assert (apart.min(axis=1) < 0.05).all() and len(set(apart.argmin(axis=1))) == 7
-    is_shown = apart.argmin(axis=1) < len(marks(many, "shown"))
-    np.testing.assert_allclose(np.asarray(bars.get_colors())[:, 3], np.repeat(np.where(is_shown, 1.0, 0.3), 2))
-    legends = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in crossed.axes]
-    assert legends[1][-1] == "cannot feel 7" and legends[1][:-1] == [
-        t.get_text() for t in plain.axes[1].get_legend().get_texts()
-    ]
-    assert not any("feel" in text for text in legends[0])
-
-
-def test_the_file_has_red_pixels_only_where_something_is_crossed_out(hand: Drawn, tmp_path: Path) -> None:
-    model, layouts = hand
-    taxels = np.arange(4)
-    for name, unfelt in (("plain", {}), ("crossed", {"many": (Unfelt("palm", BURIED, "", taxels, 36),)})):
-        image = matplotlib.image.imread(render(model, layouts, tmp_path / f"{name}.png", size=(1200, 600), unfelt=unfelt))
-        is_red = (image[..., 0] > 0.7) & (image[..., 1] < 0.2) & (image[..., 2] < 0.2)
-        left, right = is_red[:, :600].sum(), is_red[:, 600:].sum()
-        assert left == 0 and (right > 20) == (name == "crossed")

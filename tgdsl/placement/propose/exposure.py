@@ -7,7 +7,6 @@ collides than a taxel's radius; what is inside other colliding geoms in the init
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 
@@ -23,8 +22,8 @@ from tgdsl.surfaces.surface import Surface
 MIN_AREA = 1e-8
 """A surface smaller than this is degenerate [m²]."""
 _ANYWHERE = Region(is_geom=None, facings=(), boxes=(), spheres=())
-Options = Mapping[Literal["surface", "exposed"], str | bool]
-"""Options of a placement, as the grammar has them."""
+Options = Mapping[str, str | bool]
+"""Options of a placement, `surface` and `exposed`, as the grammar has them."""
 
 
 def surface_pool(surface: Surface) -> Pool | None:
