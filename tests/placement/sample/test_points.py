@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from surfaces import HERE, ball, error_of, placement, surface_of
 
+from tgdsl.errors import SampleError
 from tgdsl.placement.sample.sample import sample
 
 
@@ -67,3 +68,34 @@ def test_bad_files_of_points(tmp_path, text, message):
 def test_a_missing_file_of_points(tmp_path):
     error = error_of(surface_of(ball(1)), placement("points", points="no.csv"), tmp_path)
     assert (error.what, error.hint) == ("cannot read the points of no.csv: No such file or directory", "")
+
+
+def test_a_file_of_several_links_with_tangents_and_cells(tmp_path):
+    lines = [f"link,{HEADER},tx,ty,tz,row,column", "a,1,2,3,0,0,2,1,0,1,0,2", "b,0,0,0,0,0,1,,,,,", "a,4,5,6,0,0,1,,,,,"]
+    (tmp_path / "p.csv").write_text("\n".join(lines))
+    where = placement("points", points="p.csv")
+    found = sample(surface_of(ball(1)), where, tmp_path, "a")
+    np.testing.assert_array_equal(found.pos, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.tangent, [[1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(found.cell, [[0, 2], [-1, -1]])
+    with pytest.raises(SampleError, match=r'^p\.csv has no points of the link "c"; known links: a, b$'):
+        sample(surface_of(ball(1)), where, tmp_path, "c")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (f"{HEADER},tx,ty,tz\n0,0,0,0,0,1,0,0,3\n", "p.csv:2: the tangent is along the normal; expected a direction across it"),
+        (f"{HEADER},tx,ty,tz\n0,0,0,0,0,1,1,,\n", "p.csv:2: tx without the others of tx, ty, tz; give all or none"),
+        (f"{HEADER},row\n0,0,0,0,0,1,1\n", "p.csv:2: row without the others of row, column; give all or none"),
+        (f"{HEADER},row,column\n0,0,0,0,0,1,1,.5\n", 'p.csv:2: column is ".5", expected a whole number from 0 to 999999'),
+        (
+            f"{HEADER},row,column\n0,0,0,0,0,1,1,2\n0,0,0,0,0,1,1,2\n",
+            "p.csv:3: row 1, column 2 is that of p.csv:2 too; one point for each cell",
+        ),
+        (f"{HEADER},x\n0,0,0,0,0,1,1\n", 'p.csv:1: column "x" is there twice'),
+    ],
+)
+def test_bad_tangents_and_cells(tmp_path, text, message):
+    (tmp_path / "p.csv").write_text(text)
+    assert str(error_of(surface_of(ball(1)), placement("points", points="p.csv"), tmp_path)) == message
