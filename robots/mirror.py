@@ -27,8 +27,24 @@ from tgdsl.schema import yaml
 from tgdsl.schema.placement import Grid, LayoutSpec, Points, Poisson
 from tgdsl.surfaces.rays import reference_axes
 
-_VECTORS = ["direction", "columns_along", "pos", "normal", "center", "facing"]
-_NOT_GEOMETRY = ["method", "rows", "columns", "count", "spacing", "seed", "radius", "area", "within"]
+_VECTORS = ["direction", "columns_along", "pos", "normal", "tangent", "center", "facing"]
+_NOT_GEOMETRY = [
+    *(
+        "method",
+        "rows",
+        "columns",
+        "count",
+        "spacing",
+        "seed",
+        "radius",
+        "area",
+        "within",
+        "surface",
+        "exposed",
+        "row",
+        "column",
+    ),
+]
 
 
 @dataclass
@@ -114,7 +130,8 @@ class LayoutMirror:
                 if isinstance(placement, Poisson):
                     found.append(f"{resolution}, {link}: poisson samples of the same surface, not the mirror images")
                 elif isinstance(placement, Points):
-                    normals = point_table(placement, self.file.parent)[:, 3:6]
+                    table = point_table(placement, self.file.parent, link)
+                    normals = table.normal[np.isnan(table.tangent).any(axis=1)]  # those that follow the link's axes
                     num = sum(_default_columns(normal) == self.mirror.axis for normal in normals)
                     what = f"{resolution}, {link}: tangents follow the link's axes, {num} of {len(normals)} are the opposite"
                     found += [f"{what} of the mirror images"] if num else []

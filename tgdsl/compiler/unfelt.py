@@ -44,7 +44,8 @@ def unfelt_taxels(resolved: Resolved, sensors: Sequence[LoweredSensor], pruned: 
         touched = set().union(*(resolved.objects[name].touched for name in objects))
         deep = sensor.taxels[is_deep[sensor.taxels]]
         for body in dict.fromkeys(names[deep]):
-            is_kept_out[deep[names[deep] == body]] |= resolved.scene.can_collide_with(body, touched)
+            own = [geom.id for geom in resolved.scene.rigid_geoms(resolved.link_bodies[body]) if geom.is_colliding]
+            is_kept_out[deep[names[deep] == body]] |= resolved.scene.geoms_can_collide(own, touched)
     within = replace(
         within,
         is_collided=~is_deaf | (layout.radius == 0),

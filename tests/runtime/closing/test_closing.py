@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from unscripted_hands import GRIPPER, URDF
 from odd_hands import CAPSULES, FOUR_BAR, TENDON
+from unscripted_hands import GRIPPER, URDF
 
 import tgdsl
 from tgdsl.formats.robot import load_model

@@ -49,9 +49,7 @@ class Samples:
     cell: Int[np.ndarray, "taxel 2"]
 
 
-def sample(
-    surface: Surface, placement: Placement, folder: Path, link: str = "", is_covered: Covered | None = None
-) -> Samples:
+def sample(surface: Surface, placement: Placement, folder: Path, link: str = "", is_covered: Covered | None = None) -> Samples:
     """Return the taxels that a placement puts on a link's surface; the same input gives the same bytes.
 
     Args:
