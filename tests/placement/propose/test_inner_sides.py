@@ -84,7 +84,7 @@ def test_the_command_says_what_is_weak_and_takes_include(tmp_path, here):
     assert code == 0
     assert "left out: arm2, arm3, arm4: before the link from which the fingers part; --include adds it\n" in said
     assert "all around: arm1, arm5: asked for with --include\n" in said
-    assert "# Left out: arm2, arm3, arm4: before" in text and "asked for with --include: all around\n    arm5: {" in text
+    assert "# Left out: arm2, arm3, arm4: before" in text and text.count("asked for with --include: all around\n") == 2
 
 
 @pytest.mark.parametrize("robot", ["xhand1", "xhand1_left", "sharpa", "sharpa_left"])
