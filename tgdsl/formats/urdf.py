@@ -1,9 +1,15 @@
-"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning."""
+"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning.
+
+Other people's files also have tags of other programs with undeclared prefixes, geoms that share a name, and links that move
+but weigh nothing.
+"""
 
 from __future__ import annotations
 
+import re
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
@@ -12,6 +18,11 @@ import numpy as np
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mjcf import rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
+
+LEAST_MASS = 1e-6
+"""Mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]."""
+_PREFIX = re.compile(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]")
+_ROOT = re.compile(r"<robot\b")
 
 
 def read_urdf(path: Path) -> Model:
@@ -34,16 +45,14 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
 
     Mesh files are found (`package://` is looked up in the folders above the file), links on fixed joints keep their own
-    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size.
+    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size. Geoms that have a name
+    which is taken get a number, as MuJoCo has each name once.
 
     Raises:
         RobotError: If the file is not XML, or a mesh cannot be found.
     """
-    try:
-        tree = ET.parse(path)
-    except ET.ParseError as error:
-        raise RobotError(f"{path}: not XML: {error}") from error
-    robot = tree.getroot()
+    robot = _root(path)
+    _number_names(robot)
     files: dict[str, Path] = {}
     for mesh in robot.iter("mesh"):
         file = _mesh_file(mesh.get("filename", ""), path)
@@ -52,7 +61,8 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
             number += 1
             stem = f"{file.stem}_{number}"
         mesh.set("filename", f"{stem}{file.suffix}")
-    mended = [link.get("name", "") for link in robot.iter("link") if _mend(link)]
+    moving = {child.get("link", "") for joint in robot.iter("joint") if joint.get("type") != "fixed" for child in joint.iter("child")}
+    mended = [link.get("name", "") for link in robot.iter("link") if _mend(link, moving)]
     if mended:
         warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=5)
     settings = robot.find("mujoco")
@@ -61,6 +71,48 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     compiler = ET.SubElement(settings, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "meshdir": ""}
     return ET.tostring(robot, encoding="unicode"), files
+
+
+def _root(path: Path) -> ET.Element:
+    """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out.
+
+    Raises:
+        RobotError: If the file is not XML.
+    """
+    content = path.read_bytes()
+    try:
+        root = ET.fromstring(content)
+    except ET.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise RobotError(f"{path}: not XML: {error}") from error
+        text = content.decode(errors="replace")
+        prefixes = sorted(set(_PREFIX.findall(text)) - {"xml", "xmlns"})
+        declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in prefixes)
+        try:
+            root = ET.fromstring(_ROOT.sub(f"<robot{declared}", text, count=1))
+        except ET.ParseError:
+            raise RobotError(f"{path}: not XML: {error}") from error
+    for parent in list(root.iter()):
+        for child in [child for child in parent if isinstance(child.tag, str) and child.tag.startswith("{")]:
+            parent.remove(child)
+    return root
+
+
+def _number_names(robot: ET.Element) -> None:
+    """Give geoms whose name another has too a number: the second of `pad` is `pad_2`; those without a name keep none.
+
+    MuJoCo would take the name of the one before for a geom that has none.
+    """
+    geoms = [part for link in robot.iter("link") for part in (*link.findall("collision"), *link.findall("visual"))]
+    names = [part.get("name", "") for part in geoms]
+    taken: set[str] = set()
+    for part, name in zip(geoms, names, strict=True):
+        own, number = name, 1
+        while own and own in taken or (number > 1 and own in names):
+            number += 1
+            own = f"{name}_{number}"
+        taken.add(own)
+        part.set("name", own)
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
@@ -79,11 +131,22 @@ def _mesh_file(name: str, urdf: Path) -> Path:
     return found
 
 
-def _mend(link: ET.Element) -> bool:
-    """Replace the link's inertia if its principal moments are not positive or break the triangle inequality."""
-    inertia = link.find("inertial/inertia")
+def _mend(link: ET.Element, moving: Collection[str]) -> bool:
+    """Replace the link's inertia if it has a mass alone, or if its principal moments are not positive or break the triangle
+    inequality; give a moving link without mass and geometry the least mass that MuJoCo can move.
+
+    Args:
+        link: The link, changed in place.
+        moving: Names of links that a joint moves.
+    """
+    inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
+    if inertial is None:
+        if link.get("name") not in moving or link.find("collision") is not None or link.find("visual") is not None:
+            return False
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "mass", {"value": repr(LEAST_MASS)})
     if inertia is None:
-        return False
+        inertia = ET.SubElement(inertial, "inertia")
     try:
         xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", "0")) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
     except ValueError:
