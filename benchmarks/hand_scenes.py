@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.formats.mjcf import mjcf_of
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout
 
@@ -91,7 +92,7 @@ def _with_files(spec: mujoco.MjSpec, out: Path) -> None:
         if mesh.file:
             mesh.file = str(out.with_name(mesh.file) if mesh.file in spec.assets else (folder / mesh.file).resolve())
     spec.meshdir = ""
-    out.write_text(spec.to_xml())
+    out.write_text(mjcf_of(spec))
 
 
 def fingertips(model: mujoco.MjModel, layout: Layout) -> dict[int, Float[np.ndarray, " 3"]]:
@@ -185,8 +186,7 @@ def _span(model: mujoco.MjModel, tips: Tips, qpos: np.ndarray) -> float:
 def _ball(model: mujoco.MjModel, tips: Tips, poses: list[np.ndarray], opened: int) -> tuple[np.ndarray, float]:
     """Return where the fingertips meet, and the largest ball there that the hand does not touch while it opens.
 
-    The place is the tips' mean half way between the open and the closed hand; a ball that leaves no room is moved on as the hand
-    closes.
+    The place is the tips' mean half way between the open and the closed hand, or later where there is no room for a ball.
     """
     path = poses[opened - 1 :]
     for share in (0.5, 0.65, 0.8, 1.0):

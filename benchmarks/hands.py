@@ -322,7 +322,9 @@ def printed_row(row: Row, hand: Hand) -> list[str]:
         for _ in range(bool(row.felt))
     )
     lines = [f"{row.name:<14}{row.joints:>4} joints {row.links:>3} links ({row.facing} facing) {counts}  {groups}"]
-    lines.append(f"    {hand.package} {row.version}; {100 * row.outside:.0f} % outside `hand`{felt}; USD: {row.usd or 'the same'}")
+    lines.append(
+        f"    {hand.package} {row.version}; {100 * row.outside:.0f} % outside `hand`{felt}; USD: {row.usd or 'the same'}"
+    )
     lines.append("    " + ", ".join(f"{stage} {seconds:g} s" for stage, seconds in row.seconds.items()))
     lines += [f"    explain: {line}" for line in row.explained]
     shown = [text[:400] for text in row.warnings]

@@ -16,9 +16,12 @@ import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError, listed
-from tgdsl.formats.mjcf import rewrite_meshes
+from tgdsl.formats.mjcf import mjcf_of, rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
 
+EDGE = 1e-8
+"""A plate's largest moment is the sum of the others. By as much of it [1] a file's rounding may miss that, either way; twice
+as much is then added, so that MuJoCo, which looks at every bit, takes it."""
 LEAST_MASS = 1e-6
 """Mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]."""
 _PREFIX = re.compile(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]")
@@ -38,7 +41,7 @@ def read_urdf(path: Path) -> Model:
         mesh.file = str(files[Path(mesh.file).stem])
     rewritten = rewrite_meshes(spec)
     compiled = spec.compile()
-    return Model(path, spec, compiled, is_urdf=True, mjcf=spec.to_xml(), rewritten=rewritten)
+    return Model(path, spec, compiled, is_urdf=True, mjcf=mjcf_of(spec), rewritten=rewritten)
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
@@ -61,7 +64,8 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
             number += 1
             stem = f"{file.stem}_{number}"
         mesh.set("filename", f"{stem}{file.suffix}")
-    moving = {child.get("link", "") for joint in robot.iter("joint") if joint.get("type") != "fixed" for child in joint.iter("child")}
+    joints = [joint for joint in robot.iter("joint") if joint.get("type") != "fixed"]
+    moving = {child.get("link", "") for joint in joints for child in joint.iter("child")}
     mended = [link.get("name", "") for link in robot.iter("link") if _mend(link, moving)]
     if mended:
         warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=5)
@@ -99,19 +103,20 @@ def _root(path: Path) -> ET.Element:
 
 
 def _number_names(robot: ET.Element) -> None:
-    """Give geoms whose name another has too a number: the second of `pad` is `pad_2`; those without a name keep none.
+    """Give geoms whose name another has too a number: the second `pad` is `pad_2`.
 
-    MuJoCo would take the name of the one before for a geom that has none.
+    Those without a name get an empty one: MuJoCo would take that of the geom before.
     """
     geoms = [part for link in robot.iter("link") for part in (*link.findall("collision"), *link.findall("visual"))]
-    names = [part.get("name", "") for part in geoms]
-    taken: set[str] = set()
-    for part, name in zip(geoms, names, strict=True):
-        own, number = name, 1
-        while own and own in taken or (number > 1 and own in names):
+    names = {part.get("name", "") for part in geoms}
+    seen: set[str] = set()
+    for part in geoms:
+        name = own = part.get("name", "")
+        number = 1
+        while own in seen or (number > 1 and own in names):
             number += 1
             own = f"{name}_{number}"
-        taken.add(own)
+        seen |= {own} - {""}
         part.set("name", own)
 
 
@@ -132,8 +137,9 @@ def _mesh_file(name: str, urdf: Path) -> Path:
 
 
 def _mend(link: ET.Element, moving: Collection[str]) -> bool:
-    """Replace the link's inertia if it has a mass alone, or if its principal moments are not positive or break the triangle
-    inequality; give a moving link without mass and geometry the least mass that MuJoCo can move.
+    """Replace the link's inertia if its principal moments are missing, not positive or break the triangle inequality.
+
+    A moving link that has neither mass nor geometry gets `LEAST_MASS`, as MuJoCo moves nothing that weighs nothing.
 
     Args:
         link: The link, changed in place.
@@ -152,7 +158,11 @@ def _mend(link: ET.Element, moving: Collection[str]) -> bool:
     except ValueError:
         return False  # MuJoCo will name the line
     low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if low > 0 and low + middle >= high * (1 - 1e-9):
+    if low > 0 and low + middle >= high * (1 + EDGE):
+        return False
+    if low > 0 and low + middle >= high * (1 - EDGE):
+        for axes, moment in zip(("xx", "yy", "zz"), (xx, yy, zz), strict=True):
+            inertia.set(f"i{axes}", repr(moment + 2 * EDGE * high))
         return False
     moment = max((xx + yy + zz) / 3.0, LEAST_INERTIA)
     for axes in ("xx", "yy", "zz"):
