@@ -162,7 +162,7 @@ def _mend(link: ET.Element, moving: Collection[str]) -> bool:
         return False
     if low > 0 and low + middle >= high * (1 - EDGE):
         for axes, moment in zip(("xx", "yy", "zz"), (xx, yy, zz), strict=True):
-            inertia.set(f"i{axes}", repr(moment + 2 * EDGE * high))
+            inertia.set(f"i{axes}", repr(float(moment + 2 * EDGE * high)))
         return False
     moment = max((xx + yy + zz) / 3.0, LEAST_INERTIA)
     for axes in ("xx", "yy", "zz"):
