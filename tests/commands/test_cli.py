@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from closing_hands import URDF
 
 import tgdsl
 from tgdsl.schema.document import json_schema
@@ -240,11 +241,34 @@ def test_bad_runs(base, tmp_path, fails):
     assert not (tmp_path / "out" / "readings.npz").exists()
 
 
+def test_run_closes_a_hand_without_keyframes(here, tmp_path):
+    """From a robot file to touch by three commands; the artefact needs the file no more."""
+    (tmp_path / "my hand.urdf").write_text(URDF)
+    (tmp_path / "hand.yaml").write_text(
+        "tgdsl: 1\nrobot: {model: my hand.urdf, layout: layout.yaml}\nresolution: low\n"
+        "objects: {ball: {geom: {type: sphere, size: [12 mm]}}}\n"
+        "sensors: {touch: {kind: link_contact, links: hand, feels: [ball]}}\n"
+    )
+    assert here(tmp_path, "layout", "new", "my hand.urdf")[0] == 0
+    assert here(tmp_path, "compile", "hand.yaml")[0] == 0
+    (tmp_path / "my hand.urdf").unlink()
+    code, out, said = here(tmp_path, "run", "hand.safetensors", "--seconds", "0.8", "--num-envs", "2", "--out", "closed")
+    assert code == 0, said
+    assert out.startswith(
+        "no keyframes rest and squeeze: the hand closes on `ball`, put between the fingers, weightless; 3 of 3 joints\n"
+    )
+    with np.load(tmp_path / "closed" / "readings.npz") as kept:
+        forces = np.linalg.norm(kept["touch"][..., 1:], axis=-1)
+        assert kept["ctrl"].shape == (len(forces), 3) and np.isfinite(forces).all()
+        assert not forces[0].any() and ((forces[-1] > 0).sum(axis=-1) >= 2).all()
+
+
 def test_run_holds_a_scene_without_keyframes(here, tmp_path):
     start, end = SCENE.index("<keyframe>"), SCENE.index("</mujoco>")
     (tmp_path / "scene.xml").write_text(SCENE[:start] + SCENE[end:])
     (tmp_path / "pad.yaml").write_text(DOCUMENT)
     code, out, _ = here(tmp_path, "run", "pad.yaml", "--seconds", "0.1", "--out", "held")
-    assert code == 0 and "its initial state is held for 0.1 s" in out
+    why = "no keyframes rest and squeeze, and the hand does not close (it has no hinge and no slide)"
+    assert code == 0 and f"{why}: its initial state is held for 0.1 s\n" in out
     with np.load(tmp_path / "held" / "readings.npz") as kept:
         assert kept["touch"].shape[0] == 10

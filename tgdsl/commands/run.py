@@ -28,7 +28,7 @@ class Run:
     document: DocumentOrArtefact
     keyframes: tuple[str, ...] | None = None
     """Keyframes of the scene whose controls are held and moved between, in turn; the first is the start. Default: rest and
-    squeeze if the scene has them, else its initial state is held."""
+    squeeze if the scene has them; else the hand closes on the first object that fits between its fingers."""
     seconds: float = 1.0
     """Duration of each hold and of each move between keyframes [s]."""
     controls: OptionalFile = None
@@ -60,28 +60,46 @@ class Run:
             if self.compiled:
                 touch.compile()
             progress(f"starting {self.num_envs} environments" if self.num_envs > 1 else "starting the simulation")
-            sim, controls = self._start(touch)
+            sim, controls = self._start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 
-    def _start(self, touch: TactileModule) -> tuple[Simulator, Controls]:
+    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[Simulator, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
-        from tgdsl.runtime.rollout import default_keyframes, held_controls, recorded_controls, scripted_controls
+        from tgdsl.runtime.rollout import default_keyframes, recorded_controls, scripted_controls
         from tgdsl.runtime.simulate import simulate
+        from tgdsl.scene.scene import scene_model
 
+        if self.controls is None and self.keyframes is None and not default_keyframes(scene_model(touch.plan.scene)):
+            progress("finding out how the hand closes")
+            return self._closing(touch)
         sim = simulate(touch, self.num_envs, substeps=self.substeps)
-        keyframes = default_keyframes(sim.model) if self.keyframes is None else self.keyframes
         if self.controls is not None:
             return sim, recorded_controls(self.controls)
-        if self.keyframes is None and not keyframes:
-            print(f"the scene has no keyframes rest and squeeze: its initial state is held for {self.seconds:g} s")
-            return sim, held_controls(sim.model, self.seconds, sim.control_step)
+        keyframes = default_keyframes(sim.model) if self.keyframes is None else self.keyframes
         controls = scripted_controls(sim.model, keyframes, self.seconds, sim.control_step)
         sim.close()
         return simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0]), controls
+
+    def _closing(self, touch: TactileModule) -> tuple[Simulator, Controls]:
+        """Return a scene without keyframes whose hand closes on an object, or, if it cannot, its initial state, held."""
+        from tgdsl.runtime.batch.simulation import BatchSimulation
+        from tgdsl.runtime.closing.closing import START, closing_of
+        from tgdsl.runtime.rollout import controls_between, held_controls
+        from tgdsl.runtime.simulate import simulate
+
+        closing = closing_of(touch)
+        if isinstance(closing, str):
+            why = f"no keyframes rest and squeeze, and the hand does not close ({closing})"
+            print(f"{why}: its initial state is held for {self.seconds:g} s")
+            sim = simulate(touch, self.num_envs, substeps=self.substeps)
+            return sim, held_controls(sim.model, self.seconds, sim.control_step)
+        print(f"no keyframes rest and squeeze: {closing}")
+        sim = BatchSimulation(touch, self.num_envs, substeps=self.substeps, keyframe=START, prepare=closing.prepare)
+        return sim, controls_between(closing.targets(sim.model.nu), self.seconds, sim.control_step)
 
     def _steps(self, touch: TactileModule, sim: Simulator, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
         """Make all steps, and return the last readings."""

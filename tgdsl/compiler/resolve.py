@@ -126,13 +126,25 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     needed = needed if links else {patch.link.name for patch in patches}
     layout = _sampled(loaded, loaded.layout, robot, [patch for patch in patches if patch.link.name in needed], progress)
     loaded.raise_problems()
-    unused = [(f"link {p.link.name}", "no sensor is on it") for p in patches if p.link.name not in needed]
+    unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
-    listed_bodies = {target.body_of(name) for name, target in loaded.spec.objects.items()}
-    welded = {scene.compiled.body(i).name for felt in objects.values() for i in felt.bodies}
-    others = [body for body in scene.bodies if body not in {*robot.bodies[1:], *listed_bodies, *welded}]
-    unused += [(f"body {body}", "not listed under `objects`") for body in others if scene.touchable(body)]
+    unused += [(f"body {body}", why) for body, why in _unlisted(loaded, robot, scene, objects)]
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), {p.link.name: p for p in patches}, on_links)
+
+
+def _unlisted(
+    loaded: Loaded, robot: Model, scene: Model, objects: Mapping[str, SensedObject]
+) -> Iterator[tuple[str, str]]:
+    """Yield the bodies with geoms of the scene that are neither the robot's nor an object's, and why nothing feels them."""
+    model = scene.compiled
+    known = {*robot.bodies[1:], *(target.body_of(name) for name, target in loaded.spec.objects.items())}
+    felt = {i for sensed in objects.values() for i in sensed.bodies}
+    own = {robot.body_path(i) for i in range(1, robot.compiled.nbody)}
+    for i in range(model.nbody):
+        name = scene.body_path(i)
+        is_known = name in known or i in felt or (not model.body(i).name and name in own)
+        if model.body_geomnum[i] and not is_known:
+            yield name, "not listed under `objects`" if model.body(i).name else "no name, so `objects` cannot list it"
 
 
 def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:

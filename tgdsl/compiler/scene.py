@@ -17,7 +17,8 @@ from tgdsl.plan.inputs import ContactPart, Inputs, contact_sensor_names
 from tgdsl.plan.scene import Asset, SceneFile
 from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.scene.compare import differing_fields
-from tgdsl.scene.scene import compiled, muted_mujoco, portable
+from tgdsl.scene.mujoco_warnings import muted_mujoco
+from tgdsl.scene.scene import compiled, portable
 
 SLOT_DATA = ("found", "force", "torque", "pos", "normal", "tangent")
 """What a contact sensor hands out of each contact, in MuJoCo's order."""

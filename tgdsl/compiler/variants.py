@@ -15,7 +15,8 @@ from tgdsl.files.find import is_file
 from tgdsl.formats.model import Model
 from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
 from tgdsl.quantities.geoms.baking import aligned
-from tgdsl.scene.scene import Choice, geom_name, muted_mujoco, portable, readable, with_choices
+from tgdsl.scene.mujoco_warnings import muted_mujoco, told_of
+from tgdsl.scene.scene import Choice, geom_name, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
 Report = Callable[[tuple[str | int, ...], str, str], None]
@@ -138,7 +139,8 @@ def _scene_geom(
     trial.assets = {key: readable(key, meshes.contents[key])}
     trial.add_mesh(name=path.stem, file=key)
     try:
-        trial.compile()
+        with told_of(path):
+            trial.compile()
     except ValueError as error:
         report(f'MuJoCo cannot read mesh file "{geom.mesh}": {" ".join(str(error).split()).replace(key, path.name)}')
         return None

@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 
 from tgdsl.files.write import atomic_write_all
+from tgdsl.formats.mesh_files import refuse_unreadable
 from tgdsl.formats.model import Model
 from tgdsl.scene.scene import readable
 
@@ -19,9 +20,11 @@ def read_mjcf(path: Path) -> Model:
     """Read and compile an MJCF file.
 
     Raises:
+        RobotError: If it names meshes that MuJoCo does not read.
         ValueError: If MuJoCo cannot read or compile it.
     """
     spec = mujoco.MjSpec.from_file(str(path))
+    refuse_unreadable(path, spec)
     rewritten = rewrite_meshes(spec)
     return Model(path, spec, spec.compile(), is_urdf=False, rewritten=rewritten)
 

@@ -59,6 +59,15 @@ class Model:
         names = (self.compiled.body(i).name for i in range(self.compiled.nbody))
         return tuple(name for name in names if name)
 
+    def body_path(self, i: int) -> str:
+        """Return what to call a body: its name, or, of one without, how it is found: `forearm/[2]`, the forearm's second child."""
+        if name := self.compiled.body(i).name:
+            return name
+        parent = int(self.compiled.body_parentid[i])
+        children = np.flatnonzero(self.compiled.body_parentid == parent).tolist()
+        place = [child for child in children if child].index(i) + 1  # the world is its own parent
+        return f"{self.body_path(parent)}/[{place}]"
+
     @cached_property
     def geoms(self) -> tuple[Geom, ...]:
         """All geoms of named bodies."""

@@ -14,7 +14,7 @@ from tgdsl.formats.model import Model
 from tgdsl.formats.urdf import read_urdf
 from tgdsl.formats.usd.export.write import write_usd
 from tgdsl.formats.usd.reader import read_usd
-from tgdsl.scene.scene import muted_mujoco
+from tgdsl.scene.mujoco_warnings import told_of
 
 Reader = Callable[[Path], Model]
 """Reads and compiles a file; `load_model` names the file in what it raises that is MuJoCo's or the system's."""
@@ -39,7 +39,7 @@ def load_model(path: Path) -> Model:
         RobotError: If it cannot be read or compiled, with MuJoCo's own account of the element at fault, or the prim's path.
     """
     try:
-        with muted_mujoco():
+        with told_of(path):
             reader = READERS.get(path.suffix.lower()) or ROOTS.get(_root_element(path), read_mjcf)
             return reader(path)
     except (ValueError, OSError, mujoco.FatalError) as error:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from tgdsl.errors import RobotError, listed
+from tgdsl.formats.mesh_files import BY_MUJOCO, BY_TRIMESH, Y_UP, put_in_line
 from tgdsl.formats.mjcf import mjcf_of, rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
 
@@ -37,11 +38,26 @@ def read_urdf(path: Path) -> Model:
     """
     text, files = as_mujoco_text(path)
     spec = mujoco.MjSpec.from_string(text)
-    for mesh in spec.meshes:
-        mesh.file = str(files[Path(mesh.file).stem])
+    _fill_meshes(path, spec, files)
     rewritten = rewrite_meshes(spec)
     compiled = spec.compile()
     return Model(path, spec, compiled, is_urdf=True, mjcf=mjcf_of(spec), rewritten=rewritten)
+
+
+def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> None:
+    """Have each mesh name its file, or hold its triangles where MuJoCo does not read such files, of which a warning tells."""
+    read_here = dict[Path, None]()
+    for mesh in spec.meshes:
+        file = files[Path(mesh.file).stem]
+        if file.suffix.lower() in BY_TRIMESH:
+            put_in_line(mesh, file)
+            read_here[file] = None
+        else:
+            mesh.file = str(file)
+    if read_here:
+        axes = " and with Y not turned up to Z" if any(file.suffix.lower() in Y_UP for file in read_here) else ""
+        names = listed([file.name for file in read_here])
+        warnings.warn(f"{path}: meshes read by trimesh, without textures{axes}: {names}", stacklevel=5)
 
 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
@@ -59,6 +75,8 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     files: dict[str, Path] = {}
     for mesh in robot.iter("mesh"):
         file = _mesh_file(mesh.get("filename", ""), path)
+        if file.suffix.lower() not in (*BY_MUJOCO, *BY_TRIMESH):
+            raise RobotError(f'{path}: mesh "{file.name}": expected one of {listed((*BY_MUJOCO, *BY_TRIMESH))}')
         stem, number = file.stem, 1
         while files.setdefault(stem, file) != file:  # MuJoCo tells a URDF's meshes apart by this alone
             number += 1

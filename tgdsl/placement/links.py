@@ -72,14 +72,14 @@ def links_table(robot: Model, layout: Path | None = None) -> list[str]:
     depth = {0: 0}
     for body in range(model.nbody):
         depth[body] = depth[int(model.body_parentid[body])] + 1 if body else 0
-        name = model.body(body).name or f"(unnamed body {body})"
+        name = robot.body_path(body)
         cells = (
             ("  " * depth[body] + name,),
             _joints(model, body) or ("-" if body else "",),
             _geoms(robot, body) or ("-",),
             (_area(robot, body),),
             (f"{1e3 * model.body_mass[body]:.1f}" if body else "",),
-            (", ".join(groups.get(name, ())),),
+            (", ".join(groups.get(model.body(body).name, ())),),
         )
         blocks.append(list(cells))
     return _aligned(blocks)

@@ -6,7 +6,7 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -57,8 +57,21 @@ def scripted_controls(model: mujoco.MjModel, keyframes: tuple[str, ...], seconds
     for name in keyframes:
         if name not in known:
             raise SimulationError(f'the scene has no keyframe "{name}"; {did_you_mean(name, known, "keyframes")}')
-    steps = _num_steps(model, seconds, control_step, 2 * len(keyframes) - 1)
-    targets = [model.key_ctrl[model.key(name).id] for name in keyframes]
+    return controls_between([model.key_ctrl[model.key(name).id] for name in keyframes], seconds, control_step)
+
+
+def controls_between(targets: Sequence[Float[np.ndarray, " actuator"]], seconds: float, control_step: float) -> Controls:
+    """Return controls that hold each of some for a while and move evenly to the next in as long.
+
+    Args:
+        targets: The controls.
+        seconds: Duration of each hold and of each move [s].
+        control_step: Duration of a control step [s].
+
+    Raises:
+        SimulationError: If the duration is not positive, or takes more steps than there is memory for.
+    """
+    steps = _num_steps(len(targets[0]), seconds, control_step, 2 * len(targets) - 1)
     parts = [np.tile(targets[0], (steps, 1))]
     for start, end in pairwise(targets):
         ramp = np.linspace(0.0, 1.0, steps)[:, None]
@@ -83,15 +96,15 @@ def held_controls(model: mujoco.MjModel, seconds: float, control_step: float) ->
     Raises:
         SimulationError: If the duration is not positive, or takes more steps than there is memory for.
     """
+    return np.zeros((_num_steps(model.nu, seconds, control_step), model.nu))
+
+
+def _num_steps(num_actuators: int, seconds: float, control_step: float, times: int = 1) -> int:
+    """Return how many control steps a duration has, at least one; controls of so many, `times` over, fit into memory."""
     if not 0 < seconds < np.inf:
         raise SimulationError(f"held for {seconds:g} s: expected more than 0 s")
-    return np.zeros((_num_steps(model, seconds, control_step), model.nu))
-
-
-def _num_steps(model: mujoco.MjModel, seconds: float, control_step: float, times: int = 1) -> int:
-    """Return how many control steps a duration has, at least one; controls of so many, `times` over, fit into memory."""
     steps = max(round(seconds / control_step), 1)
-    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * model.nu)
+    refuse_beyond_memory(f"controls of {times * steps} steps", 8 * times * steps * num_actuators)
     return steps
 
 

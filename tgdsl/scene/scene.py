@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from tgdsl.errors import ArtifactError, RobotError, TgdslError
 from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
+from tgdsl.scene.mujoco_warnings import muted_mujoco
 
 INHERITED = (
     *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
@@ -26,23 +25,6 @@ INHERITED = (
 _STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 OFF_CENTER = 2e-6
 """Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
-
-
-@contextmanager
-def muted_mujoco() -> Iterator[None]:
-    """Turn what MuJoCo would print and log while it reads a model into Python warnings.
-
-    One is left out: a robot attached under its own names, with no prefix, is just what a scene of ours wants, and scenes are
-    never saved by MuJoCo, which is what it warns of.
-    """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: warnings.warn(f"MuJoCo: {message}", stacklevel=2))
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*Attaching a spec with an empty prefix")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
@@ -192,8 +174,12 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
 class SceneModels:
     """The models of a scene whose objects differ between environments, all of one layout, each compiled once while in use."""
 
-    def __init__(self, scene: SceneFile):
+    def __init__(self, scene: SceneFile, prepare: Callable[[mujoco.MjSpec], None] | None = None):
         """Read the assets.
+
+        Args:
+            scene: The scene.
+            prepare: Changes the scene before anything of it is compiled.
 
         Raises:
             ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
@@ -201,6 +187,8 @@ class SceneModels:
         self.objects = {target.name: target for target in scene.objects}
         with muted_mujoco():
             self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
+            if prepare is not None:
+                prepare(self._base)
         self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}
         self._off_center: tuple[str, ...] = ()
         for target in scene.objects:
@@ -210,6 +198,11 @@ class SceneModels:
                 self._off_center += (target.body,)
         if self._off_center:
             self._models.clear()
+
+    def first(self) -> mujoco.MjSpec:
+        """Return the scene with the first variant of each object, to read or to compile."""
+        with muted_mujoco():
+            return with_choices(self._base.copy(), list(self.objects.values()), {})
 
     def model(self, choices: Mapping[str, Choice]) -> mujoco.MjModel:
         """Return the scene with some choices of objects; the others have their first variant.

@@ -6,7 +6,7 @@ Every guess is written down in the file, for its reader to keep or to change.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,6 +136,21 @@ def propose(robot: Model, density: float, with_groups: bool = True) -> Proposal:
     return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)))
 
 
+def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
+    """Return how the hands of a robot close: by name, each joint's open and closed end [rad, of slides m].
+
+    A joint that has no name, or of which it is not clear which end is the closed one, is not in it.
+    """
+    surfaces, _ = _link_surfaces(robot)
+    tree = kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
+    model, motion = robot.compiled, {}
+    for hand in hands(tree):
+        for joint, closed in Flexion(tree, hand).closed.items():
+            low, high = model.jnt_range[joint].tolist()
+            motion[model.joint(joint).name] = (low if closed > 0.5 * (low + high) else high, closed)
+    return {name: ends for name, ends in motion.items() if name}
+
+
 def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str, str]]]:
     """Return what can be touched of each named body with geoms, and why some cannot be sampled."""
     surfaces: dict[str, LinkSurface] = {}
@@ -155,9 +170,8 @@ def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str
         else:
             surfaces[body] = surface
     model = robot.compiled
-    unnamed = sum(not model.body(i).name and model.body_geomnum[i] > 0 for i in range(model.nbody))
-    if unnamed:
-        left_out.append((f"{unnamed} more", "bodies with geoms but no name"))
+    unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
+    left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
     return surfaces, left_out
 
 

@@ -25,6 +25,7 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices
 
@@ -57,6 +58,7 @@ class BatchSimulation(Simulation):
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
         on_fault: OnFault = "raise",
+        prepare: Callable[[mujoco.MjSpec], None] | None = None,
     ):
         """Start all environments.
 
@@ -71,6 +73,7 @@ class BatchSimulation(Simulation):
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
                 them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
                 with controls that are not finite, which "raise" refuses.
+            prepare: Changes the artefact's scene before it is compiled; bodies and contact sensors must stay.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -80,7 +83,7 @@ class BatchSimulation(Simulation):
         """
         refuse_unfit(touch, num_envs, substeps, model)
         if model is None:
-            scenes = SceneModels(touch.plan.scene)
+            scenes = SceneModels(touch.plan.scene, prepare)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = EnvObjects(scenes, touch.inputs, num_envs)
@@ -92,6 +95,7 @@ class BatchSimulation(Simulation):
         self._touch = touch
         self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
+        self._warnings = StepWarnings()
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
         with torch.inference_mode(False):
@@ -183,6 +187,9 @@ class BatchSimulation(Simulation):
 
     def _run(self, call: Callable[[], None]) -> None:
         try:
-            call()
+            with collected_messages() as messages:
+                call()
         except (mujoco.batch.SimulationError, mujoco.FatalError, ValueError) as error:
             raise SimulationError(f"MuJoCo: {error}") from error
+        if messages:
+            self._warnings.tell(messages)

@@ -1,0 +1,238 @@
+"""Hands without keyframes close on an object by themselves: two links or more are pressed, whatever drives the hand."""
+
+import warnings
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from closing_hands import GRIPPER, URDF
+from odd_hands import CAPSULES, TENDON
+
+import tgdsl
+from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.propose import escaped
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.closing.closing import GRIP, MOST, START, Closing, closing_of
+from tgdsl.runtime.rollout import controls_between, rollout
+
+BALL = {"geom": {"type": "sphere", "size": [0.012]}}
+HANDS = {"gripper.xml": GRIPPER, "tendon.xml": TENDON, "three fingers.urdf": URDF, "capsules.xml": CAPSULES}
+SECONDS = 1.0
+HELD_ATOL = 2e-3
+"""How far soft constraints let held joints go under the forces of a grip [rad, m]."""
+SOLVER_RTOL = 0.02
+"""What presses is at rest up to the drag of the object."""
+
+
+def module(
+    folder: Path, name: str, text: str, objects: dict | None = None, scene: str = "", without: tuple[str, ...] = ()
+) -> tgdsl.TactileModule:
+    """Compile a hand with a few taxels and a contact sensor on each body with geoms."""
+    (folder / name).write_text(text)
+    robot = load_model(folder / name)
+    links = [body for body in robot.bodies[1:] if robot.touchable(body) and body not in without]
+    document = {
+        "tgdsl": 1,
+        "robot": {
+            "model": str(folder / name),
+            "layout": {"resolutions": {"r": {escaped(b): {"method": "poisson", "count": 4, "radius": "4 mm"} for b in links}}},
+        },
+        "objects": objects or {"ball": BALL},
+        "sensors": {"load": {"kind": "link_contact", "links": "*", "feels": list(objects or {"ball": BALL})}},
+    }
+    if scene:
+        (folder / "scene.xml").write_text(scene)
+        document["scene"] = {"model": str(folder / "scene.xml")}
+    return tgdsl.compile(document, dtype=torch.float64)
+
+
+def closed(touch: tgdsl.TactileModule, num_envs: int = 1) -> tuple[Closing, BatchSimulation, torch.Tensor]:
+    """Close the hand; return how, the simulation at its end, and the force on each link (env, link) [N]."""
+    closing = closing_of(touch)
+    assert isinstance(closing, Closing), closing
+    sim = BatchSimulation(touch, num_envs, substeps=5, keyframe=START, prepare=closing.prepare)
+    controls = controls_between(closing.targets(sim.model.nu), SECONDS, sim.control_step)
+    for step in rollout(touch, sim, controls):
+        assert all(torch.isfinite(reading).all() for reading in step.readings.values())
+    sim.forward()
+    return closing, sim, touch(sim.state())["load"][..., 1:].norm(dim=-1)
+
+
+def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]:
+    """Return the normal forces between a body and others, by MuJoCo's own function [N]."""
+    model, force, found = sim.env_model(env), np.zeros(6), dict[str, float]()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = sim.qpos[env], sim.qvel[env], sim.ctrl[env]
+    mujoco.mj_forward(model, data)
+    for i, contact in enumerate(data.contact):
+        names = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
+        if body in names:
+            mujoco.mj_contactForce(model, data, i, force)
+            other = names[1 - names.index(body)]
+            found[other] = found.get(other, 0.0) + float(force[0])
+    return found
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_at_least_two_links_are_pressed(tmp_path, name):
+    ball = {"geom": {"type": "sphere", "size": [0.02 if name == "capsules.xml" else 0.012]}}
+    touch = module(tmp_path, name, HANDS[name], {"ball": ball})
+    closing, sim, load = closed(touch)
+    pressed = {link for link, force in forces_on(sim, "ball").items() if force > 0}
+    assert len(pressed) >= 2 and (load[0] > 0).sum() >= 2
+    assert torch.isfinite(sim.qpos).all() and closing.target == "ball" and closing.place is not None
+    depth = -min(contact.dist for contact in _contacts(sim))
+    assert depth < 0.2 * ball["geom"]["size"][0]  # forces that soft contacts can bear
+
+
+def _contacts(sim: BatchSimulation):
+    data = mujoco.MjData(sim.model)
+    data.qpos[:] = sim.qpos[0]
+    mujoco.mj_fwdPosition(sim.model, data)
+    return list(data.contact)
+
+
+def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
+    """By virtual work a servo that both jaws follow gives each half its force; the arm's motor, at zero, bears nothing."""
+    touch = module(tmp_path, "gripper.xml", GRIPPER)
+    closing, sim, _ = closed(touch)
+    assert str(closing) == "the hand closes on `ball`, put between the fingers, weightless; 1 of 1 joints"
+    np.testing.assert_allclose(closing.place[:2], 0.0, atol=1e-9)  # midway between the jaws
+    mass = float(sim.model.body("ball").mass[0])
+    found = forces_on(sim, "ball")
+    assert found.keys() == {"left", "right"}
+    assert sum(found.values()) == pytest.approx(GRIP * mass * 9.81, rel=SOLVER_RTOL)
+    for joint in ("lift", "turn"):
+        assert abs(float(sim.qpos[0, sim.joints[joint].qpos])) < HELD_ATOL
+    assert float(sim.qpos[0, sim.joints["left slide"].qpos]) == pytest.approx(0.012, abs=1e-3)  # the ball's radius
+    assert closing.resting == (0, 1) and not sim.ctrl[0, :2].any()
+
+
+def test_forces_are_bounded_on_a_heavy_object(tmp_path):
+    text = scene("<body name='ball' pos='1 0 0'><freejoint/><geom size='.012' mass='5'/></body>")
+    _, sim, _ = closed(module(tmp_path, "gripper.xml", GRIPPER, {"ball": {"body": "ball"}}, text))
+    assert 0 < max(forces_on(sim, "ball").values()) < MOST
+
+
+def test_the_same_scene_closes_alike(tmp_path):
+    first, second = (closed(module(tmp_path, "gripper.xml", GRIPPER))[1].qpos for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_a_floating_hand_stays_where_it_is(tmp_path):
+    _, sim, _ = closed(module(tmp_path, "tendon.xml", TENDON))
+    np.testing.assert_allclose(sim.qpos[0, :3], [0, 0, 0.3], atol=HELD_ATOL)
+
+
+def test_a_urdf_s_second_joints_follow_the_first(tmp_path):
+    closing, sim, _ = closed(module(tmp_path, "three fingers.urdf", URDF))
+    assert [servo.joint for servo in closing.servos] == ["a_1", "b_1", "thumb_1"] and closing.num_joints == 3
+    for name in ("a", "b", "thumb"):
+        one, two = (float(sim.qpos[0, sim.joints[f"{name}_{i}"].qpos]) for i in (1, 2))
+        assert two == pytest.approx(0.8 * one, abs=0.05)
+
+
+SCENE = """<mujoco><include file="gripper.xml"/><worldbody>{bodies}</worldbody>{rest}</mujoco>"""
+
+
+def scene(bodies: str, rest: str = "") -> str:
+    return SCENE.format(bodies=bodies, rest=rest)
+
+
+def test_what_is_between_the_fingers_stays_there(tmp_path):
+    text = scene(
+        "<body name='egg' pos='.002 .003 .435'><freejoint/><geom type='ellipsoid' size='.01 .012 .014' mass='.02'/></body>"
+    )
+    closing, _, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"egg": {"body": "egg"}}, text))
+    assert closing.place is None
+    assert str(closing) == "the hand closes on `egg`, which stays where it is; 1 of 1 joints"
+    np.testing.assert_allclose(closing.start[-7:-4], [0.002, 0.003, 0.435])
+    assert (load[0] > 0).sum() == 2
+
+
+def test_the_first_object_that_fits_is_taken(tmp_path):
+    bodies = "<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>"
+    bodies += "<body name='crate' pos='1 0 .3'><freejoint/><geom type='box' size='.3 .3 .3' mass='5'/></body>"
+    bodies += "<body name='pen' pos='2 0 .3'><freejoint/><geom type='capsule' size='.004 .05' mass='.01'/></body>"
+    objects = {name: {"body": name} for name in ("table", "crate", "pen")}
+    touch = module(tmp_path, "gripper.xml", GRIPPER, objects, scene(bodies))
+    closing = closing_of(touch)
+    assert isinstance(closing, Closing) and closing.target == "pen"
+
+
+@pytest.mark.parametrize(
+    ("bodies", "name", "why"),
+    [
+        (
+            "<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>",
+            "table",
+            "table is fixed out of its reach",
+        ),
+        (
+            "<body name='crate' pos='1 0 .3'><freejoint/><geom type='box' size='.3 .3 .3'/></body>",
+            "crate",
+            "crate does not fit between its fingers",
+        ),
+    ],
+)
+def test_why_it_does_not_close_on_an_object(tmp_path, bodies, name, why):
+    assert closing_of(module(tmp_path, "gripper.xml", GRIPPER, {name: {"body": name}}, scene(bodies))) == why
+
+
+def test_a_fixed_object_within_reach_is_pressed(tmp_path):
+    text = scene("<body name='post' pos='0 0 .44'><geom type='cylinder' size='.01 .02'/></body>")
+    closing, _, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"post": {"body": "post"}}, text))
+    assert closing.place is None and closing.body is None and (load[0] > 0).sum() == 2
+
+
+@pytest.mark.parametrize(
+    ("joint", "why"),
+    [
+        ("", "it has no hinge and no slide"),
+        ("<joint type='hinge' axis='0 1 0' range='-60 60'/>", "which way its joints close is not clear"),
+    ],
+)
+def test_why_a_hand_does_not_close(tmp_path, joint, why):
+    text = f"<mujoco><worldbody><body name='pad'>{joint}<geom type='box' size='.03 .03 .01'/></body></worldbody></mujoco>"
+    assert closing_of(module(tmp_path, "pad.xml", text)) == why
+
+
+def test_objects_that_differ_between_environments(tmp_path):
+    variants = [{"type": "sphere", "size": [0.012]}, {"type": "box", "size": [0.01, 0.011, 0.012]}]
+    touch = module(tmp_path, "gripper.xml", GRIPPER, {"thing": {"variants": variants}})
+    _, sim, load = closed(touch, num_envs=2)
+    assert ((load > 0).sum(dim=1) == 2).all()
+    assert [set(forces_on(sim, "thing", env)) for env in range(2)] == [{"left", "right"}] * 2
+
+
+def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path):
+    bodies = (
+        "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
+    )
+    rest = "<option actuatorgroupdisable='0 3'/><actuator><velocity joint='spin' kv='1' group='2'/><motor joint='spin' group='3'/></actuator>"
+    objects = {"ball": BALL, "fan": {"body": "fan"}}
+    touch = module(tmp_path, "gripper.xml", GRIPPER, objects, scene(bodies, rest))
+    closing, sim, _ = closed(touch)
+    groups = sim.model.actuator_group.tolist()
+    is_off = [bool(sim.model.opt.disableactuator >> group & 1) for group in groups]
+    assert closing.resting == (0, 1) and is_off == [True, True, False, True, False]
+    assert closing.target == "ball"
+
+
+@pytest.mark.parametrize("robot", ["xhand1", "sharpa"])
+def test_hands_with_many_fingers(robot):
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": robot},
+        "resolution": "low",
+        "objects": {"ball": {"geom": {"type": "sphere", "size": [0.02]}}},
+        "sensors": {"load": {"kind": "link_contact", "links": "hand", "feels": ["ball"]}},
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        closing, sim, load = closed(tgdsl.compile(document, dtype=torch.float64))
+    assert (load[0] > 0).sum() >= 2 and load.max() < MOST
+    assert sum(force > 0 for force in forces_on(sim, "ball").values()) >= 2
+    assert len(closing.servos) >= 10 and torch.isfinite(sim.qpos).all()

@@ -1,0 +1,101 @@
+"""What MuJoCo warns of is told once, with the file named, and neither printed nor logged."""
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from cube_on_pad import pad
+
+import tgdsl
+from tgdsl.formats.robot import load_model
+from tgdsl.scene.mujoco_warnings import StepWarnings, told_of
+
+REPOSITORY = Path(__file__).parents[2]
+INERTIAL = "<inertial><mass value='.1'/><inertia ixx='1e-5' iyy='1e-5' izz='1e-5' ixy='0' ixz='0' iyz='0'/></inertial>"
+MIMIC = f"""<robot name='r'><link name='world'/><link name='b'>{INERTIAL}</link>
+<joint name='j' type='floating'><mimic joint='k'/><parent link='world'/><child link='b'/></joint></robot>"""
+DEPRECATED = "<mujoco><compiler settotalmass='3'/><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "what"), [("r.urdf", MIMIC, "<mimic> on joint 'j'"), ("r.xml", DEPRECATED, "settotalmass")]
+)
+def test_a_model_s_are_told_once(tmp_path, monkeypatch, capfd, name, text, what):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / name
+    path.write_text(text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_model(path)
+    said = [str(w.message) for w in caught]
+    assert len(said) == 1 and said[0].startswith(f"{path}: MuJoCo: ") and what in said[0]
+    assert capfd.readouterr() == ("", "") and [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("filters", ["error", "always"])
+def test_they_end_no_process(tmp_path, filters):
+    """A Python exception inside MuJoCo's callback would."""
+    (tmp_path / "r.urdf").write_text(MIMIC)
+    environment = {**os.environ, "PYTHONWARNINGS": filters, "PYTHONPATH": str(REPOSITORY)}
+    code = "from pathlib import Path\nfrom tgdsl.formats.robot import load_model\nload_model(Path('r.urdf'))"
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == (1 if filters == "error" else 0), ran.stderr
+    assert "UserWarning: r.urdf: MuJoCo: <mimic> on joint 'j' ignored" in ran.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["r.urdf"]
+
+
+def test_a_handler_of_the_user_s_is_given_back():
+    own = lambda message: None  # noqa: E731
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(own)
+    try:
+        with pytest.raises(ValueError, match="broken"), told_of("x"):
+            raise ValueError("broken")
+        assert mujoco.get_mju_user_warning() is own
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def test_others_keep_their_words_and_kind():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with told_of("hand.xml"):
+            warnings.warn("old", DeprecationWarning, stacklevel=1)
+            warnings.warn("hand.xml: a reader's own", stacklevel=1)
+            warnings.warn("Attaching a spec with an empty prefix", stacklevel=1)
+    assert [(w.category, str(w.message)) for w in caught] == [
+        (DeprecationWarning, "old"),
+        (UserWarning, "hand.xml: a reader's own"),
+    ]
+
+
+def test_a_simulation_that_diverges_prints_and_logs_nothing(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    touch = pad(tmp_path, kind="contact")
+    sim = tgdsl.simulate(touch, 3, threads=2)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    sim.qvel[1] = np.nan
+    with pytest.raises(tgdsl.SimulationError, match="environments 1 diverged"):
+        sim.step()
+    assert capfd.readouterr() == ("", "") and sorted(path.name for path in tmp_path.iterdir()) == names
+
+
+def test_a_step_s_are_told_once_each_whatever_their_numbers():
+    told = StepWarnings()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        told.tell(
+            ["Pre-allocated constraint buffer is full (12). Time = 0.1000.\n\n", "Nan, Inf or huge value in QACC at DOF 0."]
+        )
+        told.tell(["Pre-allocated constraint buffer is full (13). Time = 0.2000.\n\n", "Another thing. Time = 1e-3."])
+    assert [str(w.message) for w in caught] == [
+        "MuJoCo: Pre-allocated constraint buffer is full (12). Time = 0.1000.; this is said once",
+        "MuJoCo: Another thing. Time = 1e-3.; this is said once",
+    ]

@@ -1,0 +1,96 @@
+"""Mesh files that MuJoCo does not read itself, read by trimesh: glTF, COLLADA, PLY and OFF.
+
+A file's scene becomes one mesh, each node's under its transform; materials and textures are left out. Numbers are kept as the
+file has them, in its frame: glTF's are metres with Y up by its specification, and are not turned to have Z up. So do yourdfpy
+and trimesh, three.js' urdf-loader and SAPIEN, for which the glTF files of hands are mostly made (those of dex-urdf lie in the
+frames of their links); RViz 2 since 2025 and Drake do turn them. COLLADA's `up_axis` is left alone likewise, as RViz does,
+and its unit, which most URDF loaders apply, is applied.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from tgdsl.errors import RobotError, listed
+
+BY_MUJOCO = (".stl", ".obj", ".msh")
+"""Endings of the mesh files that MuJoCo reads."""
+BY_TRIMESH = (".glb", ".gltf", ".dae", ".ply", ".off")
+"""Endings of those that are read here."""
+Y_UP = (".glb", ".gltf", ".dae")
+"""Endings of those whose up axis is, or may be, Y."""
+_HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
+"""How the names of glTF's extensions begin that change nothing in triangles."""
+DIGITS = 6
+"""Significant digits of coordinates: what MuJoCo writes in MJCF."""
+
+
+def triangles(file: Path) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+    """Return the vertices and faces of a mesh file, in its own unit (COLLADA's in metres); equal vertices are one.
+
+    Coordinates are rounded to `DIGITS` significant digits, so that a model and its MJCF have the same.
+
+    Raises:
+        RobotError: If the file cannot be read, wants an extension of glTF that changes triangles, or holds none.
+    """
+    kwargs: dict[str, Any] = {}
+    if file.suffix.lower() in (".glb", ".gltf"):
+        kwargs["skip_materials"] = True
+        _check_extensions(file)
+    try:
+        scene = trimesh.load_scene(file, **kwargs)
+        mesh = scene.to_mesh()
+    except ImportError as error:
+        raise RobotError(f"{file}: this mesh needs another package: {error}; or convert it to .stl or .obj") from error
+    except Exception as error:  # trimesh raises whatever its parsers do
+        raise RobotError(f"{file}: trimesh cannot read this mesh: {type(error).__name__}: {error}") from error
+    if file.suffix.lower() == ".dae":
+        mesh.apply_scale(trimesh.units.unit_conversion(scene.units or "meters", "meters"))
+    vertices = np.array([[float(f"{x:.{DIGITS}g}") for x in vertex] for vertex in np.asarray(mesh.vertices)]).reshape(-1, 3)
+    vertices, index = np.unique(vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)]
+    one, two, three = faces.T
+    faces = faces[(one != two) & (two != three) & (three != one)]
+    if not len(faces):
+        raise RobotError(f"{file}: this mesh file holds no triangles")
+    return vertices, faces.astype(np.int64)
+
+
+def put_in_line(mesh: mujoco.MjsMesh, file: Path) -> None:
+    """Give a mesh of a MuJoCo model the triangles of a file instead of the file's name; what is flat weighs as a shell."""
+    vertices, faces = triangles(file)
+    mesh.file = ""
+    mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
+    if np.linalg.matrix_rank(vertices - vertices[0], tol=1e-6 * np.ptp(vertices)) < 3:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+
+
+def refuse_unreadable(model_file: Path, spec: mujoco.MjSpec) -> None:
+    """Refuse MJCF that names meshes that MuJoCo does not read.
+
+    Raises:
+        RobotError: With all of them.
+    """
+    named = {mesh.file for mesh in spec.meshes if mesh.file and not mesh.content_type}
+    if wrong := sorted(name for name in named if Path(name).suffix.lower() not in BY_MUJOCO):
+        what = f"MJCF's meshes are files of {listed(BY_MUJOCO)}, found {listed(wrong)}"
+        raise RobotError(f"{model_file}: {what}; convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)")
+
+
+def _check_extensions(file: Path) -> None:
+    content = file.read_bytes()
+    if content[:4] == b"glTF":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    try:
+        wanted = json.loads(content).get("extensionsRequired", [])
+    except (ValueError, AttributeError) as error:
+        raise RobotError(f"{file}: not glTF 2.0: {error}") from error
+    if unknown := [name for name in wanted if not name.startswith(_HARMLESS)]:
+        raise RobotError(f"{file}: this mesh is stored by {listed(unknown)}, which cannot be read; export it without")
