@@ -4,9 +4,9 @@
     python benchmarks/hands.py [NAME ...] [--out out/hands] [--pictures docs/images/hands]
 
 Each hand is looked for inside its installed package; one that is not there is skipped by name. Nothing of a file is edited: a
-layout is proposed, and a document of four kinds of sensor on its group `hand` feels a ball on which the hand closes (see
-`hand_scenes`). On the way the readings are checked against MuJoCo's own, in float64 (see `hand_checks`): depths against
-`mj_geomDistance`, forces against `mj_contactForce`.
+layout is proposed, and a document of four kinds of sensor on its group `hand` feels a ball on which `tgdsl run` closes the hand.
+On the way the readings are checked against MuJoCo's own, in float64 (see `hand_checks`): depths against `mj_geomDistance`,
+forces against `mj_contactForce`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ from io import StringIO
 from pathlib import Path
 
 import mujoco
-import numpy as np
 from hand_checks import check
-from hand_scenes import grasp, with_servos
 
 import tgdsl
 from tgdsl.commands.compile import Compile
@@ -44,10 +42,18 @@ from tgdsl.commands.run import Run
 from tgdsl.compiler.pipeline import layouts
 from tgdsl.errors import TgdslError
 from tgdsl.formats.robot import load_model
+from tgdsl.module.artifact import load
 from tgdsl.placement.propose.propose import FACTORS
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.closing.closing import START, closing_of
+from tgdsl.runtime.rollout import controls_between
 
 DENSITY = "1/cm2"
 """Taxels per area at `med`."""
+RADII = (0.025, 0.015, 0.01, 0.006)
+"""Radii of the ball that are tried, from the largest [m]."""
+SECONDS = 0.5
+"""How long the hand is open, closes, and is closed [s]."""
 SUBSTEPS = 10
 """Physics steps per control step of `tgdsl run`."""
 INSTANTS = 12
@@ -159,13 +165,13 @@ class Line:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.layout, self.document = self.folder / "layout.yaml", self.folder / "hand.yaml"
         self.picture = (pictures or self.folder) / f"{name}.png"
-        self.scene = self.file
+        self.artefact = self.folder / "hand.safetensors"
 
     def run(self) -> Row:
         """Take the hand through all stages; what fails ends in the row, and what needs it is left out."""
         stages: tuple[Callable[[], None], ...] = (
-            *(self.links, self.layout_new, self.render, self.close, self.compile, self.explain, self.run_scene),
-            *(self.compare, self.usd),
+            *(self.links, self.layout_new, self.render, self.usd),
+            *(self.compile, self.explain, self.run_scene, self.compare),
         )
         for stage in stages:
             start, said = time.perf_counter(), []
@@ -177,7 +183,7 @@ class Line:
                 self.row.error += f"{stage.__name__}: {what}\n"
             self.row.seconds[stage.__name__] = round(time.perf_counter() - start, 1)
             self.row.warnings += [f"{stage.__name__}: {text}" for text in dict.fromkeys(said)]
-            if self.row.error and stage.__name__ not in ("explain", "run_scene", "compare"):
+            if self.row.error and stage.__name__ not in ("render", "usd", "explain", "run_scene"):
                 break
         return self.row
 
@@ -205,28 +211,18 @@ class Line:
         view = Render(str(self.file), self.layout, ("med",), view="iso", size=(360, 360), out=self.picture)
         printed(view.run)
 
-    def close(self) -> None:
-        """Find how the hand closes, and write the document."""
-        self.scene = with_servos(self.file, self.folder / "scene.xml") or self.file
-        self.grasp = grasp(self.scene, self.med)
-        np.savez(self.folder / "controls.npz", ctrl=self.grasp.control[::SUBSTEPS])
-        ball = {
-            "geom": {"type": "sphere", "size": [self.grasp.radius]},
-            "pos": self.grasp.centre.tolist(),
-            "joint": "fixed",
-        }
-        document = {
-            **self._robot(),
-            **({"scene": {"model": str(self.scene)}} if self.scene != self.file else {}),
-            "objects": {"ball": ball},
-            "resolution": "med",
-            "sensors": {name: {"kind": kind, "links": "hand", "feels": ["ball"]} for name, kind in SENSORS.items()},
-        }
-        self.document.write_text(json.dumps(document, indent=1))  # JSON is YAML
-
     def compile(self) -> None:
-        """`tgdsl compile`."""
-        printed(Compile(self.document, out=self.folder / "hand.safetensors").run)
+        """Write the document, with the largest ball that fits into the hand, and `tgdsl compile` it."""
+        why = ""
+        for radius in RADII:
+            self.document.write_text(json.dumps(self._document(radius), indent=1))  # JSON is YAML
+            printed(Compile(self.document, out=self.artefact).run)
+            closing = closing_of(load(self.artefact))
+            if not isinstance(closing, str):
+                self.closing = closing
+                return
+            why = closing
+        raise TgdslError(f"the hand closes on no ball of {1e3 * min(RADII):g} to {1e3 * max(RADII):g} mm: {why}")
 
     def explain(self) -> None:
         """`tgdsl explain`; what it says of taxels that feel nothing is kept."""
@@ -235,14 +231,14 @@ class Line:
 
     def run_scene(self) -> None:
         """`tgdsl run`: the hand opens and closes on the ball."""
-        controls = self.folder / "controls.npz"
-        printed(Run(self.document, controls=controls, substeps=SUBSTEPS, out=self.folder).run)
+        printed(Run(self.artefact, seconds=SECONDS, substeps=SUBSTEPS, out=self.folder).run)
 
     def compare(self) -> None:
         """Compare readings with MuJoCo's own."""
         touch = tgdsl.compile(self.document, dtype="float64")
-        sim = tgdsl.simulate(touch, 1, substeps=1)
-        self.row.felt = asdict(check(touch, sim, self.grasp.control, INSTANTS))
+        sim = BatchSimulation(touch, 1, keyframe=START, prepare=self.closing.prepare)
+        control = controls_between(self.closing.targets(sim.model.nu), SECONDS, sim.control_step)
+        self.row.felt = asdict(check(touch, sim, control, INSTANTS))
         wrong = [f"{what} by {self.row.felt[what]:.1e}" for what in ("depth", "force") if not self.row.felt[what] <= LIMIT]
         if wrong:
             raise TgdslError(f"readings differ from MuJoCo's: {', '.join(wrong)}")
@@ -253,8 +249,16 @@ class Line:
         """`tgdsl export-usd` and `tgdsl import`: the robot must come back as it was."""
         stage, back = self.folder / "robot.usda", self.folder / "back.xml"
         printed(ExportUsd(str(self.file), stage).run)
-        printed(Import(stage, back).run if "force" not in Import.__dataclass_fields__ else Import(stage, back, force=True).run)
+        printed(Import(stage, back, force=True).run)
         self.row.usd = difference(load_model(self.file).compiled, load_model(back).compiled)
+
+    def _document(self, radius: float) -> dict[str, object]:
+        return {
+            **self._robot(),
+            "objects": {"ball": {"geom": {"type": "sphere", "size": [radius]}}},
+            "resolution": "med",
+            "sensors": {name: {"kind": kind, "links": "hand", "feels": ["ball"]} for name, kind in SENSORS.items()},
+        }
 
     def _robot(self) -> dict[str, object]:
         return {"tgdsl": 1, "robot": {"model": str(self.file), "layout": str(self.layout)}}
