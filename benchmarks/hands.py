@@ -4,8 +4,8 @@
     python benchmarks/hands.py [NAME ...] [--out out/hands] [--pictures docs/images/hands]
 
 Each hand is looked for inside its installed package; one that is not there is skipped by name. Nothing of a file is edited: a
-layout is proposed, and a document of four kinds of sensor on its group `hand` feels a ball on which `tgdsl run` closes the hand.
-On the way the readings are checked against MuJoCo's own, in float64 (see `hand_checks`): depths against `mj_geomDistance`,
+layout is proposed, and a document of four kinds of sensor on its group `hand` feels a ball on which `tgdsl run` closes it. On
+the way the readings are checked against MuJoCo's own, in float64 (see `hand_checks`): depths against `mj_geomDistance`,
 forces against `mj_contactForce`.
 """
 
@@ -28,6 +28,7 @@ from io import StringIO
 from pathlib import Path
 
 import mujoco
+import numpy as np
 from hand_checks import check
 
 import tgdsl
@@ -249,7 +250,7 @@ class Line:
         """`tgdsl export-usd` and `tgdsl import`: the robot must come back as it was."""
         stage, back = self.folder / "robot.usda", self.folder / "back.xml"
         printed(ExportUsd(str(self.file), stage).run)
-        printed(Import(stage, back, force=True).run)
+        printed(Import(stage, back).run)
         self.row.usd = difference(load_model(self.file).compiled, load_model(back).compiled)
 
     def _document(self, radius: float) -> dict[str, object]:
