@@ -31,7 +31,6 @@ import mujoco
 import numpy as np
 from hand_checks import check
 
-import tgdsl
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
 from tgdsl.commands.export_usd import ExportUsd
@@ -53,7 +52,7 @@ DENSITY = "1/cm2"
 """Taxels per area at `med`."""
 RADII = (0.025, 0.015, 0.01, 0.006)
 """Radii of the ball that are tried, from the largest [m]."""
-SECONDS = 0.5
+SECONDS = 1.0
 """How long the hand is open, closes, and is closed [s]."""
 SUBSTEPS = 10
 """Physics steps per control step of `tgdsl run`."""
@@ -227,7 +226,7 @@ class Line:
 
     def explain(self) -> None:
         """`tgdsl explain`; what it says of taxels that feel nothing is kept."""
-        text = printed(Explain(self.document).run)
+        text = printed(Explain(self.artefact).run)
         self.row.explained = [line.strip() for line in text.splitlines() if re.search("buried|deaf|feel nothing|never", line)]
 
     def run_scene(self) -> None:
@@ -236,7 +235,7 @@ class Line:
 
     def compare(self) -> None:
         """Compare readings with MuJoCo's own."""
-        touch = tgdsl.compile(self.document, dtype="float64")
+        touch = load(self.artefact, dtype="float64")
         sim = BatchSimulation(touch, 1, keyframe=START, prepare=self.closing.prepare)
         control = controls_between(self.closing.targets(sim.model.nu), SECONDS, sim.control_step)
         self.row.felt = asdict(check(touch, sim, control, INSTANTS))
