@@ -183,6 +183,7 @@ class Line:
                 self.row.error += f"{stage.__name__}: {what}\n"
             self.row.seconds[stage.__name__] = round(time.perf_counter() - start, 1)
             self.row.warnings += [f"{stage.__name__}: {text}" for text in dict.fromkeys(said)]
+            (self.folder / "row.json").write_text(json.dumps(asdict(self.row), indent=1))
             if self.row.error and stage.__name__ not in ("render", "usd", "explain", "run_scene"):
                 break
         return self.row
@@ -222,6 +223,8 @@ class Line:
                 self.closing = closing
                 return
             why = closing
+            if "does not fit" not in why:  # then no other ball will
+                break
         raise TgdslError(f"the hand closes on no ball of {1e3 * min(RADII):g} to {1e3 * max(RADII):g} mm: {why}")
 
     def explain(self) -> None:
@@ -355,8 +358,7 @@ def main() -> int:
             print(f"{name:<14} skipped: {HANDS[name].package} with {HANDS[name].file} is not installed", flush=True)
             continue
         if options.child:
-            row = Line(name, *place, options.out, options.pictures).run()
-            (options.out / name / "row.json").write_text(json.dumps(asdict(row), indent=1))
+            Line(name, *place, options.out, options.pictures).run()
             continue
         row = in_own_process(name, place[1], options)
         failed += bool(row.error)
@@ -365,18 +367,21 @@ def main() -> int:
 
 
 def in_own_process(name: str, version: str, options: argparse.Namespace) -> Row:
-    """Return a hand's row, made in a process of its own: what crashes or hangs costs one row."""
+    """Return a hand's row, made in a process of its own: what crashes or hangs costs the rest of one row."""
     file = options.out / name / "row.json"
     file.unlink(missing_ok=True)
     command = [sys.executable, __file__, name, "--child", "--out", str(options.out)]
     command += ["--pictures", str(options.pictures)] if options.pictures else []
+    why = ""
     try:
         ended = subprocess.run(command, timeout=options.timeout, capture_output=True, text=True)
-        if file.is_file():
-            return Row(**json.loads(file.read_text()))
-        return Row(name, version, error=f"exit code {ended.returncode}: {ended.stderr.strip()[-300:]}")
+        if ended.returncode:
+            why = f"exit code {ended.returncode}: {ended.stderr.strip()[-300:]}"
     except subprocess.TimeoutExpired:
-        return Row(name, version, error=f"not done after {options.timeout:g} s")
+        why = f"not done after {options.timeout:g} s"
+    row = Row(**json.loads(file.read_text())) if file.is_file() else Row(name, version)
+    row.error += why
+    return row
 
 
 if __name__ == "__main__":
