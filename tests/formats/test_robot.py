@@ -203,3 +203,11 @@ def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch):
     assert str(caught.value) == f"{tmp_path / 'c.toy'}: [Errno 2] gone"
     export_model(tmp_path / "a.TOY", tmp_path / "d.toy")
     assert written == {tmp_path / "d.toy": model}
+
+
+def test_a_part_that_models_include_is_told_from_a_model(tmp_path):
+    part = tmp_path / "hand_assets.xml"
+    part.write_text("<mujocoinclude><worldbody/></mujocoinclude>")
+    with pytest.raises(RobotError) as caught:
+        load_model(part)
+    assert str(caught.value) == f"{part}: a part that models <include>, and no model; name the file that includes it"

@@ -3,6 +3,7 @@
 import warnings
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -89,6 +90,55 @@ def test_urdf_inertias_are_mended_with_one_warning(tmp_path):
     np.testing.assert_allclose(moments["skew"], 1e-5)
 
 
+def test_urdf_links_without_mass_or_moments_can_move(tmp_path):
+    links = link_of("base", "<sphere radius='.01'/>") + "<link name='knuckle'/>"
+    links += link_of("tip", "<sphere radius='.01'/>", "<inertial><mass value='.1'/></inertial>")
+    path = urdf_of(tmp_path, links + joint_of("j", "base", "knuckle", "revolute") + joint_of("k", "knuckle", "tip", "revolute"))
+    with pytest.warns(UserWarning, match="mended: knuckle, tip$"):
+        model = load_model(path).compiled
+    np.testing.assert_allclose(model.body_mass[1:], [0.1, 1e-6, 0.1])
+    np.testing.assert_allclose(model.body_inertia[2:], 1e-9)
+
+
+@pytest.mark.parametrize("turn", range(8))
+def test_urdf_inertias_at_the_edge_survive_being_written(tmp_path, turn):
+    """A plate's largest moment is the sum of the others: to six digits it may be larger."""
+    rotation = Rotation.from_euler("xyz", [0.3 * turn, 0.5, 0.7]).as_matrix()
+    plate = rotation @ np.diag([1.06853e-5 + 1e-12 * turn, 4.10897e-5, 5.17750e-5 + 1e-12 * turn]) @ rotation.T
+    names = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
+    moments = " ".join(f"i{axes}='{float(plate[place])!r}'" for axes, place in names.items())
+    inertial = f"<inertial><mass value='.1'/><inertia {moments}/></inertial>"
+    links = link_of("base", "<sphere radius='.01'/>") + link_of("plate", "<sphere radius='.01'/>", inertial)
+    model = load_model(urdf_of(tmp_path, links + joint_of("j", "base", "plate", "revolute")))
+    again = mujoco.MjModel.from_xml_string(model.mjcf)
+    np.testing.assert_allclose(again.body_inertia, model.compiled.body_inertia, rtol=2e-5)
+
+
+def test_urdf_geoms_of_one_name_are_numbered(tmp_path, capfd):
+    def geom(tag: str, name: str) -> str:
+        return f"<{tag}{name and f' name={name!r}'}><geometry><sphere radius='.01'/></geometry></{tag}>"
+
+    one = geom("collision", "pad") + geom("collision", "pad") + geom("collision", "") + geom("visual", "pad_2")
+    two = geom("visual", "shell") + geom("collision", "") + geom("collision", "pad")
+    links = f"<link name='a'>{BALL}{one}</link><link name='b'>{BALL}{two}</link>"
+    model = load_model(urdf_of(tmp_path, links + joint_of("j", "a", "b", "revolute")))
+    found = {body: sorted(geom.name for geom in model.geoms if geom.body == body) for body in ("a", "b")}
+    assert found == {"a": ["", "pad", "pad_2", "pad_3"], "b": ["", "pad_4", "shell"]}
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("declared", ["", " xmlns:drake='http://drake.mit.edu'"])
+def test_urdf_tags_of_other_programs_are_passed_over(tmp_path, declared):
+    foreign = "<drake:collision_filter_group name='g'><drake:member link='base'/></drake:collision_filter_group>"
+    path = tmp_path / "hand.urdf"
+    body = link_of("base", "<sphere radius='.01'/>").replace("</link>", "<drake:diaphragm/></link>")
+    path.write_text(f"<?xml version='1.0' encoding='utf-8'?>\n<!-- a:b --><robot name='hand'{declared}>{foreign}{body}</robot>")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = load_model(path)
+    assert model.bodies == ("world", "base") and not caught
+
+
 def test_sound_urdf_gives_no_warning(tmp_path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -105,6 +155,7 @@ def test_sound_urdf_gives_no_warning(tmp_path):
             'mesh "package://pkg/m/gone.stl": no folder above the file holds "pkg/m/gone.stl"',
         ),
         ("<link>", "not XML: mismatched tag: line 1, column 27"),
+        ("<a:b><link></a:b>", "not XML: unbound prefix: line 1, column 19"),
     ],
 )
 def test_urdf_errors(tmp_path, text, message):

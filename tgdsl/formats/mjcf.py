@@ -41,6 +41,21 @@ def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
     return files
 
 
+def mjcf_of(spec: mujoco.MjSpec) -> str:
+    """Return a compiled spec as MJCF that MuJoCo compiles again.
+
+    MuJoCo writes six digits. Of a flat body, whose largest principal moment is the sum of the others, they may be those of no
+    body; the largest moment is then that sum.
+    """
+    root = ET.fromstring(spec.to_xml())
+    for inertial in root.iter("inertial"):
+        moments = [float(moment) for moment in inertial.get("diaginertia", "").split()]
+        if moments and max(moments) > (bound := sum(moments) - max(moments)):
+            moments[moments.index(max(moments))] = bound * (1.0 - 1e-12)
+            inertial.set("diaginertia", " ".join(map(repr, moments)))
+    return ET.tostring(root, encoding="unicode")
+
+
 def xml_files(path: Path) -> Iterator[Path]:
     """Yield a model file and all the files that it includes or attaches, each once."""
     seen: list[Path] = []

@@ -26,7 +26,13 @@ READERS: Mapping[str, Reader] = {
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
 }
 """By a file's ending, in lower case; any other file is XML, whose root element tells."""
-ROOTS: Mapping[str, Reader] = {"robot": read_urdf}
+
+
+def _refuse_part(path: Path) -> Model:
+    raise RobotError(f"{path}: a part that models <include>, and no model; name the file that includes it")
+
+
+ROOTS: Mapping[str, Reader] = {"robot": read_urdf, "mujocoinclude": _refuse_part}
 """By the root element of XML; any other is MJCF's."""
 WRITERS: Mapping[str, Writer] = dict.fromkeys((".usda", ".usdc", ".usd"), write_usd)
 """By a file's ending."""

@@ -1,10 +1,15 @@
-"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning."""
+"""URDF for MuJoCo: mesh paths resolved, links on fixed joints kept as bodies, invalid inertias replaced with a warning.
+
+Other people's files also have tags of other programs with undeclared prefixes, geoms that share a name, and links that move
+but weigh nothing.
+"""
 
 from __future__ import annotations
 
+import re
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import mujoco
@@ -12,8 +17,16 @@ import numpy as np
 
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.mesh_files import BY_MUJOCO, BY_TRIMESH, Y_UP, put_in_line
-from tgdsl.formats.mjcf import rewrite_meshes
+from tgdsl.formats.mjcf import mjcf_of, rewrite_meshes
 from tgdsl.formats.model import LEAST_INERTIA, Model
+
+EDGE = 1e-8
+"""A plate's largest moment is the sum of the others. By as much of it [1] a file's rounding may miss that, either way; twice
+as much is then added, so that MuJoCo, which looks at every bit, takes it."""
+LEAST_MASS = 1e-6
+"""Mass of a moving link that has none, and no geometry that MuJoCo could infer it from [kg]."""
+_PREFIX = re.compile(r"[<\s]([A-Za-z_][\w.-]*):[A-Za-z_]")
+_ROOT = re.compile(r"<robot\b")
 
 
 def read_urdf(path: Path) -> Model:
@@ -28,7 +41,7 @@ def read_urdf(path: Path) -> Model:
     _fill_meshes(path, spec, files)
     rewritten = rewrite_meshes(spec)
     compiled = spec.compile()
-    return Model(path, spec, compiled, is_urdf=True, mjcf=spec.to_xml(), rewritten=rewritten)
+    return Model(path, spec, compiled, is_urdf=True, mjcf=mjcf_of(spec), rewritten=rewritten)
 
 
 def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> None:
@@ -51,16 +64,14 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
 
     Mesh files are found (`package://` is looked up in the folders above the file), links on fixed joints keep their own
-    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size.
+    bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size. Geoms that have a name
+    which is taken get a number, as MuJoCo has each name once.
 
     Raises:
         RobotError: If the file is not XML, or a mesh cannot be found.
     """
-    try:
-        tree = ET.parse(path)
-    except ET.ParseError as error:
-        raise RobotError(f"{path}: not XML: {error}") from error
-    robot = tree.getroot()
+    robot = _root(path)
+    _number_names(robot)
     files: dict[str, Path] = {}
     for mesh in robot.iter("mesh"):
         file = _mesh_file(mesh.get("filename", ""), path)
@@ -71,7 +82,9 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
             number += 1
             stem = f"{file.stem}_{number}"
         mesh.set("filename", f"{stem}{file.suffix}")
-    mended = [link.get("name", "") for link in robot.iter("link") if _mend(link)]
+    joints = [joint for joint in robot.iter("joint") if joint.get("type") != "fixed"]
+    moving = {child.get("link", "") for joint in joints for child in joint.iter("child")}
+    mended = [link.get("name", "") for link in robot.iter("link") if _mend(link, moving)]
     if mended:
         warnings.warn(f"{path}: inertias that no body can have were mended: {listed(mended)}", stacklevel=5)
     settings = robot.find("mujoco")
@@ -80,6 +93,49 @@ def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     compiler = ET.SubElement(settings, "compiler") if compiler is None else compiler
     compiler.attrib |= {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "meshdir": ""}
     return ET.tostring(robot, encoding="unicode"), files
+
+
+def _root(path: Path) -> ET.Element:
+    """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out.
+
+    Raises:
+        RobotError: If the file is not XML.
+    """
+    content = path.read_bytes()
+    try:
+        root = ET.fromstring(content)
+    except ET.ParseError as error:
+        if "unbound prefix" not in str(error):
+            raise RobotError(f"{path}: not XML: {error}") from error
+        text = content.decode(errors="replace")
+        prefixes = sorted(set(_PREFIX.findall(text)) - {"xml", "xmlns"})
+        declared = "".join(f' xmlns:{prefix}="{prefix}"' for prefix in prefixes)
+        try:
+            root = ET.fromstring(_ROOT.sub(f"<robot{declared}", text, count=1))
+        except ET.ParseError:
+            raise RobotError(f"{path}: not XML: {error}") from error
+    for parent in list(root.iter()):
+        for child in [child for child in parent if isinstance(child.tag, str) and child.tag.startswith("{")]:
+            parent.remove(child)
+    return root
+
+
+def _number_names(robot: ET.Element) -> None:
+    """Give geoms whose name another has too a number: the second `pad` is `pad_2`.
+
+    Those without a name get an empty one: MuJoCo would take that of the geom before.
+    """
+    geoms = [part for link in robot.iter("link") for part in (*link.findall("collision"), *link.findall("visual"))]
+    names = {part.get("name", "") for part in geoms}
+    seen: set[str] = set()
+    for part in geoms:
+        name = own = part.get("name", "")
+        number = 1
+        while own in seen or (number > 1 and own in names):
+            number += 1
+            own = f"{name}_{number}"
+        seen |= {own} - {""}
+        part.set("name", own)
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
@@ -98,17 +154,33 @@ def _mesh_file(name: str, urdf: Path) -> Path:
     return found
 
 
-def _mend(link: ET.Element) -> bool:
-    """Replace the link's inertia if its principal moments are not positive or break the triangle inequality."""
-    inertia = link.find("inertial/inertia")
+def _mend(link: ET.Element, moving: Collection[str]) -> bool:
+    """Replace the link's inertia if its principal moments are missing, not positive or break the triangle inequality.
+
+    A moving link that has neither mass nor geometry gets `LEAST_MASS`, as MuJoCo moves nothing that weighs nothing.
+
+    Args:
+        link: The link, changed in place.
+        moving: Names of links that a joint moves.
+    """
+    inertial, inertia = link.find("inertial"), link.find("inertial/inertia")
+    if inertial is None:
+        if link.get("name") not in moving or link.find("collision") is not None or link.find("visual") is not None:
+            return False
+        inertial = ET.SubElement(link, "inertial")
+        ET.SubElement(inertial, "mass", {"value": repr(LEAST_MASS)})
     if inertia is None:
-        return False
+        inertia = ET.SubElement(inertial, "inertia")
     try:
         xx, yy, zz, xy, xz, yz = (float(inertia.get(f"i{axes}", "0")) for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
     except ValueError:
         return False  # MuJoCo will name the line
     low, middle, high = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if low > 0 and low + middle >= high * (1 - 1e-9):
+    if low > 0 and low + middle >= high * (1 + EDGE):
+        return False
+    if low > 0 and low + middle >= high * (1 - EDGE):
+        for axes, moment in zip(("xx", "yy", "zz"), (xx, yy, zz), strict=True):
+            inertia.set(f"i{axes}", repr(float(moment + 2 * EDGE * high)))
         return False
     moment = max((xx + yy + zz) / 3.0, LEAST_INERTIA)
     for axes in ("xx", "yy", "zz"):
