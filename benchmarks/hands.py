@@ -30,6 +30,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from hand_checks import check
+from PIL import Image
 
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
@@ -97,7 +98,6 @@ HANDS = {
     "robotiq_s": Hand("robosuite", f"{_SUITE}robotiq_gripper_s.xml"),
     "robotiq_140": Hand("robosuite", f"{_SUITE}robotiq_gripper_140.xml"),
     "robotiq_85": Hand("airo-models", "airo_models/grippers/robotiq_2f_85/urdf/robotiq_2f_85.urdf"),
-    "schunk_egk40": Hand("airo-models", "airo_models/grippers/schunk_egk40/urdf/schunk_egk40.urdf"),
     "panda": Hand("genesis-world", "genesis/assets/xml/franka_emika_panda/hand.xml"),
     "panda_suite": Hand("robosuite", f"{_SUITE}panda_gripper.xml"),
     "rethink": Hand("robosuite", f"{_SUITE}rethink_gripper.xml"),
@@ -211,6 +211,9 @@ class Line:
         self.picture.parent.mkdir(parents=True, exist_ok=True)
         view = Render(str(self.file), self.layout, ("med",), view="iso", size=(360, 360), out=self.picture)
         printed(view.run)
+        with Image.open(self.picture) as picture:
+            colours = picture.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE, colors=64)
+        colours.save(self.picture, optimize=True)
 
     def compile(self) -> None:
         """Write the document, with the largest ball that fits into the hand, and `tgdsl compile` it."""
