@@ -7,8 +7,8 @@ from closing_hands import INNER, MADE, arm, parallel_jaws, slides, world
 from odd_hands import FOUR_BAR
 
 from tgdsl.errors import TgdslError
-from tgdsl.formats.robot import load_model
 from tgdsl.files.find import layout_of
+from tgdsl.formats.robot import load_model
 from tgdsl.placement.links import open_robot
 from tgdsl.placement.propose.propose import closing_motion, propose
 from tgdsl.schema.load import load_layout
