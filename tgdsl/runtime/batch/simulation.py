@@ -25,10 +25,13 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.scene.options import Options
 from tgdsl.scene.scene import SceneModels
-from tgdsl.tensors.env_ids import EnvIds, env_indices
+from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 Array = np.ndarray
+_FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
+"""How far `forward` goes: all that `mj_forward` does; poses and velocities."""
 _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 
 
@@ -56,6 +59,7 @@ class BatchSimulation(Simulation):
         threads: int = 0,
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
+        options: Options | None = None,
         on_fault: OnFault = "raise",
     ):
         """Start all environments.
@@ -68,6 +72,7 @@ class BatchSimulation(Simulation):
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
             model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
                 artefact's scene. Its objects are the same in all environments.
+            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
                 them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
                 with controls that are not finite, which "raise" refuses.
@@ -78,9 +83,9 @@ class BatchSimulation(Simulation):
                 bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
                 module's state is another simulation's or of other environments.
         """
-        refuse_unfit(touch, num_envs, substeps, model)
+        refuse_unfit(touch, num_envs, substeps, model, options)
         if model is None:
-            scenes = SceneModels(touch.plan.scene)
+            scenes = SceneModels(touch.plan.scene, options)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = EnvObjects(scenes, touch.inputs, num_envs)
@@ -111,7 +116,9 @@ class BatchSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._evaluate(self._ascending(env_ids))
+        ids = self._ascending(env_ids)
+        self._start_contacts.forget(env_mask(torch.from_numpy(ids), self.num_envs, torch.device("cpu")))
+        self._evaluate(ids)
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
@@ -126,13 +133,13 @@ class BatchSimulation(Simulation):
         models = self._objects.models()
         self._run(lambda: self.batch.set_models(models))
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         ids = self._ascending(env_ids)
         if not len(ids):
             return
         self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
         self._write(ids, rows)
-        self._evaluate(ids)
+        self._evaluate(ids, _FORWARD if finds_contacts else _VELOCITIES)
         self._touch.reset(torch.from_numpy(ids))
         is_new = torch.zeros(self.num_envs, dtype=torch.bool)
         is_new[torch.from_numpy(ids)] = True
@@ -152,19 +159,18 @@ class BatchSimulation(Simulation):
         for name, values in rows.values.items():
             self._arrays[name][chosen] = values[chosen]
 
-    def _evaluate(self, ids: Int[Array, " n"]) -> None:
+    def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
         if len(ids):
-            self._run(lambda: self.batch.forward(ids))
+            self._run(lambda: self.batch.forward(ids, stage=stage))
             self._kept.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
+        self._physics_steps(num_steps - 1 if self._kept.is_wanted else num_steps)
         if self._kept.is_wanted:
-            if num_steps > 1:
-                self._run(lambda: self.batch.step(nstep=num_steps - 1))
+            self._drive()
             self._kept.keep()
-            num_steps = 1
-        self._run(lambda: self.batch.step(nstep=num_steps))
+            self._run(lambda: self.batch.step(nstep=1))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
         if not is_faulty.any():
@@ -174,6 +180,19 @@ class BatchSimulation(Simulation):
         self._begin_episodes(is_faulty, Rows({}))
         self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
+
+    def _physics_steps(self, num: int) -> None:
+        """Make physics steps: all in one call if nothing drives them."""
+        if self.drive is None and num:
+            self._run(lambda: self.batch.step(nstep=num))
+            return
+        for _ in range(num):
+            self._drive()
+            self._run(lambda: self.batch.step(nstep=1))
+
+    def _drive(self) -> None:
+        if self.drive is not None:
+            self.drive()
 
     def _state(self, dt: float) -> SceneState:
         values = self._reader.read() | self._kept.read()

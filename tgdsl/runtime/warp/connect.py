@@ -9,6 +9,7 @@ from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_o
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.source_kind import SimulatorKind
 from tgdsl.runtime.warp.simulation import WarpSimulation
+from tgdsl.scene.options import Options
 
 
 def _simulate(
@@ -19,6 +20,7 @@ def _simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -36,6 +38,7 @@ def _simulate(
         device=device,
         substeps=substeps,
         keyframe=keyframe,
+        options=options,
         on_fault=on_fault,
         nconmax=nconmax,
         njmax=njmax,

@@ -26,6 +26,7 @@ from tgdsl.runtime.warp.reading import StateReader
 from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
+from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 
@@ -66,6 +67,7 @@ class WarpSimulation(Simulation):
         nconmax: int | None = None,
         njmax: int | None = None,
         model: mujoco.MjModel | None = None,
+        options: Options | None = None,
         per_env: Sequence[str] = (),
         device: str = "cuda",
         graph: bool = True,
@@ -82,6 +84,7 @@ class WarpSimulation(Simulation):
             njmax: Capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make.
             model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
+            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
@@ -96,11 +99,11 @@ class WarpSimulation(Simulation):
                 not support, if there is nothing to step, no such device or library, or if the module's state is another
                 simulation's or of other environments.
         """
-        refuse_unfit(touch, num_envs, substeps, model)
+        refuse_unfit(touch, num_envs, substeps, model, options)
         self._touch, self.substeps = touch, substeps
         self._stream = WarpStream(device, graph)
         if model is None:
-            scenes = SharedMeshModels(touch.plan.scene)
+            scenes = SharedMeshModels(touch.plan.scene, options)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
@@ -122,10 +125,11 @@ class WarpSimulation(Simulation):
         if self._objects is not None:
             self._objects.write_to(self._worlds)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
-        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps))
-        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1))
+        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
+        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
         self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
+        self._driven = self.drive
         claim(touch, self)
         self.reset()
 
@@ -183,7 +187,9 @@ class WarpSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._stream.device))
+        mask = env_mask(env_ids, self.num_envs, self._stream.device)
+        self._start_contacts.forget(mask)
+        self._worlds.make_stale(mask)
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -213,20 +219,20 @@ class WarpSimulation(Simulation):
 
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
-        held = (self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
+        held = (self.drive, self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
         if len(held) != len(self._held) or any(now is not then for now, then in zip(held, self._held, strict=True)):
             self._step_and_read.forget()
             self._held = held
 
     def _physics_and_touch(self) -> dict[str, Tensor]:
         if not self._earlier.are_wanted:
-            self._worlds.step(self.substeps)
+            self._worlds.step(self.substeps, self.drive)
         else:
             self._earlier.begin(self.substeps)
             for i in range(self.substeps):
                 if i:
                     self._earlier.note(self._read(float(self.model.opt.timestep)))
-                self._worlds.step(1)
+                self._worlds.step(1, self.drive)
             self._earlier.restart(self._faults.restarted)
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted)
@@ -247,9 +253,9 @@ class WarpSimulation(Simulation):
         assert self._objects is not None
         self._objects.write_to(self._worlds)
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         mask = env_mask(env_ids, self.num_envs, self._stream.device)
-        self._worlds.reset(mask, rows)
+        self._worlds.reset(mask, rows, finds_contacts=finds_contacts)
         self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
     def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
@@ -257,6 +263,10 @@ class WarpSimulation(Simulation):
 
     def _advance(self, num_steps: int) -> None:
         self._worlds.prepare()
+        if self.drive is not self._driven:
+            self._driven = self.drive
+            self._step.forget()
+            self._substep.forget()
         (self._step if num_steps == self.substeps else self._substep)()
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted.to(self._touch.device))
