@@ -10,13 +10,20 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.known import known_sources
 from tgdsl.runtime.simulators.devices import checked_device
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind, keyword_options
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.options import Options
 
 _DEFAULTS = {
-    **{"substeps": 1, "threads": 0, "keyframe": None, "options": None, "on_fault": "raise"},
-    **{"nconmax": None, "njmax": None},
+    "substeps": 1,
+    "threads": 0,
+    "keyframe": None,
+    "options": None,
+    "watch": None,
+    "on_fault": "raise",
+    "nconmax": None,
+    "njmax": None,
 }
 
 
@@ -30,6 +37,7 @@ def simulate(
     threads: int = 0,
     keyframe: str | None = None,
     options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
 ) -> BatchSimulation: ...
 @overload
@@ -42,6 +50,7 @@ def simulate(
     threads: int = 0,
     keyframe: str | None = None,
     options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -55,6 +64,7 @@ def simulate(
     threads: int = 0,
     keyframe: str | None = None,
     options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -72,6 +82,7 @@ def simulate(
         keyframe: Name of the keyframe to start from.
         options: Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
             `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`; no XML is edited.
+        watch: Names of bodies, sites, joints, actuators and pairs that `sim.watched()` returns, of the instant of readings.
         on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
             until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
         nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
@@ -83,7 +94,7 @@ def simulate(
             wants.
     """
     given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
-    given |= {"options": options, "nconmax": nconmax, "njmax": njmax}
+    given |= {"options": options, "watch": watch, "nconmax": nconmax, "njmax": njmax}
     kind = _simulator_on(device)
     known = keyword_options(kind.simulate)
     if unknown := [name for name, value in given.items() if name not in known and value != _DEFAULTS[name]]:

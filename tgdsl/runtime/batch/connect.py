@@ -8,6 +8,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_only, set_control_step
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
 from tgdsl.scene.options import Options
 
@@ -20,6 +21,7 @@ def simulate_on_cpu(
     threads: int = 0,
     keyframe: str | None = None,
     options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -32,7 +34,14 @@ def simulate_on_cpu(
     if nconmax is not None or njmax is not None:
         raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
     return BatchSimulation(
-        touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, options=options, on_fault=on_fault
+        touch,
+        num_envs,
+        substeps=substeps,
+        threads=threads,
+        keyframe=keyframe,
+        options=options,
+        watch=watch,
+        on_fault=on_fault,
     )
 
 

@@ -6,6 +6,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -25,6 +26,7 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.options import Options
 from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
@@ -60,6 +62,7 @@ class BatchSimulation(Simulation):
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
         options: Options | None = None,
+        watch: Watch | None = None,
         on_fault: OnFault = "raise",
     ):
         """Start all environments.
@@ -73,15 +76,16 @@ class BatchSimulation(Simulation):
             model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
                 artefact's scene. Its objects are the same in all environments.
             options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
+            watch: What `watched` returns.
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
                 them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
                 with controls that are not finite, which "raise" refuses.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
-                bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
-                module's state is another simulation's or of other environments.
+            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, if its integrator is
+                RK4, if its bodies may sleep, if there is nothing to step, more environments than this computer has memory for,
+                or if the module's state is another simulation's or of other environments.
         """
         refuse_unfit(touch, num_envs, substeps, model, options)
         if model is None:
@@ -99,6 +103,12 @@ class BatchSimulation(Simulation):
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
+        self._keepers = [self._kept]
+        if watch is not None:
+            self._watch = WatchReader(watch, touch.inputs, self.model, torch.device("cpu"))
+            self._watch_reader = BatchReader(self._watch.inputs, self.model, self.batch)
+            self._watched_joints = KeptJoints(JointColumns.of(self._watch.inputs, self.model), self.batch)
+            self._keepers.append(self._watched_joints)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
@@ -162,14 +172,17 @@ class BatchSimulation(Simulation):
     def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
         if len(ids):
             self._run(lambda: self.batch.forward(ids, stage=stage))
-            self._kept.keep(ids)
+            for keeper in self._keepers:
+                keeper.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
-        self._physics_steps(num_steps - 1 if self._kept.is_wanted else num_steps)
-        if self._kept.is_wanted:
+        keepers = [keeper for keeper in self._keepers if keeper.is_wanted]
+        self._physics_steps(num_steps - 1 if keepers else num_steps)
+        if keepers:
             self._drive()
-            self._kept.keep()
+            for keeper in keepers:
+                keeper.keep()
             self._run(lambda: self.batch.step(nstep=1))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
@@ -199,6 +212,11 @@ class BatchSimulation(Simulation):
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
         return self._scene_state({name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}, dt)
+
+    def _read_watch(self) -> SceneState:
+        arrays = self._watch_reader.read() | self._watched_joints.read()
+        values: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        return SceneState(**values)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

@@ -27,6 +27,7 @@ from tgdsl.runtime.simulators.objects import ObjectChoices, Values
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.substep_states import SubstepStates
+from tgdsl.runtime.simulators.watch import Watched, WatchReader
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 
@@ -51,6 +52,7 @@ class Simulation(ABC):
     _faults: EnvFaults
     _table: StateTable
     _objects: ObjectChoices | None = None
+    _watch: WatchReader | None = None
     _is_closed = False
 
     @property
@@ -203,6 +205,18 @@ class Simulation(ABC):
             return self._touch(self.state())
         return self._touch(self.state(), env_mask(env_ids, self.num_envs, self._touch.device))
 
+    def watched(self) -> Watched:
+        """Return what `watch` named when the simulation was made, of the instant that `state` is of, on the physics' device.
+
+        Raises:
+            SimulationError: If nothing is watched.
+        """
+        self._refuse_if_closed()
+        if self._watch is None:
+            raise SimulationError("nothing is watched: simulate(..., watch=Watch(bodies=(...), joints=(...)))")
+        values = self._start_contacts.applied_to(self._read_watch(), is_stored=False)
+        return self._watch.watched(values, self.state() if self._watch.has_pairs else None)
+
     def reset(self, env_ids: EnvIds | None = None, *, contacts: Contacts = "evaluate", **values: Unpack[StateValues]) -> None:
         """Begin a new episode in some environments (default: all), in the simulator and in the module.
 
@@ -304,6 +318,10 @@ class Simulation(ABC):
 
     @abstractmethod
     def _state(self, dt: float) -> SceneState: ...
+
+    @abstractmethod
+    def _read_watch(self) -> SceneState:
+        """Return the fields that the watch wants."""
 
     @abstractmethod
     def _use_objects(self) -> None:

@@ -1,4 +1,4 @@
-"""Contacts of environments that a reset has placed without looking for contacts: none, or those that were stored with the start.
+"""Contacts of environments that a reset has placed without looking for any: none, or those that were stored with the start.
 
 Shapes: `env` environments.
 """
@@ -62,15 +62,20 @@ class StartContacts:
             self._values[name] = torch.where(_over(chosen, like), new, old.to(new.dtype))
         self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
 
-    def applied_to(self, state: SceneState) -> SceneState:
-        """Return a state in which placed environments have the contacts of their start."""
+    def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
+        """Return a state in which placed environments have the contacts of their start.
+
+        Args:
+            state: What the simulator has.
+            is_stored: Whether those that were stored are of this state's pairs and joints; if not, all are zero.
+        """
         if self._is_placed is None:
             return state
         values: dict[str, Any] = {}
         for name in FIELDS:
             now = getattr(state, name)
             if now is not None:
-                start = self._values.get(name)
+                start = self._values.get(name) if is_stored else None
                 value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
                 values[name] = torch.where(_over(self._is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)

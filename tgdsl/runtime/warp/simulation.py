@@ -21,6 +21,7 @@ from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
+from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
 from tgdsl.runtime.warp.reading import StateReader
 from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
@@ -68,6 +69,7 @@ class WarpSimulation(Simulation):
         njmax: int | None = None,
         model: mujoco.MjModel | None = None,
         options: Options | None = None,
+        watch: Watch | None = None,
         per_env: Sequence[str] = (),
         device: str = "cuda",
         graph: bool = True,
@@ -85,6 +87,7 @@ class WarpSimulation(Simulation):
             model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
             options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
+            watch: What `watched` returns.
             per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
@@ -95,7 +98,7 @@ class WarpSimulation(Simulation):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body or the keyframe, holds something that MuJoCo Warp does
+            SimulationError: If the model lacks a body, the keyframe or what is watched, holds something that MuJoCo Warp does
                 not support, if there is nothing to step, no such device or library, or if the module's state is another
                 simulation's or of other environments.
         """
@@ -108,9 +111,11 @@ class WarpSimulation(Simulation):
             if touch.inputs.objects:
                 self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
         self.model: mujoco.MjModel = model
+        if watch is not None:
+            self._watch = WatchReader(watch, touch.inputs, model, self._stream.device)
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
-            touch.inputs,
+            merged_joints(touch.inputs, self._watch),
             num_envs,
             self._stream,
             keyframe=keyframe_id(model, keyframe),
@@ -125,6 +130,8 @@ class WarpSimulation(Simulation):
         if self._objects is not None:
             self._objects.write_to(self._worlds)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
+        if self._watch is not None:
+            self._watch_reader = StateReader(self._watch.inputs, model, self._worlds.arrays, self._worlds.kept)
         self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
         self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
         self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
@@ -248,6 +255,11 @@ class WarpSimulation(Simulation):
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         return self._scene_state(values, dt)
+
+    def _read_watch(self) -> SceneState:
+        self._worlds.refresh()
+        values: dict[str, Any] = dict(self._watch_reader.read())
+        return SceneState(**values)
 
     def _use_objects(self) -> None:
         assert self._objects is not None
