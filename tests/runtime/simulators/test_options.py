@@ -37,7 +37,7 @@ def test_an_artefact_keeps_its_own_options(tmp_path):
 
 @BOTH
 @pytest.mark.parametrize(
-    "options, message",
+    ("options", "message"),
     [
         ({"timestp": 1}, 'MuJoCo has no option "timestp"; did you mean "timestep"?'),
         ({"cone": "eliptic"}, 'option cone is "eliptic"; did you mean "elliptic"?'),

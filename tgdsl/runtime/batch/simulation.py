@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.batch.own_fields import OwnFields
 from tgdsl.runtime.batch.reading import BatchReader
 from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
@@ -24,11 +25,11 @@ from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects import EnvObjects
+from tgdsl.runtime.simulators.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.options import Options
-from tgdsl.scene.scene import SceneModels
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 Array = np.ndarray
@@ -50,6 +51,7 @@ class BatchSimulation(Simulation):
         substeps: Physics steps per control step.
     """
 
+    properties: OwnFields
     _objects: EnvObjects | None = None
 
     def __init__(
@@ -89,7 +91,7 @@ class BatchSimulation(Simulation):
         """
         refuse_unfit(touch, num_envs, substeps, model, options)
         if model is None:
-            scenes = SceneModels(touch.plan.scene, options)
+            scenes = SharedMeshModels(touch.plan.scene, options)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = EnvObjects(scenes, touch.inputs, num_envs)
@@ -113,8 +115,9 @@ class BatchSimulation(Simulation):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
+        self.properties = OwnFields(self.batch, model, touch.inputs.bodies_of)
         if self._objects is not None:
-            self.batch.set_models(self._objects.models())
+            self.properties.use_models(np.arange(num_envs), self._objects.models())
         claim(touch, self)
         self.reset()
 
@@ -141,7 +144,7 @@ class BatchSimulation(Simulation):
     def _use_objects(self) -> None:
         assert self._objects is not None
         models = self._objects.models()
-        self._run(lambda: self.batch.set_models(models))
+        self._run(lambda: self.properties.use_models(np.arange(self.num_envs), models))
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         ids = self._ascending(env_ids)

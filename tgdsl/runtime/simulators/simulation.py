@@ -24,6 +24,7 @@ from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.objects import ObjectChoices, Values
+from tgdsl.runtime.simulators.properties import ObjectProperties
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.substep_states import SubstepStates
@@ -40,12 +41,14 @@ class Simulation(ABC):
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
         substeps: Physics steps per control step.
+        properties: Masses and frictions of objects, which environments may have of their own.
         drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: what an
             actuator does that MuJoCo's does not. It is captured with the step on a GPU, so it must not wait for it there.
     """
 
     model: mujoco.MjModel
     substeps: int
+    properties: ObjectProperties
     drive: Callable[[], None] | None = None
     _touch: TactileModule
     _arrays: Mapping[str, Tensor]

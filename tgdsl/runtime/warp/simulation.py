@@ -19,12 +19,14 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.properties import PER_ENV
+from tgdsl.runtime.simulators.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
+from tgdsl.runtime.warp.properties import WorldProperties
 from tgdsl.runtime.warp.reading import StateReader
-from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.options import Options
@@ -88,7 +90,8 @@ class WarpSimulation(Simulation):
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
             options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
             watch: What `watched` returns.
-            per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
+            per_env: What environments shall have of their own: "mass" and "friction" for `set_properties`, or fields of the
+                model by name, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
             on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step`
@@ -113,6 +116,7 @@ class WarpSimulation(Simulation):
         self.model: mujoco.MjModel = model
         if watch is not None:
             self._watch = WatchReader(watch, touch.inputs, model, self._stream.device)
+        own = list(OWN_FIELDS) if self._objects else []
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
             merged_joints(touch.inputs, self._watch),
@@ -121,10 +125,12 @@ class WarpSimulation(Simulation):
             keyframe=keyframe_id(model, keyframe),
             nconmax=nconmax,
             njmax=njmax,
-            per_env=list(dict.fromkeys([*per_env, *(OWN_FIELDS if self._objects else ())])),
+            per_env=list(dict.fromkeys([f for word in per_env for f in PER_ENV.get(word, (word,))] + own)),
             on_fault=on_fault,
         )
         self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
+        parameters, bodies_of = self._worlds.parameters, touch.inputs.bodies_of
+        self.properties = WorldProperties(parameters, model, bodies_of, num_envs, self._stream.device)
         with self._stream.scope():
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
