@@ -210,7 +210,7 @@ def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
 
 JOINT = '<body name="{0}"><joint name="{0}" range="-1 1" limited="true"/><geom size="0.1"/></body>'
 SERVO = '<position name="{0}" joint="{0}" kp="1" forcerange="-1 1"/>'
-THREE = "<mujoco><compiler angle=\"radian\"/><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>".format(
+THREE = '<mujoco><compiler angle="radian"/><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>'.format(
     "".join(JOINT.format(name) for name in "abc"), "".join(SERVO.format(name) for name in "abc")
 )
 

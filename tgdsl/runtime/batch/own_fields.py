@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, listed
-from tgdsl.runtime.simulators.properties import ObjectProperties, RigidObject
+from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject
 
 Array = np.ndarray
 _OPTION = "opt."

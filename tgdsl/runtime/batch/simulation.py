@@ -24,8 +24,8 @@ from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
 from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import keyframe_id
-from tgdsl.runtime.simulators.objects import EnvObjects
-from tgdsl.runtime.simulators.shared_meshes import SharedMeshModels
+from tgdsl.runtime.simulators.objects.choices import EnvObjects
+from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader

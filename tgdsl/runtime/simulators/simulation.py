@@ -23,8 +23,8 @@ from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
-from tgdsl.runtime.simulators.objects import ObjectChoices, Values
-from tgdsl.runtime.simulators.properties import ObjectProperties
+from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
+from tgdsl.runtime.simulators.objects.properties import ObjectProperties
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.substep_states import SubstepStates

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.simulators.properties import MASS_FIELDS, PER_ENV, ObjectProperties, RigidObject
+from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS, PER_ENV, ObjectProperties, RigidObject
 
 
 class WorldProperties(ObjectProperties):

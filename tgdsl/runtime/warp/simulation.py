@@ -19,8 +19,8 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
-from tgdsl.runtime.simulators.properties import PER_ENV
-from tgdsl.runtime.simulators.shared_meshes import SharedMeshModels
+from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints

@@ -8,7 +8,7 @@ from warp_cases import SCENE, module, warp
 
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.simulators.properties import MASS_FIELDS
+from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS
 
 OWN = ("mass", "friction")
 VARIANTS = {"variants": [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02], "density": 500}]}
