@@ -67,7 +67,7 @@ def buffers_of(module: nn.Module) -> dict[str, Tensor | None]:
 
 def held_buffers(module: nn.Module) -> dict[str, Tensor]:
     """Return a module's own buffers in a dictionary of their own, less those that are None: `named_buffers` takes longer."""
-    return {name: buffer for name, buffer in module._buffers.items() if buffer is not None}
+    return {name: buffer for name, buffer in buffers_of(module).items() if buffer is not None}
 
 
 def mark_static(tensor: Tensor) -> None:

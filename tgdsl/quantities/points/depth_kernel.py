@@ -147,7 +147,7 @@ def depth_kernel(
 
 @triton.jit
 def posed(planes, turn, offset):
-    """Return the pose of a pair: `planes` are where twelve numbers begin, `turn` and `offset` its place in nine and in three."""
+    """Return the pose of a pair: `planes` are where twelve numbers begin, `turn` and `offset` its place in them."""
     return (
         tl.load(planes[0] + turn), tl.load(planes[1] + turn), tl.load(planes[2] + turn),
         tl.load(planes[3] + turn), tl.load(planes[4] + turn), tl.load(planes[5] + turn),
