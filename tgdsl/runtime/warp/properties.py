@@ -37,7 +37,7 @@ class WorldProperties(ObjectProperties):
             device: Where physics runs.
         """
         super().__init__(model, bodies_of, num_envs, device)
-        self._parameters = parameters
+        self._fields = parameters
         self._indices: dict[tuple[str, str], Tensor] = {}
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
@@ -45,7 +45,7 @@ class WorldProperties(ObjectProperties):
         if not target.is_tree:
             what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
             raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
-        own, inertia, subtree, body, dof = (self._parameters[name] for name in MASS_FIELDS)
+        own, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
         bodies, above, dofs = (self._index(target, name, own.device) for name in ("bodies", "above", "dofs"))
         before = own[:, bodies].sum(dim=1)
         factor = torch.where(mask, mass.to(own.dtype) / before, 1.0)[:, None]
@@ -57,22 +57,22 @@ class WorldProperties(ObjectProperties):
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         self._check("friction")
-        own = self._parameters["geom_friction"]
+        own = self._fields["geom_friction"]
         geoms = self._index(target, "geoms", own.device)
         own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
 
     def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
         self._check("mass")
-        own = self._parameters["body_mass"]
+        own = self._fields["body_mass"]
         return own[:, self._index(target, "bodies", own.device)].sum(dim=1)
 
     def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
         self._check("friction")
-        own = self._parameters["geom_friction"]
+        own = self._fields["geom_friction"]
         return own[:, self._index(target, "geoms", own.device), 0].amax(dim=1)
 
     def _check(self, word: str) -> None:
-        if not self._parameters.keys() >= set(PER_ENV[word]):
+        if not self._fields.keys() >= set(PER_ENV[word]):
             raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')
 
     def _index(self, target: RigidObject, name: str, device: torch.device) -> Tensor:
