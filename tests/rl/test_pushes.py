@@ -1,0 +1,109 @@
+"""Pushes: a free ball gains F Δt / m, intervals and forces are those drawn, and only chosen environments begin anew."""
+
+import numpy as np
+import pytest
+import torch
+from warp_cases import warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.pushes import Pushes, PushSpec
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
+BALL = """
+<mujoco>
+  <option timestep="0.005" gravity="0 0 0" integrator="implicitfast"/>
+  <worldbody>
+    <body name="pad" pos="5 0 0"><geom size=".01"/></body>
+    <body name="ball"><freejoint/><geom size=".02" mass=".4"/></body>
+  </worldbody>
+</mujoco>
+"""
+STEP = 0.025
+PAPER = PushSpec(x=(-1, 1), y=(-1, 1), z=(-5, 0))
+
+
+def arrays(num_envs: int) -> dict[str, torch.Tensor]:
+    return {"xfrc_applied": torch.zeros(num_envs, 3, 6, dtype=torch.float64)}
+
+
+def begun(spec=PAPER, num_envs=1, seed=0, first_env=0, episode=1):
+    own = arrays(num_envs)
+    pushes = Pushes(spec, own, 2, STEP, Draws(seed, num_envs, first_env=first_env))
+    pushes.reset(torch.ones(num_envs, dtype=torch.bool), torch.full((num_envs,), episode))
+    return pushes, own["xfrc_applied"]
+
+
+@BOTH
+@pytest.mark.parametrize(("duration", "steps"), [(0.025, 1), (0.06, 3)])
+def test_a_free_ball_gains_force_times_time_over_mass(tmp_path, simulator, duration, steps):
+    (tmp_path / "ball.xml").write_text(BALL)
+    points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1]}], "radius": 0.005}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "ball.xml"), "layout": {"resolutions": {"only": {"pad": points}}}},
+        "objects": {"ball": {"body": "ball"}},
+        "sensors": {"touch": {"kind": "contact_depth", "links": "pad", "feels": ["ball"], "gate": "geometric"}},
+    }
+    sim = simulator(tgdsl.compile(document), 2, substeps=5)
+    spec = PushSpec(x=(0.2, 0.2), y=(-0.3, 0.3), interval=(0.1, 0.1), duration=duration)
+    pushes = Pushes(spec, sim._arrays, sim.model.body("ball").id, sim.control_step, Draws(0, 2))
+    pushes.reset(torch.tensor([True, True]), torch.tensor([1, 1]))
+    gained, forces = np.zeros((2, 3)), set()
+    for _ in range(2 * (4 + steps)):
+        pushes.advance()
+        gained += pushes.force.numpy() * STEP / 0.4
+        forces |= {round(float(f), 6) for f in pushes.force[:, 1]}
+        sim.step()
+    assert len(forces - {0.0}) == 4  # two pushes of two environments
+    np.testing.assert_allclose(gained[:, 0], 2 * steps * 0.2 * STEP / 0.4, rtol=1e-6)
+    np.testing.assert_allclose(sim.qvel[:, :3], gained, rtol=1e-5, atol=1e-7)
+
+
+def test_intervals_and_forces_are_uniform_in_their_ranges():
+    num, pushes, applied = 4000, *begun(num_envs=4000)
+    waits, forces, since = [], [], np.zeros(num)
+    for _ in range(500):
+        pushes.advance()
+        is_pushed = pushes.force.any(dim=1).numpy()
+        assert torch.equal(applied[:, 2, :3], pushes.force) and not applied[:, :2].any() and not applied[:, 2, 3:].any()
+        since += 1
+        waits += since[is_pushed].tolist()
+        forces += pushes.force[torch.from_numpy(is_pushed)].tolist()
+        since[is_pushed] = -1  # the push itself takes a step
+    first = np.array(waits[:num])
+    assert first.min() == 80 and first.max() == 160
+    assert abs(first.mean() - 120) < 5 * np.sqrt((81**2 - 1) / 12 / num)
+    found = np.array(forces)
+    for axis, (low, high) in enumerate((PAPER.x, PAPER.y, PAPER.z)):
+        assert low <= found[:, axis].min() and found[:, axis].max() <= high
+        assert abs(found[:, axis].mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * len(found))
+    assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 5 / np.sqrt(len(found))
+
+
+def test_pushes_are_the_same_for_64_environments_as_for_twice_32():
+    whole, halves = begun(num_envs=64)[0], [begun(num_envs=32, first_env=first)[0] for first in (0, 32)]
+    for _ in range(400):
+        for pushes in (whole, *halves):
+            pushes.advance()
+        assert torch.equal(whole.force, torch.cat([half.force for half in halves]))
+
+
+def test_only_chosen_environments_begin_anew():
+    pushes, applied = begun(PushSpec(x=(1, 1), interval=(0.05, 0.05), duration=10.0), num_envs=3)
+    for _ in range(2):
+        pushes.advance()
+    assert pushes.force[:, 0].tolist() == [1, 1, 1]
+    pushes.reset(torch.tensor([False, True, False]), torch.tensor([1, 2, 1]))
+    assert pushes.force[:, 0].tolist() == applied[:, 2, 0].tolist() == [1, 0, 1]
+    pushes.advance()
+    pushes.advance()
+    assert pushes.force[:, 0].tolist() == [1, 1, 1]
+
+
+def test_what_cannot_be_is_named():
+    with pytest.raises(SimulationError, match=r"pushes every 0.01 s, more often than control steps of 0.025 s"):
+        begun(PushSpec(x=(1.0, 1.0), interval=(0.01, 1.0)))
+    assert PushSpec().is_off and not PAPER.is_off
