@@ -9,7 +9,8 @@ custom attributes named `tgdsl:`, in SI units and radians:
 - a joint's spring, a ball joint's range, a body's `gravcomp`;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
 
-Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe).
+Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe);
+equality constraints are joints and couplings, as far as there are schemas for them: see `equalities.py`.
 Textures stay behind.
 """
 
@@ -28,6 +29,7 @@ from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
 from tgdsl.formats.usd.export.actuators import add_actuators, add_keyframes, add_tendons
+from tgdsl.formats.usd.export.equalities import add_equalities
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
 from tgdsl.formats.usd.export.joints import FREE, add_drives, add_joint, joint_of
 from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
@@ -133,7 +135,9 @@ def _add_joints(writer: StageWriter, scope: str) -> None:
         elif joint >= 0:
             set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
     add_keyframes(writer, scope)
-    add_actuators(writer, add_drives(writer, moving), scope, moving, add_tendons(writer, scope, moving))
+    tendons = add_tendons(writer, scope, moving)
+    add_equalities(writer, scope, moving, tendons)
+    add_actuators(writer, add_drives(writer, moving), scope, moving, tendons)
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
@@ -178,7 +182,6 @@ def _unsupported_elements(writer: StageWriter) -> list[str]:
     model = writer.model
     polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.tendon_stiffnesspoly, model.tendon_dampingpoly)
     counts = {
-        "equality constraints": model.neq,
         "contact pairs": model.npair,
         "sensors": model.nsensor,
         "cameras": model.ncam,
