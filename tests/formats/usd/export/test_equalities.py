@@ -156,13 +156,18 @@ def test_an_edit_of_the_stage_counts(tmp_path):
     np.testing.assert_allclose(model.equality("pin").data[:3], [0.04, 0, 0], atol=1e-8)
 
 
-CLOTH = "<flexcomp name='cloth' type='grid' dim='2' count='3 3 1' spacing='.1 .1 .1' radius='.01' mass='1'><edge equality='true'/></flexcomp>"
+FLEX = (
+    "<body name='a'><joint/><geom size='.1'/></body><body name='b' pos='1 0 0'><joint/><geom size='.1'/></body></worldbody>"
+    "<deformable><flex name='rope' dim='1' body='a b' vertex='0 0 0 0 0 0' element='0 1' radius='.01'/></deformable>"
+    "<equality><flex name='taut' flex='rope'/></equality><worldbody>"
+)
 
 
 def test_constraints_of_flexes_are_named(tmp_path):
-    (tmp_path / "robot.xml").write_text(world_of(f"<body name='a'>{CLOTH}</body>"))
-    with pytest.warns(UserWarning, match="equality constraint .* of a flex, which USD does not have: left out") as caught:
-        try:
-            export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
-        finally:
-            assert caught is not None
+    (tmp_path / "robot.xml").write_text(world_of(FLEX))
+    with pytest.warns(UserWarning) as caught:
+        export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
+    assert [str(warning.message) for warning in caught] == [
+        f"{tmp_path / 'robot.xml'}: {what} left out"
+        for what in ('equality constraint "taut" is of a flex, which USD does not have:', "USD holds no flexes: 1")
+    ]

@@ -6,7 +6,7 @@ custom attributes named `tgdsl:`, in SI units and radians:
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
-- a joint's spring, a ball joint's range, a body's `gravcomp`;
+- a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
 
 Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe);
@@ -117,7 +117,10 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
     set_number(mass.CreateMassAttr(), model.body_mass[body])
     set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
-        return  # of a body that has none, USD wants neither the moments nor their axes
+        # Of a body that has none, USD wants neither the moments nor their axes, and makes both, or its mass, of its colliders.
+        own = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
+        set_custom(prim, "inertial", [float(value) for value in own])
+        return
     set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
