@@ -19,8 +19,8 @@ Where MuJoCo leaves a choice:
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
   of two, and its own default where no material is bound. `newton:contactStiffness` and `contactDamping` are not read: they are
   a force per distance, MuJoCo's `solref` is per effective mass.
-- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites; one that
-  `export` wrote is again between the bodies that it had.
+- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites;
+  one that `export` wrote is again between the bodies that it had.
 - Whether a parent and its child collide is what their joint says; where it says nothing and the scene has MjcSceneAPI,
   MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.

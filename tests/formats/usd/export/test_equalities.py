@@ -165,7 +165,7 @@ FLEX = (
 
 def test_constraints_of_flexes_are_named(tmp_path):
     (tmp_path / "robot.xml").write_text(world_of(FLEX))
-    with pytest.warns(UserWarning) as caught:
+    with pytest.warns(UserWarning, match="left out") as caught:
         export_model(tmp_path / "robot.xml", tmp_path / "robot.usda")
     assert [str(warning.message) for warning in caught] == [
         f"{tmp_path / 'robot.xml'}: {what} left out"

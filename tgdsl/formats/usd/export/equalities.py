@@ -1,7 +1,7 @@
 """Equality constraints, each as what USD and the schemas of MuJoCo and Newton have for it.
 
-- `connect` and `weld`: a spherical or fixed joint outside of the articulation, with MjcEqualityConnectAPI or MjcEqualityWeldAPI;
-  it joins the bodies, or the sites, that the constraint names.
+- `connect` and `weld`: a spherical or fixed joint outside of the articulation, with MjcEqualityConnectAPI or
+  MjcEqualityWeldAPI; it joins the bodies, or the sites, that the constraint names.
 - A joint that follows another: NewtonMimicAPI and MjcEqualityJointAPI on the follower, in USD's positions, which are MuJoCo's:
   MJCF counts both positions from `qpos0`.
 - What has no schema is a Scope that only tgdsl reads, MJCF's values in custom attributes: constraints of tendons, of a joint

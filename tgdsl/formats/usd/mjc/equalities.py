@@ -1,6 +1,6 @@
-"""Equality constraints of MuJoCo: joints that follow another (NewtonMimicAPI, MjcEqualityJointAPI), and those that `export` wrote.
+"""Equality constraints: joints that follow another (NewtonMimicAPI, MjcEqualityJointAPI), and those that `export` wrote.
 
-How those are written, and the attributes `tgdsl:equality` and `equality_name`, see `export/equalities.py`.
+How these are written, and the attributes `tgdsl:equality` and `equality_name`, see `export/equalities.py`.
 """
 
 from __future__ import annotations
