@@ -63,9 +63,17 @@ WATER = 1000.0
 PLACEHOLDER = 0.01
 """Radius of the ball that a new body has until it is given its own geoms [m]."""
 PLAIN: dict[str, tuple[float, ...]] = {
-    **{"contype": (1,), "conaffinity": (1,), "condim": (3,), "priority": (0,), "friction": (1, 0.005, 0.0001)},
-    **{"solmix": (1,), "solref": (0.02, 1), "solimp": (0.9, 0.95, 0.001, 0.5, 2), "margin": (0,), "gap": (0,)},
-    **{"rgba": (0.5, 0.5, 0.5, 1)},
+    "contype": (1,),
+    "conaffinity": (1,),
+    "condim": (3,),
+    "priority": (0,),
+    "friction": (1, 0.005, 0.0001),
+    "solmix": (1,),
+    "solref": (0.02, 1),
+    "solimp": (0.9, 0.95, 0.001, 0.5, 2),
+    "margin": (0,),
+    "gap": (0,),
+    "rgba": (0.5, 0.5, 0.5, 1),
 }
 """MuJoCo's own contact parameters: those of a scene's `<default>` are for the scene's geoms."""
 INERTIAL = {"pos": (0.0, 0.0, 0.0), "mass": (1.0,), "diaginertia": (1.0, 1.0, 1.0)}
