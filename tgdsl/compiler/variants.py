@@ -122,11 +122,9 @@ def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
         if new.is_free:
             ET.SubElement(body, "freejoint", {"align": "false"})
         ET.SubElement(body, "inertial", {name: " ".join(map(repr, value)) for name, value in INERTIAL.items()})
-        shown = {
-            name: " ".join(map(repr, value)) for name, value in (PLAIN | {"group": (new.group,), "density": (WATER,)}).items()
-        }
-        named = {"name": placeholder_name(new.name), "type": "sphere", "size": repr(PLACEHOLDER)}
-        ET.SubElement(body, "geom", named | shown)
+        numbers = PLAIN | {"size": (PLACEHOLDER, 0, 0), "group": (new.group,), "density": (WATER,)}
+        shown = {name: " ".join(map(repr, value)) for name, value in numbers.items()}
+        ET.SubElement(body, "geom", {"name": placeholder_name(new.name), "type": "sphere"} | shown)
     return world
 
 
