@@ -36,7 +36,7 @@ from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
 from tgdsl.commands.export_usd import ExportUsd
 from tgdsl.commands.import_ import Import
-from tgdsl.commands.layout import Layout
+from tgdsl.commands.layout.new import New
 from tgdsl.commands.links import Links
 from tgdsl.commands.render import Render
 from tgdsl.commands.run import Run
@@ -195,7 +195,7 @@ class Line:
 
     def layout_new(self) -> None:
         """`tgdsl layout new`, and what it proposed."""
-        printed(Layout("new", str(self.file), density=DENSITY, out=self.layout, force=True).run)
+        printed(New(str(self.file), density=DENSITY, out=self.layout, force=True).run)
         _, by_resolution = layouts(self._robot())
         self.row.taxels = {name: layout.num_taxels for name, layout in by_resolution.items()}
         self.med = by_resolution["med"]

@@ -142,15 +142,7 @@ def _check_variants(variant: Tensor, inputs: Inputs) -> None:
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
     """Return the shape that a field has for a module, after the leading `env`."""
-    sizes = {
-        "body": len(inputs.bodies),
-        "pair": len(inputs.pairs),
-        "slot": inputs.slots,
-        "object": len(inputs.objects),
-        "joint": len(inputs.joints),
-        "actuator": len(inputs.actuators),
-    }
-    return tuple(sizes[part] if isinstance(part, str) else part for part in SHAPES[name])
+    return tuple([inputs.sizes[part] if isinstance(part, str) else part for part in SHAPES[name]])
 
 
 def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device) -> Tensor:

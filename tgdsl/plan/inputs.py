@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 from tgdsl.console.tables import listing, spelled
@@ -58,6 +59,18 @@ class Inputs:
     contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
     link_parts: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
     substeps: int = 1
+
+    @cached_property
+    def sizes(self) -> Mapping[str, int]:
+        """How many there are along each named axis of the fields."""
+        return {
+            "body": len(self.bodies),
+            "pair": len(self.pairs),
+            "slot": self.slots,
+            "object": len(self.objects),
+            "joint": len(self.joints),
+            "actuator": len(self.actuators),
+        }
 
     def parts_of(self, name: str) -> tuple[ContactPart, ...]:
         """Return the geoms whose contacts are an object's; no geom is in two of its parts."""

@@ -45,8 +45,10 @@ class Constants(HookedModule):
     @property
     def dtype(self) -> torch.dtype:
         """Dtype of the floats, or what it would be if there are none."""
-        floats = (b.dtype for b in buffers_of(self).values() if b is not None and b.is_floating_point())
-        return next(floats, self._like.dtype)
+        for buffer in buffers_of(self).values():
+            if buffer is not None and buffer.is_floating_point():
+                return buffer.dtype
+        return self._like.dtype
 
     @property
     def device(self) -> torch.device:

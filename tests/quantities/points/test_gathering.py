@@ -15,8 +15,8 @@ SCENE = """<mujoco><worldbody>
 
 
 @pytest.mark.parametrize("gate", ["contact_pair", "geometric"])
-def test_all_planes_of_a_pose_have_the_same_strides(tmp_path, gate):
-    """A kernel steps through the twelve planes by the strides of the first."""
+def test_planes_of_a_rotation_and_of_an_offset_have_the_same_strides(tmp_path, gate):
+    """A kernel steps through the nine and the three planes by the strides of the first of each."""
     (tmp_path / "scene.xml").write_text(SCENE)
     points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1], "radius": 0.004}]}
     document = {
@@ -32,5 +32,5 @@ def test_all_planes_of_a_pose_have_the_same_strides(tmp_path, gate):
     tensors = {name: getattr(state, name) for name in touch.inputs.fields if name != "dt"}
     scene = scene_of(touch.plan, touch.constants.tree, tensors, {}, {}, torch.float32)
     ((own,),) = [found.values() for found in POINTS.gather(touch.constants.tree["quantities"]["points"], scene)]
-    strides = {part.stride() for part in (*own.pairs.rotation, *own.pairs.offset)}
-    assert len(strides) == 1 and (own.pairs.gate is not None) == (gate == "contact_pair")
+    strides = [{part.stride() for part in parts} for parts in (own.pairs.rotation, own.pairs.offset)]
+    assert [len(found) for found in strides] == [1, 1] and (own.pairs.gate is not None) == (gate == "contact_pair")

@@ -17,7 +17,7 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.base import UNTIMED, Context
 from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
-from tgdsl.tensors.torch_internals import HookedModule
+from tgdsl.tensors.torch_internals import HookedModule, held_buffers
 
 _INT64 = 2**63
 """First number beyond an int64."""
@@ -107,7 +107,7 @@ class Clock(HookedModule):
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what `nows` and `after` want, by name."""
-        return {f"clock/{name}": buffer for name, buffer in self.named_buffers(recurse=False)}
+        return {f"clock/{name}": buffer for name, buffer in held_buffers(self).items()}
 
     def nows(self, memory: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Now]:
         """Return when each sensor that wants to know is read, by its name.

@@ -17,7 +17,7 @@ from tgdsl.errors import StateError, listed
 from tgdsl.module.memory.clock import Clock
 from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
 from tgdsl.tensors.fusion import materialised
-from tgdsl.tensors.torch_internals import HookedModule, num_writes
+from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
 WINDOW, KEPT = "history/", "kept/"
 """Buffers `history/<reading>` (env, step, channel, row), its last calls; `kept/<reading>`, the last one."""
@@ -52,8 +52,10 @@ class Memory(HookedModule):
     @property
     def num_envs(self) -> int | None:
         """Number of environments whose state is held; None before the first call."""
-        held = (buffer for name, buffer in self.named_buffers(recurse=False) if not name.startswith(KEPT))
-        return next((len(buffer) for buffer in held), self.clock.num_envs)
+        for name, buffer in held_buffers(self).items():
+            if not name.startswith(KEPT):
+                return buffer.shape[0]
+        return self.clock.num_envs
 
     def tensors(self, num_envs: int, dt: float | None, dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
         """Return all buffers by name; at the first call they are allocated, as ordinary tensors even under `inference_mode`.
@@ -75,7 +77,7 @@ class Memory(HookedModule):
                 if self.clock.is_wanted:
                     calls = max((_calls(part, dt)[0] for _, part in self._rings.values()), default=0)
                     self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
-        held = dict(self.named_buffers(recurse=False))
+        held = held_buffers(self)
         for path, (sensor, planned) in self._rings.items():
             if _calls(planned, dt)[0] > held[path].shape[1]:
                 what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
@@ -85,7 +87,7 @@ class Memory(HookedModule):
     @property
     def num_kept(self) -> int | None:
         """Number of environments whose last readings are kept; None if none are."""
-        return next((len(buffer) for name, buffer in self.named_buffers(recurse=False) if name.startswith(KEPT)), None)
+        return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
 
     def note_last(self, readings: Mapping[str, Tensor]) -> None:
         """Note what is handed out, (env, row, channel), where it lies; nothing to do once it is kept."""

@@ -1,10 +1,10 @@
-"""Points of a surface on the lines of three fixed lattices, so that where they are drawn does not hang on how it is meshed.
+"""Points of a surface on the lines of three fixed lattices, so that where they are drawn does not depend on its triangles.
 
 Each of the three families of lines runs along one axis of the body frame and has one line in each square of a lattice of some
 pitch h that is fixed in space; where in its square a line runs is a hash of the seed, the axis and the square's integer
 coordinates. A point is where a line passes through a face. So two of its three coordinates, and its priority, are the same bits
 whatever the order of faces, the numbers of vertices or the triangles that a flat face is cut into, and when vertices move by δ
-the third moves by δ over the cosine of line and normal: no point hangs on any other one, nor on how many there are.
+the third moves by δ over the cosine of line and normal: no point depends on any other one, nor on how many there are.
 
 Lines count where they meet a face steeply, |n_a| ≥ 0.37 for the unit normal n and the axis a: one family always does, and of
 one that grazes a face no point is where it seems. A face is met by |n_a| / h² lines of family a per area, and a point counts

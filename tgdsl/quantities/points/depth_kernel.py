@@ -91,8 +91,8 @@ def launch(
 
     Args:
         run: The kernel.
-        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: twelve planes
-            that lie in memory alike.
+        pose: Rotation from each pair's link into the object's frame, row by row, and the link's origin there [m]: nine planes
+            that lie in memory alike, and three.
         gate: Negative where a pair may not be felt.
         pair: Index of each link's pair.
         points: Places in the object's frame [m].
@@ -106,7 +106,7 @@ def launch(
     points, gates = points.contiguous(), pose[0] if gate is None else gate
     run[(num_envs * num_links,)](
         found, *pose, gates, pair, points, frames.contiguous(), counts.contiguous(), values,
-        num_links, num_points, *pose[0].stride(), *gates.stride(), points.stride(0),
+        num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
         IS_GATED=gate is not None, IS_CUBIC=is_cubic, BLOCK=BLOCK, num_warps=1,
     )  # fmt: skip
@@ -116,13 +116,14 @@ def launch(
 @triton.jit
 def depth_kernel(
     found, xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values,
-    num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
+    num_links, num_points, turn_env, turn_pair, offset_env, offset_pair, gate_env, gate_pair, point_axis, point_env,
     IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write what all points are to one link of one environment; see `launch`."""
     env, link = (tl.program_id(0) // num_links).to(tl.int64), tl.program_id(0) % num_links
     pair = tl.load(pairs + link)
-    pose = posed((xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz), env * pose_env + pair * pose_pair)
+    planes = xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz
+    pose = posed(planes, env * turn_env + pair * turn_pair, env * offset_env + pair * offset_pair)
     is_open = is_felt(gates, env * gate_env + pair * gate_pair, IS_GATED)
     grid = surface(frames, counts, values, link)
     points += env * point_env
@@ -145,12 +146,13 @@ def depth_kernel(
 
 
 @triton.jit
-def posed(planes, at):
-    """Return the pose of a pair, rotation and then offset: `planes` are where twelve numbers begin, `at` the pair's place."""
+def posed(planes, turn, offset):
+    """Return the pose of a pair: `planes` are where twelve numbers begin, `turn` and `offset` its place in them."""
     return (
-        tl.load(planes[0] + at), tl.load(planes[1] + at), tl.load(planes[2] + at), tl.load(planes[3] + at),
-        tl.load(planes[4] + at), tl.load(planes[5] + at), tl.load(planes[6] + at), tl.load(planes[7] + at),
-        tl.load(planes[8] + at), tl.load(planes[9] + at), tl.load(planes[10] + at), tl.load(planes[11] + at),
+        tl.load(planes[0] + turn), tl.load(planes[1] + turn), tl.load(planes[2] + turn),
+        tl.load(planes[3] + turn), tl.load(planes[4] + turn), tl.load(planes[5] + turn),
+        tl.load(planes[6] + turn), tl.load(planes[7] + turn), tl.load(planes[8] + turn),
+        tl.load(planes[9] + offset), tl.load(planes[10] + offset), tl.load(planes[11] + offset),
     )  # fmt: skip
 
 

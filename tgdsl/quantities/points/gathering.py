@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from tgdsl.geometry import planes
@@ -42,6 +41,4 @@ def _with_lost(pairs: Pairs) -> Pairs:
     if pairs.gate is None:
         return pairs
     lost = pairs.gate.clamp(min=0.0)  # zero where it is a number
-    # Stacked, as kernels want all planes of a pose to lie in memory alike.
-    parts = torch.stack([*pairs.rotation, *(part + lost for part in pairs.offset)], dim=1).unbind(1)
-    return pairs._replace(rotation=planes.rot(parts[:9]), offset=planes.vec(parts[9:]))
+    return pairs._replace(offset=planes.vec(part + lost for part in pairs.offset))

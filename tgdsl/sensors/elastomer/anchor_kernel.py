@@ -100,7 +100,7 @@ def launch(
     run[(num_envs * num_links,)](
         found, num_active, *state, standoff, enter, exit, slip[0] if slip else standoff, *pose, gates, pair, points,
         frames.contiguous(), counts.contiguous(), values, first, state[0].stride(0),
-        num_links, num_points, *pose[0].stride(), *gates.stride(), points.stride(0),
+        num_links, num_points, *pose[0].stride(), *pose[9].stride(), *gates.stride(), points.stride(0),
         points.stride(1) if points.shape[1] != 1 else 0,
         SLIDES=len(slip) > 0, IS_GATED=gate is not None, IS_CUBIC=is_cubic, LANES=LANES,
         CHUNK=min(max(triton.next_power_of_2(num_points), LANES), CHUNK), num_warps=1, maxnreg=REGISTERS,
@@ -119,7 +119,7 @@ def _empty(pose: list[Tensor], pair: Tensor, points: Tensor) -> tuple[Tensor, Te
 def anchor_kernel(
     found, num_active, anchor_x, anchor_y, anchor_z, held, standoff, enter, exit, slip,
     xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz, gates, pairs, points, frames, counts, values, first, state_env,
-    num_links, num_points, pose_env, pose_pair, gate_env, gate_pair, point_axis, point_env,
+    num_links, num_points, turn_env, turn_pair, offset_env, offset_pair, gate_env, gate_pair, point_axis, point_env,
     SLIDES: tl.constexpr, IS_GATED: tl.constexpr, IS_CUBIC: tl.constexpr, LANES: tl.constexpr, CHUNK: tl.constexpr,
 ):  # fmt: skip
     """Advance all points on one link of one environment; see `launch`."""
@@ -131,7 +131,8 @@ def anchor_kernel(
     found += row * num_points
     plane = tl.num_programs(0).to(tl.int64) * num_points
     pair = tl.load(pairs + link)
-    pose = posed((xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz), env * pose_env + pair * pose_pair)
+    planes = xx, xy, xz, yx, yy, yz, zx, zy, zz, ox, oy, oz
+    pose = posed(planes, env * turn_env + pair * turn_pair, env * offset_env + pair * offset_pair)
     is_open = is_felt(gates, env * gate_env + pair * gate_pair, IS_GATED)
     lost = _lost(pose)
 
