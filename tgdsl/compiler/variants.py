@@ -94,7 +94,7 @@ def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
         body.explicitinertial, body.mass, body.inertia, body.ipos = True, 1.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
         geom = body.add_geom(name=placeholder_name(new.name), type=mujoco.mjtGeom.mjGEOM_SPHERE)
         for name, value in PLAIN.items():
-            setattr(geom, name, value if len(value) > 1 else value[0])
+            setattr(geom, name, value if len(value) > 1 else next(iter(value)))
         geom.size, geom.group, geom.density = [PLACEHOLDER, 0, 0], new.group, WATER
         if new.is_free:
             body.add_freejoint().align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
