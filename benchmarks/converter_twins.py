@@ -31,10 +31,14 @@ import mujoco
 import numpy as np
 import tyro
 
+from tgdsl.compiler.pipeline import placed
 from tgdsl.formats.robot import load_model
+from tgdsl.placement.propose.text import new_layout
 
 DEPTH, FORCE, MEAN = 1e-6, 0.01, 0.02
 """Limits: depth [m], relative force at a state, relative mean force of a run."""
+PLACE, ROWS = 1e-6, 0.99
+"""Distance [m] up to which two taxels are at the same place, and the share of those that must be."""
 SAME = 1e-5
 """Relative difference of parameters, most of which USD keeps in float32."""
 STATES, STEPS = 200, 500
@@ -272,6 +276,25 @@ def over_a_run(twins: Twins) -> Iterator[tuple[str, str, bool]]:
         yield f"mean {name} over {STEPS} steps", f"{a:.4f} {b:.4f}, {off:.1e}", off <= MEAN
 
 
+def taxels(mjcf: Path, usd: Path, folder: Path) -> Iterator[tuple[str, str, bool]]:
+    """Yield how many rows of taxels are at the same place: of a layout proposed for the first, sampled on both."""
+    layout = folder / "layout.yaml"
+    new_layout(load_model(mjcf), "4/cm2", True, layout, True)
+    rows = []
+    for robot in (mjcf, usd):
+        found = placed({"tgdsl": 1, "robot": {"model": str(robot), "layout": str(layout)}}, resolutions=["med"]).layouts["med"]
+        names = [plain(link.name) for link in found.links]
+        rows.append({name: found.pos[found.link_id == i] for i, name in enumerate(names)})
+    first, second = rows
+    same = sum(
+        int((np.linalg.norm(a - b, axis=1) <= PLACE).sum())
+        for name in first.keys() & second.keys()
+        for a, b in [(first[name][: len(second[name])], second[name][: len(first[name])])]
+    )
+    total = max(sum(map(len, own.values())) for own in rows)
+    yield f"taxels of {total} within {PLACE * 1e6:g} µm", f"{same / total:.1%}", same / total >= ROWS
+
+
 def without_losses(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Return a model without what the converter does not write; print what that is."""
     colliding = [geom for geom in spec.geoms if geom.contype or geom.conaffinity]
@@ -326,12 +349,13 @@ def main(options: Compare) -> int:
             subprocess.run([options.converter, str(with_mesh_paths(options.mjcf, folder)), str(folder / "usd")], check=True)
             usd = next((folder / "usd").glob("*.usd*"))
         model, two = load_model(options.mjcf), load_model(usd).compiled
-    one = without_losses(model.spec) if options.losses else model.compiled
-    twins = twins_of(one, two)
-    wrong = 0
-    for name, shown, is_same in (*differences(twins), *at_states(twins, options.seed), *over_a_run(twins)):
-        wrong += not is_same
-        print(f"{'    ' if is_same else 'OFF '}{name}: {shown}")
+        one = without_losses(model.spec) if options.losses else model.compiled
+        twins = twins_of(one, two)
+        states = (*differences(twins), *at_states(twins, options.seed), *over_a_run(twins))
+        wrong = 0
+        for name, shown, is_same in (*states, *taxels(options.mjcf, usd, folder)):
+            wrong += not is_same
+            print(f"{'    ' if is_same else 'OFF '}{name}: {shown}")
     print(f"{options.mjcf.name}: {wrong} quantities differ")
     return wrong
 

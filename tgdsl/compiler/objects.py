@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Set
 from dataclasses import replace
 
+import mujoco
+
 from tgdsl.compiler.sensed import sensed_object
 from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, variant_scenes, with_bodies
 from tgdsl.errors import did_you_mean
@@ -54,14 +56,17 @@ def _others(loaded: Loaded, body: str) -> set[str]:
 
 
 def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
-    new = []
+    compiler, new = scene.spec.compiler, []
+    is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    low = int(compiler.inertiagrouprange[0])
+    group = low if is_forced and low > 0 else 0
     for name, target in loaded.spec.objects.items():
         if target.body is None and name in scene.bodies:
             what = f'the scene has a body "{name}" already'
             loaded.problems.append(loaded.problem(("objects", name), what, f"`body: {name}` gives that one these geoms"))
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
-            new.append(NewBody(name, pos, quat, target.joint != "fixed"))
+            new.append(NewBody(name, pos, quat, target.joint != "fixed", group))
     return tuple(new)
 
 

@@ -16,7 +16,7 @@ from tgdsl.formats.model import Model
 from tgdsl.plan.scene import Asset, SceneGeom, SceneObject
 from tgdsl.quantities.geoms.baking import aligned
 from tgdsl.scene.mujoco_warnings import muted_mujoco, told_of
-from tgdsl.scene.scene import Choice, geom_name, portable, readable, with_choices
+from tgdsl.scene.scene import Choice, geom_name, placeholder_name, portable, readable, with_choices
 from tgdsl.schema.objects import MeshGeom, ObjectSpec, PrimitiveGeom
 
 Report = Callable[[tuple[str | int, ...], str, str], None]
@@ -48,16 +48,36 @@ class NewBody:
         pos: Where it starts, in the world [m].
         quat: How it is turned there, w, x, y, z.
         is_free: Whether it moves freely, or is fixed to the world.
+        group: Of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms.
     """
 
     name: str
     pos: tuple[float, float, float]
     quat: tuple[float, float, float, float]
     is_free: bool
+    group: int = 0
 
 
+WATER = 1000.0
+"""MuJoCo's density of geoms [kg/m³]."""
 PLACEHOLDER = 0.01
 """Radius of the ball that a new body has until it is given its own geoms [m]."""
+PLAIN: dict[str, tuple[float, ...]] = {
+    "contype": (1,),
+    "conaffinity": (1,),
+    "condim": (3,),
+    "priority": (0,),
+    "friction": (1, 0.005, 0.0001),
+    "solmix": (1,),
+    "solref": (0.02, 1),
+    "solimp": (0.9, 0.95, 0.001, 0.5, 2),
+    "margin": (0,),
+    "gap": (0,),
+    "rgba": (0.5, 0.5, 0.5, 1),
+}
+"""MuJoCo's own contact parameters: those of a scene's `<default>` are for the scene's geoms."""
+INERTIAL = {"pos": (0.0, 0.0, 0.0), "mass": (1.0,), "diaginertia": (1.0, 1.0, 1.0)}
+"""Of a body until it has its own geoms, so that it compiles whatever the scene's compiler makes of inertias."""
 
 
 def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
@@ -71,9 +91,13 @@ def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
     spec = scene.spec.copy()
     for new in bodies:
         body = spec.worldbody.add_body(name=new.name, pos=new.pos, quat=new.quat)
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[PLACEHOLDER, 0, 0])
+        body.explicitinertial, body.mass, body.inertia, body.ipos = True, 1.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
+        geom = body.add_geom(name=placeholder_name(new.name), type=mujoco.mjtGeom.mjGEOM_SPHERE)
+        for name, value in PLAIN.items():
+            setattr(geom, name, value if len(value) > 1 else next(iter(value)))
+        geom.size, geom.group, geom.density = [PLACEHOLDER, 0, 0], new.group, WATER
         if new.is_free:
-            body.add_freejoint()
+            body.add_freejoint().align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
     for key in spec.keys:
         if len(key.qpos):
             key.qpos = [*key.qpos, *start_qpos(bodies)]
@@ -96,8 +120,11 @@ def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
         place = {"pos": " ".join(map(repr, new.pos)), "quat": " ".join(map(repr, new.quat))}
         body = ET.SubElement(world, "body", {"name": new.name, **place})
         if new.is_free:
-            ET.SubElement(body, "freejoint")
-        ET.SubElement(body, "geom", {"type": "sphere", "size": repr(PLACEHOLDER)})
+            ET.SubElement(body, "freejoint", {"align": "false"})
+        ET.SubElement(body, "inertial", {name: " ".join(map(repr, value)) for name, value in INERTIAL.items()})
+        numbers = PLAIN | {"size": (PLACEHOLDER, 0, 0), "group": (new.group,), "density": (WATER,)}
+        shown = {name: " ".join(map(repr, value)) for name, value in numbers.items()}
+        ET.SubElement(body, "geom", {"name": placeholder_name(new.name), "type": "sphere"} | shown)
     return world
 
 

@@ -15,6 +15,7 @@ from tgdsl.errors import ArtifactError, RobotError, TgdslError
 from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
+from tgdsl.scene.masses import freeze, weigh
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.options import Options, set_options
 
@@ -84,13 +85,17 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
     Bodies that are welded to an object's body lose theirs. Whatever is chosen, the same geoms and meshes are there, so that
     MuJoCo lays its data out alike: those that a variant lacks weigh nothing, are not seen, and collide only with what has a bit
     of `conaffinity` that nothing has. A custom number of each geom's says whether it is lacking: its looks, which are the
-    template's, do not.
+    template's, do not. Bodies whose inertia the scene does not give have that of their own geoms.
 
     Args:
         spec: The scene.
         objects: The objects.
         choices: What each is like, by its name; default: its first variant.
     """
+    new = {target.body for target in objects if spec.geom(placeholder_name(target.body)) is not None}
+    weighed = new | {target.body for target in objects if target.types and not spec.body(target.body).explicitinertial}
+    if weighed:
+        freeze(spec, new, weighed)
     for target in objects:
         choice = choices.get(target.name, Choice())
         body = spec.body(target.body)
@@ -102,6 +107,8 @@ def with_choices(spec: mujoco.MjSpec, objects: Sequence[SceneObject], choices: M
                 spec.delete(geom)
         if choice.size is not None:
             body.geoms[_sized_geom(target, choice.variant)].size = choice.size
+        if target.body in weighed:
+            weigh(spec, body)
     return spec
 
 
@@ -119,6 +126,11 @@ def _sized_geom(target: SceneObject, variant: int) -> int:
 def geom_name(target: SceneObject, i: int) -> str:
     """Return the name that geom i of an object has in the scene."""
     return f"tgdsl/{target.name}/{i}"
+
+
+def placeholder_name(body: str) -> str:
+    """Return the name of the geom that a body has which the document adds, until it is given the object's."""
+    return f"tgdsl/{body}/placeholder"
 
 
 def is_absent(model: mujoco.MjModel, geom: int) -> bool:
@@ -160,6 +172,8 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
         quat=like.quat,
         density=like.density,
     )
+    geom.mass, geom.fromto = np.nan, np.full(6, np.nan)  # whatever the scene's defaults say
+    geom.typeinertia, geom.fluid_ellipsoid = mujoco.mjtGeomInertia.mjINERTIA_VOLUME, 0.0
     if meshes:
         geom.meshname = meshes.get(variant, next(iter(meshes.values())))
     for name in INHERITED:

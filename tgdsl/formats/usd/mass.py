@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.formats.model import LEAST_INERTIA
+from tgdsl.formats.usd.custom_attributes import read_custom
 from tgdsl.formats.usd.geoms import Gprim
 from tgdsl.formats.usd.joints import rotation_of
 from tgdsl.formats.usd.mjc.solids import mujoco_mass_properties
@@ -32,14 +33,20 @@ class Inertial:
         mass: [kg].
         centre: Centre of mass [m].
         tensor: Inertia about it [kg·m²].
+        axes: Principal moments [kg·m²] and the rotation of their axes, if they are given in an order of their own.
     """
 
     mass: float
     centre: Vector
     tensor: Tensor
+    axes: tuple[Vector, Rotation] | None = None
 
     def principal(self) -> tuple[Vector, Rotation]:
         """Return the principal moments [kg·m²] and the rotation of their axes."""
+        return self.ascending() if self.axes is None else self.axes
+
+    def ascending(self) -> tuple[Vector, Rotation]:
+        """Return the same in ascending order."""
         moments, axes = np.linalg.eigh(self.tensor)
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         return moments, Rotation.from_matrix(axes)
@@ -58,13 +65,15 @@ class _Authored:
     density: float = 0.0
     centre: Vector | None = None
     tensor: Tensor | None = None
+    axes: tuple[Vector, Rotation] | None = None
 
 
 def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix) -> Inertial | None:
     """Return the mass and inertia of a body, or None if it has neither mass nor colliders.
 
     A body's mass overrules its colliders', a collider's density overrules its body's, and that its material's. A centre of
-    mass that is authored without an inertia is the point about which the colliders' inertia is taken, as in usd-core.
+    mass that is authored without an inertia is the point about which the colliders' inertia is taken, as in usd-core. What
+    `tgdsl:inertial` says of a mass or moments of zero, which USD takes for what is not given, holds while USD's mass is that.
 
     Args:
         stage: The stage.
@@ -76,9 +85,11 @@ def inertial_of(stage: Stage, body: Prim, geoms: Iterable[Gprim], frame: Matrix)
         RobotError: If what is authored is no mass, or no inertia.
     """
     own, geoms = _authored(stage, body), list(geoms)
+    if (exact := _with_zeros(stage, body, own)) is not None:
+        return exact
     colliders = [(geom, _own_mass(stage, geom)) for geom in geoms if geom.is_collider and geom.shape.kind != "plane"]
     if own.mass and own.centre is not None and own.tensor is not None:
-        return _repaired(stage, body, Inertial(own.mass, own.centre, own.tensor))
+        return _repaired(stage, body, Inertial(own.mass, own.centre, own.tensor, own.axes))
     parts = [_collider(stage, geom, found, own.density, frame) for geom, found in colliders]
     whole = _sum([part for part in parts if part.mass > 0])
     if own.mass and whole is not None:
@@ -99,18 +110,32 @@ def _authored(stage: Stage, prim: Prim) -> _Authored:
         if not np.isfinite(value).all() or np.min(value) < 0:
             raise stage.error(prim, f"physics:{name} is {np.asarray(value).tolist()}; expected 0 or more")
     centre = np.array(stage.value(prim, "physics:centerOfMass"), dtype=np.float64)
-    tensor = _full_tensor(stage, prim)
+    tensor, axes = _full_tensor(stage, prim), None
     if tensor is None and moments.any():
         quat = stage.value(prim, "physics:principalAxes")
         is_turned = quat.GetReal() or any(quat.GetImaginary())
-        axes = rotation_of(stage, prim, "physics:principalAxes").as_matrix() if is_turned else np.eye(3)
-        tensor = axes @ np.diag(moments) @ axes.T * stage.kilograms_per_unit * stage.metres_per_unit**2
+        turn = rotation_of(stage, prim, "physics:principalAxes") if is_turned else Rotation.identity()
+        axes = (moments * stage.kilograms_per_unit * stage.metres_per_unit**2, turn)
+        tensor = turn.as_matrix() @ np.diag(axes[0]) @ turn.as_matrix().T
     return _Authored(
         mass * stage.kilograms_per_unit,
         density * stage.kilograms_per_unit / stage.metres_per_unit**3,
         stage.frame(prim)[1] * centre if np.isfinite(centre).all() else None,
         tensor,
+        axes,
     )
+
+
+def _with_zeros(stage: Stage, body: Prim, own: _Authored) -> Inertial | None:
+    """Return the mass and inertia of which some are zero, as `export` wrote them: mass, moments and axes (w x y z)."""
+    values = np.array(read_custom(stage, body, "inertial") or (), dtype=np.float64)
+    if not values.size or own.tensor is not None or np.float32(own.mass) != np.float32(values[0]):
+        return None
+    if values.size != 8 or not np.isfinite(values).all() or values[:4].min() < 0 or not values[4:].any():
+        raise stage.error(body, f"tgdsl:inertial is {values.tolist()}; expected a mass, three moments and a quaternion")
+    turn = Rotation.from_quat(values[4:], scalar_first=True)
+    tensor = turn.as_matrix() @ np.diag(values[1:4]) @ turn.as_matrix().T
+    return Inertial(own.mass, np.zeros(3) if own.centre is None else own.centre, tensor, (values[1:4], turn))
 
 
 def _full_tensor(stage: Stage, prim: Prim) -> Tensor | None:
@@ -192,8 +217,8 @@ def _fallback_inertial(stage: Stage, body: Prim, mass: float, geoms: list[Gprim]
 
 def _repaired(stage: Stage, body: Prim, found: Inertial) -> Inertial:
     """Replace an inertia that breaks the triangle inequality by a ball's of about the same size; rounding is only corrected."""
-    moments, axes = found.principal()
-    low, middle, high = moments
+    moments, axes = found.ascending()
+    low, middle, high = np.sort(found.principal()[0])
     if low > 0 and low + middle >= high:
         return found
     if low > 0 and low + middle >= high * (1 - 1e-6):  # authored in float32: a disc may miss by a digit

@@ -19,7 +19,8 @@ Where MuJoCo leaves a choice:
 - Sliding friction is a material's dynamic friction, or its static friction if only that is authored; MuJoCo takes the greater
   of two, and its own default where no material is bound. `newton:contactStiffness` and `contactDamping` are not read: they are
   a force per distance, MuJoCo's `solref` is per effective mass.
-- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites.
+- A joint that closes a loop, or has MjcEqualityConnectAPI or MjcEqualityWeldAPI, becomes an equality constraint between sites;
+  one that `export` wrote is again between the bodies that it had.
 - Whether a parent and its child collide is what their joint says; where it says nothing and the scene has MjcSceneAPI,
   MuJoCo's own filter of parents (`mjc:flag:filterparent`) decides.
 - Colliders are in group 0 if they are visible and in group 3 if not, other visuals in group 2; or as `mjc:group` says.
@@ -60,7 +61,7 @@ from tgdsl.formats.usd.joints import FRAME_TOLERANCE, Joint, read_joints
 from tgdsl.formats.usd.mass import Inertial, inertial_of
 from tgdsl.formats.usd.mjc.actuators import Named, read_actuators
 from tgdsl.formats.usd.mjc.attributes import BODY, EQUALITY, WELD, read_attributes
-from tgdsl.formats.usd.mjc.couplings import add_couplings
+from tgdsl.formats.usd.mjc.equalities import add_couplings, add_exact_constraint, add_polynomials, put_in_order
 from tgdsl.formats.usd.mjc.keyframes import add_keyframes
 from tgdsl.formats.usd.mjc.tendons import add_tendons
 from tgdsl.formats.usd.scene import add_scene
@@ -213,6 +214,8 @@ def _mjcf_root(stage: Stage, robot: _Robot) -> ET.Element:
     named = _named(robot)
     add_couplings(stage, equality, robot.joints, _scalars(robot))
     named = replace(named, tendons=add_tendons(stage, tendon, replace(named, joints=_scalars(robot))))
+    add_polynomials(stage, equality, {"joint": _scalars(robot), "tendon": named.tendons})
+    put_in_order(equality)
     nodes = list(robot.tree.nodes.values())
     motions = [(node, _authored(robot, node.joint) if node.joint else None) for node in nodes]
     others = read_actuators(stage, named)
@@ -296,6 +299,10 @@ def _add_geoms(robot: _Robot, body: str | None, element: ET.Element, meshes: Mes
 def _add_loop_constraint(
     stage: Stage, robot: _Robot, joint: Joint, elements: Mapping[str | None, ET.Element], equality: ET.Element
 ) -> None:
+    if joint.constraint:
+        sites = {str(site.prim.GetPath()): (robot.names[3][str(site.prim.GetPath())], site.pose) for site in robot.sites}
+        if add_exact_constraint(stage, equality, joint, robot.names[0], sites, robot.names[2][joint.path]):
+            return
     if all(body is None or robot.kinematic[body] for body in joint.bodies):
         stage.drop("joints between bodies that no force can move were dropped", joint.prim)
         return

@@ -6,10 +6,11 @@ custom attributes named `tgdsl:`, in SI units and radians:
 - the names of MuJoCo (`name`, `actuator`, `mesh`; a floating body's joint in `freejoint`), and which frame is a `site`;
 - a joint's own `damping`, which its drive's includes; its actuator's `ctrlrange`; the `gear`, which drive and range include;
   the actuator's place in the `order`, if actuators do not come in the joints' order or are not all drives;
-- a joint's spring, a ball joint's range, a body's `gravcomp`;
+- a joint's spring, a ball joint's range, a body's `gravcomp`, and its `inertial` if its mass or some moment is zero;
 - contact parameters and the solver's settings, and the exact values of what USD rounds to float32: see `custom_attributes`.
 
-Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe).
+Actuators that USD has no drive for, tendons and keyframes are prims of MuJoCo's schemas (MjcActuator, MjcTendon, MjcKeyframe);
+equality constraints are joints and couplings, as far as there are schemas for them: see `equalities.py`.
 Textures stay behind.
 """
 
@@ -28,6 +29,7 @@ from tgdsl.files.write import atomic_path
 from tgdsl.formats.model import Model
 from tgdsl.formats.usd.custom_attributes import OPTION, default_model, non_default, non_default_flags
 from tgdsl.formats.usd.export.actuators import add_actuators, add_keyframes, add_tendons
+from tgdsl.formats.usd.export.equalities import add_equalities
 from tgdsl.formats.usd.export.geoms import add_geoms, add_sites
 from tgdsl.formats.usd.export.joints import FREE, add_drives, add_joint, joint_of
 from tgdsl.formats.usd.export.stage_writer import StageWriter, set_custom, set_number, set_pose
@@ -115,7 +117,10 @@ def _add_mass(writer: StageWriter, body: int, prim: Any) -> None:
     set_number(mass.CreateMassAttr(), model.body_mass[body])
     set_number(mass.CreateCenterOfMassAttr(), model.body_ipos[body])
     if not model.body_inertia[body].all():
-        return  # of a body that has none, USD wants neither the moments nor their axes
+        # Of a body that has none, USD wants neither the moments nor their axes, and makes both, or its mass, of its colliders.
+        own = [model.body_mass[body], *model.body_inertia[body], *model.body_iquat[body]]
+        set_custom(prim, "inertial", [float(value) for value in own])
+        return
     set_number(mass.CreateDiagonalInertiaAttr(), model.body_inertia[body])
     set_number(mass.CreatePrincipalAxesAttr(), model.body_iquat[body])
 
@@ -133,7 +138,9 @@ def _add_joints(writer: StageWriter, scope: str) -> None:
         elif joint >= 0:
             set_custom(writer.stage.GetPrimAtPath(writer.bodies[body]), "freejoint", model.joint(joint).name)
     add_keyframes(writer, scope)
-    add_actuators(writer, add_drives(writer, moving), scope, moving, add_tendons(writer, scope, moving))
+    tendons = add_tendons(writer, scope, moving)
+    add_equalities(writer, scope, moving, tendons)
+    add_actuators(writer, add_drives(writer, moving), scope, moving, tendons)
 
 
 def _excluded(model: mujoco.MjModel) -> set[tuple[int, int]]:
@@ -178,7 +185,6 @@ def _unsupported_elements(writer: StageWriter) -> list[str]:
     model = writer.model
     polynomials = (model.jnt_stiffnesspoly, model.dof_dampingpoly, model.tendon_stiffnesspoly, model.tendon_dampingpoly)
     counts = {
-        "equality constraints": model.neq,
         "contact pairs": model.npair,
         "sensors": model.nsensor,
         "cameras": model.ncam,
