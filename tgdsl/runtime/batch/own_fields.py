@@ -1,10 +1,11 @@
 """Fields of the model that environments of MuJoCo's batch have of their own: what their objects are like, mass and friction.
 
-Shapes: `env` environments, `n` environments that are chosen.
+Shapes: `env` environments.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,10 +13,9 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, listed
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject
 
 Array = np.ndarray
@@ -23,48 +23,80 @@ _OPTION = "opt."
 
 
 class OwnFields(ObjectProperties):
-    """The expanded fields of a batch. Models of variants differ from the batch's in these alone."""
+    """What environments of a batch have of their own: expanded fields of its model, or models of their own.
 
-    def __init__(self, batch: mujoco.batch.Batch, model: mujoco.MjModel, bodies_of: Mapping[str, str]):
-        """Begin: all environments have the batch's model."""
+    Expanded fields share all else. Variants that differ in what cannot be expanded, such as trees of bounding volumes,
+    take a model for each environment, of which those that are changed are copies.
+    """
+
+    def __init__(
+        self,
+        batch: mujoco.batch.Batch,
+        model: mujoco.MjModel,
+        bodies_of: Mapping[str, str],
+        variants: Sequence[mujoco.MjModel] = (),
+        is_open: bool = False,
+    ):
+        """Begin: all environments have the batch's model.
+
+        Args:
+            batch: The environments.
+            model: The batch's model.
+            bodies_of: Body of each of the document's objects.
+            variants: The model of each variant that an object may have.
+            is_open: Whether models that are not among these may come.
+        """
         super().__init__(model, bodies_of, batch.nsim, torch.device("cpu"))
         self._batch = batch
         self._fields: dict[str, Array] = {}
+        self._chosen = [model] * batch.nsim
+        self._own = list(self._chosen) if is_open or any(_shared(_differing(model, other)) for other in variants) else None
         self._is_derived = False
 
-    def use_models(self, ids: Int[Array, " n"], models: Sequence[mujoco.MjModel]) -> None:
-        """Give environments what models have that differs from the batch's.
+    def use_models(self, models: Sequence[mujoco.MjModel]) -> None:
+        """Give environments other models than they had; those that keep theirs keep their masses and frictions too.
 
         Args:
-            ids: The environments.
-            models: The model of each.
-
-        Raises:
-            SimulationError: If a model differs in what environments cannot have of their own.
+            models: The model of each environment.
         """
-        for model in {id(model): model for model in models}.values():
+        changed = [env for env, model in enumerate(models) if model is not self._chosen[env]]
+        self._chosen = list(models)
+        if self._own is not None:
+            for env in changed:
+                self._own[env] = models[env]
+            self._batch.set_models(self._own)
+            return
+        for model in {id(models[env]): models[env] for env in changed}.values():
             for name in _differing(self._model, model):
-                if name not in self._fields:
-                    self._fields[name] = self._batch.expand(name)
-        for env, model in zip(ids, models, strict=True):
+                self._field(name)
+        for env in changed:
             for name, values in self._fields.items():
-                value = _value(model, name)
+                value = _value(models[env], name)
                 values[env] = value[: len(values[env])] if values[env].ndim else value
-        if self._is_derived:
-            self._batch.set_const(ids)
+        if self._is_derived and changed:
+            self._batch.set_const(np.array(changed))
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        own, inertia, place = self._field("body_mass"), self._field("body_inertia"), np.ix_(ids, target.bodies)
-        factor = mass.numpy()[ids] / own[place].sum(axis=1)
-        own[place] *= factor[:, None]
-        inertia[place] *= factor[:, None, None]
-        self._batch.set_const(ids)
-        self._is_derived = True
+        for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
+            own, inertia = self._row("body_mass", env), self._row("body_inertia", env)
+            factor = wanted / own[target.bodies].sum()
+            own[target.bodies] *= factor
+            inertia[target.bodies] *= factor
+        if self._own is None:
+            self._batch.set_const(ids)
+            self._is_derived = True
+            return
+        for env in ids:
+            mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
+        self._batch.set_models(self._own)
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
-        self._field("geom_friction")[ids[:, None], target.geoms, 0] = friction.numpy()[ids, None]
+        for env, wanted in zip(ids.tolist(), friction.numpy()[ids], strict=True):
+            self._row("geom_friction", env)[target.geoms, 0] = wanted
+        if self._own is not None:
+            self._batch.set_models(self._own)
 
     def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
         return torch.from_numpy(self._values("body_mass")[:, target.bodies].sum(axis=1))
@@ -73,8 +105,19 @@ class OwnFields(ObjectProperties):
         return torch.from_numpy(self._values("geom_friction")[:, target.geoms, 0].max(axis=1))
 
     def _values(self, name: str) -> Array:
+        """Return a field of all environments, to be read."""
+        if self._own is not None:
+            return np.stack([getattr(model, name) for model in self._own])
         base = getattr(self._model, name)
         return self._fields[name] if name in self._fields else np.broadcast_to(base, (self._batch.nsim, *base.shape))
+
+    def _row(self, name: str, env: int) -> Array:
+        """Return a field of one environment, to be changed."""
+        if self._own is None:
+            return self._field(name)[env]
+        if self._own[env] is self._chosen[env]:
+            self._own[env] = copy.copy(self._own[env])
+        return getattr(self._own[env], name)
 
     def _field(self, name: str) -> Array:
         if name not in self._fields:
@@ -87,14 +130,11 @@ def _value(model: mujoco.MjModel, name: str) -> Any:
 
 
 def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
-    """Return the fields in which two models of one layout differ.
-
-    Raises:
-        SimulationError: If one of them cannot be an environment's own.
-    """
+    """Return the fields in which two models of one layout differ."""
     names = [name for name in dir(one) if isinstance(getattr(one, name), Array)]
-    found = [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
-    if shared := [name for name in found if name not in mujoco.batch.MODEL_FIELDS]:
-        what = f"variants of objects differ in MuJoCo's {listed(shared)}"
-        raise SimulationError(f"{what}, which all environments share")
-    return found
+    return [name for name in names if not np.array_equal(getattr(one, name), getattr(other, name))]
+
+
+def _shared(fields: Sequence[str]) -> list[str]:
+    """Return those fields that environments of a batch cannot have of their own."""
+    return [name for name in fields if name not in mujoco.batch.MODEL_FIELDS]

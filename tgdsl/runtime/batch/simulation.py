@@ -119,9 +119,12 @@ class BatchSimulation(Simulation):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
-        self.properties = OwnFields(self.batch, model, touch.inputs.bodies_of)
-        if self._objects is not None:
-            self.properties.use_models(np.arange(num_envs), self._objects.models())
+        bodies_of = touch.inputs.bodies_of
+        if self._objects is None:
+            self.properties = OwnFields(self.batch, model, bodies_of)
+        else:
+            self.properties = OwnFields(self.batch, model, bodies_of, *self._objects.variants())
+            self.properties.use_models(self._objects.models())
         claim(touch, self)
         self.reset()
 
@@ -148,7 +151,7 @@ class BatchSimulation(Simulation):
     def _use_objects(self) -> None:
         assert self._objects is not None
         models = self._objects.models()
-        self._run(lambda: self.properties.use_models(np.arange(self.num_envs), models))
+        self._run(lambda: self.properties.use_models(models))
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         ids = self._ascending(env_ids)

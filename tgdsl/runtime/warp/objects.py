@@ -68,6 +68,7 @@ class WorldObjects:
         self._scenes, self._names = scenes, inputs.objects
         self._chosen = EnvObjects(scenes, inputs, num_envs)
         self._rows: dict[tuple[Choice, ...], Row] = {}
+        self._written: list[tuple[Choice, ...]] = []
         self.model = shared_model(scenes, inputs)
         self.variant = torch.zeros(self._chosen.variant.shape, dtype=torch.int64, device=device)
         self.object_size = torch.zeros(self._chosen.object_size.shape, device=device)
@@ -77,12 +78,14 @@ class WorldObjects:
         self._chosen.choose(ids, variants, sizes)
 
     def write_to(self, worlds: Worlds) -> None:
-        """Write each environment's own fields, in place.
+        """Write the fields of environments whose objects were chosen anew, in place; the others keep their masses.
 
         Raises:
             SimulationError: If a field that all environments share would differ.
         """
         choices = [self._choices(env) for env in range(len(self._chosen.variant))]
+        before, self._written = self._written or [None] * len(choices), choices
+        changed = torch.tensor([old != new for old, new in zip(before, choices, strict=True)], device=self.variant.device)
         distinct = list(dict.fromkeys(choices))
         self._rows = {key: self._rows[key] if key in self._rows else self._row(key) for key in distinct}
         number = {key: i for i, key in enumerate(distinct)}
@@ -90,7 +93,8 @@ class WorldObjects:
         for name in (*OWN_FIELDS, "geom_xpos", "geom_xmat"):
             target = worlds.parameters[name] if name in OWN_FIELDS else worlds.arrays[name]
             rows = torch.from_numpy(np.stack([self._rows[key][name] for key in distinct]))
-            target.copy_(rows.to(target.device, target.dtype)[index].reshape(target.shape))
+            new = rows.to(target.device, target.dtype)[index].reshape(target.shape)
+            target.copy_(torch.where(changed.view(-1, *[1] * (new.ndim - 1)), new, target))
         self.variant.copy_(torch.from_numpy(self._chosen.variant))
         self.object_size.copy_(torch.from_numpy(self._chosen.object_size))
 

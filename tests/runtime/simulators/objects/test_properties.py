@@ -11,6 +11,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS
 
 OWN = ("mass", "friction")
+ODD = {"geoms": [{"type": "sphere", "size": [0.012], "pos": [0, 0, 0.02]}, {"type": "box", "size": [0.01, 0.01, 0.02]}]}
 VARIANTS = {"variants": [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02], "density": 500}]}
 SLOPE = """
 <mujoco>
@@ -89,6 +90,24 @@ def test_a_cube_slides_beyond_the_angle_of_friction(tmp_path, kind, friction):
         assert float(sim.qvel[1, 0]) == pytest.approx(0, abs=0.003)
 
 
+def test_compounds_too_weigh_what_they_are_given(tmp_path):
+    sim = BatchSimulation(module(tmp_path, target={"variants": [*VARIANTS["variants"], ODD]}), 6)
+    before = sim.properties.mass("cube").clone()
+    sim.properties.set([1, 2], mass={"cube": 0.5}, friction={"cube": 0.1})
+    np.testing.assert_allclose(sim.properties.mass("cube"), [before[0], 0.5, 0.5, *before[3:]], rtol=1e-12)
+    np.testing.assert_allclose(sim.properties.friction("cube"), [1, 0.1, 0.1, 1, 1, 1])
+    body = sim.model.body("cube").id
+    for env in (1, 2):
+        plain, own = sim.env_model(env + 3), sim.env_model(env)
+        np.testing.assert_allclose(own.body_inertia[body] / 0.5, plain.body_inertia[body] / plain.body_mass[body], rtol=1e-12)
+        np.testing.assert_allclose(
+            own.body_invweight0[body] * 0.5, plain.body_invweight0[body] * plain.body_mass[body], rtol=1e-9
+        )
+    for _ in range(3):
+        sim.step()
+    assert torch.isfinite(sim.qpos).all()
+
+
 @BOTH
 def test_variants_weigh_what_they_are_given_and_are_themselves_again_when_chosen_anew(tmp_path, kind):
     sim = simulator(kind, module(tmp_path, target=VARIANTS), 4)
@@ -98,7 +117,7 @@ def test_variants_weigh_what_they_are_given_and_are_themselves_again_when_chosen
     np.testing.assert_allclose(sim.properties.mass("cube"), [0.3] * 4, rtol=1e-6)
     sim.set_objects(variants={"cube": [1, 0]}, env_ids=[0, 1])
     masses = sim.properties.mass("cube")
-    np.testing.assert_allclose(masses[:2], [nominal[1], nominal[0]], rtol=1e-6)
+    np.testing.assert_allclose(masses, [nominal[1], nominal[0], 0.3, 0.3], rtol=1e-6)
     for _ in range(3):
         sim.step()
     assert torch.isfinite(sim.qpos).all()

@@ -69,6 +69,13 @@ class EnvObjects:
         self.variant = np.array([[choice.variant for choice in own.values()] for own in self._choices], dtype=np.int64)
         self.object_size = np.array([[self._size(*item) for item in own.items()] for own in self._choices])
 
+    def variants(self) -> tuple[list[mujoco.MjModel], bool]:
+        """Return a model with each variant that an object may have, and whether a compound's sizes may make further ones."""
+        chosen = [(name, v) for name, num in self._num_variants.items() for v in range(num)]
+        objects = self._scenes.objects.values()
+        is_open = any(target.is_sized and len(target.types) > 1 for target in objects)
+        return [self._scenes.model({name: Choice(v)}) for name, v in chosen], is_open
+
     def models(self) -> list[mujoco.MjModel]:
         """Return each environment's model; those that are alike share one."""
         return self._scenes.models(self._choices)
