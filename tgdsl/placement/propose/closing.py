@@ -13,24 +13,24 @@ The evidence, in the order in which it decides:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.placement.propose.hands import Hand, KinematicTree
+from tgdsl.placement.propose.hands import MAX_FINGER, Hand, KinematicTree
 from tgdsl.placement.propose.poses import Poses
 
 ONE_SIDED, LEANING = 3.0, 1.5
 """A joint bends one way, or leans to one, if its range from the start is this many times longer on one side."""
+SYMMETRIC = 0.05
+"""Limits are the same both ways if their middle is nearer to zero than half this share of the range."""
 MIN_CLOSING = 0.03
 """Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
 MIN_BEND = np.radians(30.0)
 """A hinge that turns by less than this does not close a finger, but shapes a palm."""
-MAX_FINGER = 0.35
-"""A longer chain is an arm or a leg, of which nothing closes [m]."""
 PARALLEL = 0.7
 """Least cosine of the angle between two axes about which a finger curls."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -108,8 +108,14 @@ class Closing:
         return max(start - low, 0.0), max(high - start, 0.0)
 
     def _lean(self, joint: int) -> float:
-        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide."""
+        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide.
+
+        One with limits that are the same both ways bends to neither side, even if it starts at one of them.
+        """
         down, up = self._sides(joint)
+        low, high = self._range(joint)
+        if abs(low + high) < SYMMETRIC * (high - low):
+            return 0.0
         if int(self.tree.model.jnt_type[joint]) != _HINGE or max(down, up) < LEANING * min(down, up):
             return 0.0
         return float(np.sign(up - down)) * (1.0 if max(down, up) >= ONE_SIDED * min(down, up) else 0.5)
@@ -161,7 +167,7 @@ class Closing:
         return found
 
     def _bending(self, candidates: list[int]) -> list[int]:
-        """Return the joints of which to find the closed end: those that spread a curling finger are not among them."""
+        """Return the joints of which to find the closed end: those that spread fingers are not among them."""
         curled = {self.chain[self.segment(joint)] for joint in self.sense}
         one_way = {joint for joint in candidates if abs(self.lean[joint]) == 1.0}
         found = []
@@ -169,11 +175,17 @@ class Closing:
             segment = self.segment(joint)
             own = [other for other in candidates if self.segment(other) == segment]
             rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
-            is_hinge = int(self.tree.model.jnt_type[joint]) == _HINGE
-            spreads = is_hinge and joint not in self.sense and joint not in one_way and self.chain[segment] in curled
+            is_free = joint not in self.sense and joint not in one_way and int(self.tree.model.jnt_type[joint]) == _HINGE
+            spreads = is_free and (self.chain[segment] in curled or self._is_across(joint, one_way))
             if rivals == [joint] and not spreads:
                 found.append(joint)
         return found
+
+    def _is_across(self, joint: int, one_way: Set[int]) -> bool:
+        """Return whether hinges that bend one way follow a joint in its chain, none of them about an axis parallel to its own."""
+        path = {other: self.tree.path(self.segment(other)) for other in one_way}
+        beyond = [other for other in one_way if other != joint and self.segment(joint) in path[other][1:]]
+        return bool(beyond) and not any(abs(cosine) > PARALLEL for o in beyond for cosine in self._cosines(joint, o))
 
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
         gain = half + whole if _is_clear(half, whole) else 0.0
@@ -206,9 +218,9 @@ class Closing:
         return (at_low - at_high) / max(at_low, at_high, 1e-9)
 
     def _points(self, values: Mapping[int, float]) -> Float[np.ndarray, "point 3"]:
-        """Return the centres of the tips, and of the palm if there is one, in the world [m]."""
+        """Return the centres of the tips, and of the palm or the fixed jaw if there is one, in the world [m]."""
         data = self.poses.kinematics(self.poses.posed(values))
-        bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
+        bodies = [*self.hand.tips, *(body for body in (self.hand.palm, self.hand.jaw) if body is not None)]
         return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
 
 
