@@ -19,7 +19,7 @@ FLOORS = (
     ("placement",),
     ("compiler", "runtime"),
     ("view",),
-    ("calibrate",),
+    ("calibrate", "rl"),
     ("commands",),
 )
 FLOOR_OF = {part: floor for floor, parts in enumerate(FLOORS) for part in parts}

@@ -128,6 +128,7 @@ def test_what_can_never_be_in_contact(folder):
     assert touch.inputs.bodies == ("ghost", "index_1", "index_2", "palm", "thumb_1")
 
 
+@pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")
 def test_pairs_that_never_meet_are_dropped_and_told(folder):
     """The palm is the parent of its fingers, which MuJoCo does not collide with it; the fingers' tips it does."""
     changes = DOCUMENT.replace("{body: cube}", "{body: thumb_1}")

@@ -18,6 +18,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.sensors import KINDS
 from tgdsl.testing import FLOAT64_TOLERANCE, ReferenceModule, assert_agrees
 
+pytestmark = pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")  # probes lie all through a ball
 BOXES = [{"type": "box", "size": [0.015 + 0.0005 * i, 0.02, 0.018 + 0.0004 * i]} for i in range(14)]
 CYLINDERS = [{"type": "cylinder", "size": [0.02, 0.02]}, {"type": "cylinder", "size": [0.016, 0.025]}]
 PAPER = [*BOXES, *CYLINDERS]

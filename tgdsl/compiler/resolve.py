@@ -9,40 +9,24 @@ import numpy as np
 
 from tgdsl.compiler.links import LinkBodies, link_bodies
 from tgdsl.compiler.objects import own_objects, sensed_objects
+from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
-from tgdsl.fields.models import Selection, SpecModel
-from tgdsl.fields.regions import OnGeoms, RegionPart
+from tgdsl.fields.models import Selection
+from tgdsl.fields.regions import RegionPart
 from tgdsl.files.find import is_file, robot_names
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders, Reach, reach
-from tgdsl.placement.sample.sample import Samples, sample
 from tgdsl.schema.loaded import Loaded, LoadedLayout
-from tgdsl.schema.placement import Placement, Points
-from tgdsl.schema.select import Report, is_plain, matching, select
+from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
-from tgdsl.surfaces.geom import Geom, SurfaceGeom
+from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.region import clip
 from tgdsl.surfaces.sensed import SensedObject
 from tgdsl.surfaces.surface import Surface
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A link that the layout gives taxels: its name and body, the geoms that are sampled, and how."""
-
-    link: Link
-    geoms: tuple[Geom, ...]
-    placement: Placement
-    path: Path
-
-    @property
-    def as_collided(self) -> bool:
-        """Whether its taxels are on the convex hulls that the simulator collides."""
-        return not isinstance(self.placement, Points) and self.placement.surface == "collision"
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +110,10 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     if robot is not None and loaded.is_without_layout:
         links = _sensor_links(loaded, {}, robot, [], on_links)
     elif robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
-        _check_groups(loaded.layout, robot, loaded.problems)
+        check_groups(loaded.layout, robot, loaded.problems)
         placements = loaded.layout.spec.resolutions.get(loaded.resolution or "")
         if placements is not None:
-            patches = _patches(loaded, loaded.layout, robot, placements)
+            patches = patches_of(loaded, loaded.layout, robot, placements)
             links = _sensor_links(loaded, loaded.layout.spec.groups, robot, patches, on_links)
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
@@ -143,7 +127,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     layout = Layout.of_links((), {})
     if loaded.layout is not None:
         placed = [patch for patch in patches if patch.link.name in needed]
-        layout = _sampled(loaded, loaded.layout, colliders, placed, felt, progress)
+        layout = sampled(loaded, loaded.layout, colliders, placed, felt, progress)
     loaded.raise_problems()
     unused = [(f"link {p.link.name}", "no sensor is on its taxels") for p in patches if p.link.name not in needed]
     unused += [(f"object {name}", "no sensor feels it") for name in loaded.spec.objects if name not in objects]
@@ -167,11 +151,11 @@ def taxels_of_all_links(loaded: Loaded) -> Layout:
     robot, _ = _models(loaded)
     patches: list[Patch] = []
     if robot is not None and loaded.layout is not None and not _is_foreign(loaded, loaded.layout, robot):
-        _check_groups(loaded.layout, robot, loaded.problems)
-        patches = _patches(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
+        check_groups(loaded.layout, robot, loaded.problems)
+        patches = patches_of(loaded, loaded.layout, robot, loaded.layout.spec.resolutions.get(loaded.resolution or "", {}))
     loaded.raise_problems()
     assert robot is not None and loaded.layout is not None
-    return _sampled(loaded, loaded.layout, Colliders(robot), patches, _object_bodies(loaded, robot), silent)
+    return sampled(loaded, loaded.layout, Colliders(robot), patches, _object_bodies(loaded, robot), silent)
 
 
 def _object_bodies(loaded: Loaded, robot: Model) -> tuple[int, ...]:
@@ -222,7 +206,7 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
 def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
     """Return whether a layout is for another robot, which is then one mistake: none of its links is on this one."""
     keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
-    if len(keys) < 2 or any(_matched(robot, key) for key in keys):
+    if len(keys) < 2 or any(matched(robot, key) for key in keys):
         return False
     what = f"this layout is for another robot: {robot.file.name} has none of its {len(keys)} links"
     hint = f"the layout has {listed(keys, 4)}; the robot has {listed([b for b in robot.bodies if b != 'world'], 4)}"
@@ -230,114 +214,26 @@ def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
     return True
 
 
-def _names(robot: Model) -> list[list[str]]:
-    """Return the names that selectors know: of bodies, geoms and meshes, each with those of what it belongs to."""
-    return [[body] for body in robot.bodies] + [[*geom.names, geom.body] for geom in robot.geoms if geom.names]
-
-
-def _check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) -> None:
-    for group, selection in layout.spec.groups.items():
-        path: Path = ("groups", group)
-        select(selection, _names(robot), layout.spec.groups, _reporter(layout, path, problems), group)
-
-
-def _reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
-    """Return a function that notes what is wrong with a pattern, at the place where the pattern stands."""
-
-    def report(where: tuple[str, int], what: str, hint: str) -> None:
-        written = owner.raw(path)  # `links: a` and `links: [a]` stand for `links: {include: [a]}`
-        place = where if isinstance(written, dict) else where[1:] if isinstance(written, list) else ()
-        problems.append(owner.problem((*path, *place), what, hint))
-
-    return report
-
-
-def _geom_selections(owner: Loaded | LoadedLayout, value: object, path: Path) -> Iterator[tuple[Path, Selection]]:
-    """Yield each selection of geoms in a part of a document, and where it stands."""
-    if isinstance(value, OnGeoms):
-        yield (*path, "geoms"), value.geoms
-    elif isinstance(value, SpecModel):
-        for name in type(value).model_fields:
-            yield from _geom_selections(owner, getattr(value, name), (*path, name))
-    elif isinstance(value, tuple):
-        is_list = isinstance(owner.raw(path), list)  # one region may stand for a list of one
-        for i, part in enumerate(value):
-            yield from _geom_selections(owner, part, (*path, i) if is_list else path)
-
-
-def _check_regions(owner: Loaded | LoadedLayout, value: object, path: Path, robot: Model, problems: list[Problem]) -> None:
-    """Note the plain names that regions exclude and that nothing has; what they include is looked up on each link."""
-    names = sorted({name for geom in robot.geoms for name in geom.names})
-    for place, selection in _geom_selections(owner, value, path):
-        report = _reporter(owner, place, problems)
-        for i, name in enumerate(selection.exclude):
-            if is_plain(name) and name not in names:
-                report(("exclude", i), f'no geom or mesh matches "{name}"', did_you_mean(name, names, "geoms and meshes"))
-
-
-def _patches(loaded: Loaded, layout: LoadedLayout, robot: Model, placements: dict[str, Placement]) -> list[Patch]:
-    """Return the links that carry taxels, in the robot's body order."""
-    found: dict[str, Patch] = {}
-    for pattern, placement in placements.items():
-        path: Path = ("resolutions", str(loaded.resolution), pattern)
-        _check_regions(layout, placement, path, robot, loaded.problems)
-        hits = _matched(robot, pattern)
-        if not hits:
-            known = [name for names in _names(robot) for name in names]
-            what = f'no body, geom or mesh matches "{pattern}"'
-            loaded.problems.append(layout.problem(path, what, did_you_mean(pattern, known, "links"), on_key=True))
-        for link, geoms in hits:
-            if link.name in found:
-                what = f'link "{link.name}" already has a layout, by "{found[link.name].path[-1]}"'
-                loaded.problems.append(layout.problem(path, what, "give each link one", on_key=True))
-            elif not geoms:
-                loaded.problems.append(layout.problem(path, f'link "{link.name}" has no geoms', on_key=True))
-            else:
-                found[link.name] = Patch(link, geoms, placement, path)
-    order = {body: i for i, body in enumerate(robot.bodies)}
-    return sorted(found.values(), key=lambda patch: (order[patch.link.body], patch.geoms[0].id))
-
-
-def _matched(robot: Model, pattern: str) -> list[tuple[Link, tuple[Geom, ...]]]:
-    """Return the links that a layout's key names: bodies, else geoms by name, else the geoms of a mesh."""
-    bodies = matching(pattern, [body for body in robot.bodies if body != "world"])
-    if bodies:
-        return [(Link(body, body), robot.touchable(body)) for body in bodies]
-    geoms = [geom for geom in robot.geoms if geom.name and matching(pattern, [geom.name])]
-    if geoms:
-        return [(Link(geom.name, geom.body), (geom,)) for geom in geoms]
-    of_mesh: dict[tuple[str, str], list[Geom]] = {}
-    for geom in robot.geoms:
-        if geom.mesh and matching(pattern, [geom.mesh]):
-            of_mesh.setdefault((geom.mesh, geom.body), []).append(geom)
-    meshes = [mesh for mesh, _ in of_mesh]
-    links = []
-    for (mesh, body), own in of_mesh.items():
-        name = mesh if meshes.count(mesh) == 1 else f"{body}/{mesh}"
-        links.append((Link(name, body), tuple(geom for geom in own if geom.is_colliding) or tuple(own)))
-    return links
-
-
 def _sensor_links(
     loaded: Loaded, groups: Mapping[str, Selection], robot: Model, patches: list[Patch], on_links: Set[str]
 ) -> dict[str, tuple[str, ...]]:
     """Return the names of each sensor's links: of those with taxels, or of bodies if it is `on_links`."""
     candidates = [[patch.link.name, patch.link.body, *(n for g in patch.geoms for n in g.names)] for patch in patches]
-    on_robot = _names(robot)
+    on_robot = names_of(robot)
     known = [name for names in (*on_robot, *candidates) for name in names]
     links: dict[str, tuple[str, ...]] = {}
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
-        _check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
+        check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
         if name in on_links:
             links[name] = _links_chosen(loaded, groups, robot, name)
             continue
         missing: list[Problem] = []
-        chosen = select(sensor.links, candidates, groups, _reporter(loaded, path, missing), elsewhere=known)
+        chosen = select(sensor.links, candidates, groups, reporter(loaded, path, missing), elsewhere=known)
         if missing:
             # A name that the robot has but the layout does not is another mistake than a name nobody has.
             unknown: list[Problem] = []
-            select(sensor.links, on_robot, groups, _reporter(loaded, path, unknown), elsewhere=known)
+            select(sensor.links, on_robot, groups, reporter(loaded, path, unknown), elsewhere=known)
             what = f'the layout puts no taxels on what this selects at resolution "{loaded.resolution}"'
             hint = f"links with taxels: {listed([patch.link.name for patch in patches])}"
             loaded.problems += unknown or [loaded.problem(path, what, hint)]
@@ -353,7 +249,7 @@ def _links_chosen(loaded: Loaded, groups: Mapping[str, Selection], robot: Model,
     bodies = [body for body in robot.bodies if body != "world"]
     own = [[body, *(n for g in robot.geoms if g.body == body for n in g.names)] for body in bodies]
     before = len(loaded.problems)
-    chosen = select(loaded.spec.sensors[name].links, own, groups, _reporter(loaded, path, loaded.problems))
+    chosen = select(loaded.spec.sensors[name].links, own, groups, reporter(loaded, path, loaded.problems))
     if not chosen and len(loaded.problems) == before:
         loaded.problems.append(loaded.problem(path, "`exclude` leaves no link"))
     return tuple(bodies[i] for i in chosen)
@@ -365,60 +261,3 @@ def _check_bodies(loaded: Loaded, robot: Model, scene: Model, patches: list[Patc
         what = f'the scene has no body "{missing[0]}", which the robot has'
         hint = did_you_mean(missing[0], scene.bodies, "bodies")
         loaded.problems.append(loaded.problem(("scene", "model"), what, f"a scene keeps the robot's names; {hint}"))
-
-
-def _sampled(
-    loaded: Loaded,
-    layout: LoadedLayout,
-    colliders: Colliders,
-    patches: list[Patch],
-    objects: Sequence[int],
-    progress: Progress,
-) -> Layout:
-    parts: list[Samples] = []
-    for i, patch in enumerate(patches):
-        progress(f"placing taxels on {patch.link.name} ({i + 1} of {len(patches)} links)")
-        try:
-            covered = colliders.cover_of(patch.link.body, patch.geoms, objects)
-            surface, name = _surface(colliders.robot, patch), patch.link.name
-            parts.append(sample(surface, patch.placement, layout.folder, name, covered))
-        except SampleError as error:
-            what = f'link "{patch.link.name}": {error.what}'
-            loaded.problems.append(layout.problem(patch.path, what, error.hint))
-    loaded.raise_problems()
-    if not parts:  # all sensors are on links, whatever their taxels
-        return Layout.of_links((), {})
-    counts = [len(part.pos) for part in parts]
-    return Layout(
-        links=tuple(patch.link for patch in patches),
-        groups=_groups(layout, patches),
-        link_id=np.repeat(np.arange(len(patches)), counts),
-        pos=np.concatenate([part.pos for part in parts]),
-        normal=np.concatenate([part.normal for part in parts]),
-        tangent=np.concatenate([part.tangent for part in parts]),
-        radius=np.concatenate([part.radius for part in parts]),
-        area=np.concatenate([part.area for part in parts]),
-        cell=np.concatenate([part.cell for part in parts]),
-    )
-
-
-def _surface(robot: Model, patch: Patch) -> Surface:
-    """Return the triangles that a link's taxels are sampled on.
-
-    Raises:
-        SampleError: If they shall be on colliding geoms, and one of the link's does not collide.
-    """
-    if patch.as_collided and not all(geom.is_colliding for geom in patch.geoms):
-        apart = next(geom for geom in patch.geoms if not geom.is_colliding)
-        raise SampleError(f"the simulator does not collide {apart.shown}", "expected `surface: mesh`")
-    return robot.surface(patch.geoms, patch.as_collided)
-
-
-def _groups(layout: LoadedLayout, patches: list[Patch]) -> dict[str, tuple[str, ...]]:
-    candidates = [[patch.link.name, patch.link.body] for patch in patches]
-    groups: dict[str, tuple[str, ...]] = {}
-    for group, selection in sorted(layout.spec.groups.items()):
-        chosen = select(selection, candidates, layout.spec.groups, lambda where, what, hint: None)
-        if chosen:
-            groups[group] = tuple(patches[i].link.name for i in chosen)
-    return groups

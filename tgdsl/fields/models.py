@@ -77,6 +77,28 @@ class Quantity:
         return value
 
 
+Range = tuple[float, float]
+"""Lowest and highest value; the same for a plain number."""
+
+
+class RangeOf(Quantity):
+    """Marks a quantity that may also be a range, `[low, high]`; with `least` and `most` as the bounds of both."""
+
+    def _read(self, found: object) -> Any:
+        parts = found if isinstance(found, (list, tuple)) else [found, found]
+        if len(parts) != 2:
+            raise ValueError(f"found a list of {len(parts)}, expected a number or [low, high]")
+        low, high = (super(RangeOf, self)._read(part) for part in parts)
+        if low > high:
+            raise ValueError(f"[{low:g}, {high:g}] is not ordered, expected [low, high]")
+        return low, high
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        """Return a quantity, or a list of two."""
+        one = super().__get_pydantic_json_schema__(schema, handler)
+        return {"anyOf": [one, {"type": "array", "items": one, "minItems": 2, "maxItems": 2}]}
+
+
 @dataclass(frozen=True)
 class Usual:
     """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so.

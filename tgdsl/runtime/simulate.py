@@ -10,10 +10,21 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.known import known_sources
 from tgdsl.runtime.simulators.devices import checked_device
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind, keyword_options
 from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.scene.options import Options
 
-_DEFAULTS = {"substeps": 1, "threads": 0, "keyframe": None, "on_fault": "raise", "nconmax": None, "njmax": None}
+_DEFAULTS = {
+    "substeps": 1,
+    "threads": 0,
+    "keyframe": None,
+    "options": None,
+    "watch": None,
+    "on_fault": "raise",
+    "nconmax": None,
+    "njmax": None,
+}
 
 
 @overload
@@ -25,6 +36,8 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
 ) -> BatchSimulation: ...
 @overload
@@ -36,6 +49,8 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -48,6 +63,8 @@ def simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -63,6 +80,9 @@ def simulate(
             `substeps=1`, of the instant before the step. `sim.forward()` evaluates where the environments are now.
         threads: CPU threads; 0: one per CPU.
         keyframe: Name of the keyframe to start from.
+        options: Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
+            `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`; no XML is edited.
+        watch: Names of bodies, sites, joints, actuators and pairs that `sim.watched()` returns, of the instant of readings.
         on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
             until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
         nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
@@ -74,7 +94,7 @@ def simulate(
             wants.
     """
     given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
-    given |= {"nconmax": nconmax, "njmax": njmax}
+    given |= {"options": options, "watch": watch, "nconmax": nconmax, "njmax": njmax}
     kind = _simulator_on(device)
     known = keyword_options(kind.simulate)
     if unknown := [name for name, value in given.items() if name not in known and value != _DEFAULTS[name]]:

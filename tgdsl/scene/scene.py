@@ -16,6 +16,7 @@ from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
 from tgdsl.scene.mujoco_warnings import muted_mujoco
+from tgdsl.scene.options import Options, set_options
 
 INHERITED = (
     *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
@@ -174,19 +175,24 @@ def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, te
 class SceneModels:
     """The models of a scene whose objects differ between environments, all of one layout, each compiled once while in use."""
 
-    def __init__(self, scene: SceneFile, prepare: Callable[[mujoco.MjSpec], None] | None = None):
+    def __init__(
+        self, scene: SceneFile, options: Options | None = None, prepare: Callable[[mujoco.MjSpec], None] | None = None
+    ):
         """Read the assets.
 
         Args:
             scene: The scene.
+            options: MuJoCo's options that are to differ from the scene's.
             prepare: Changes the scene before anything of it is compiled.
 
         Raises:
             ArtifactError: If an asset is missing or is not the one that the scene was compiled with.
+            SimulationError: If there is no such option, or a value does not fit.
         """
         self.objects = {target.name: target for target in scene.objects}
         with muted_mujoco():
             self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
+            set_options(self._base.option, options or {})
             if prepare is not None:
                 prepare(self._base)
         self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}

@@ -77,6 +77,7 @@ def test_odd_names_grids_samples_and_points_keep_their_bits(tmp_path, here):
     np.testing.assert_allclose(first["low.1"].tangent[-1], np.array([42, -9, 42 - 5 * 6.6]) / 50, atol=1)  # across (1, 1, 7)
 
 
+@pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")
 def test_a_module_reads_the_same_to_the_last_bit(tmp_path, here):
     """Of samples and a grid with images: every array of the plan, and readings of random states."""
     (tmp_path / "hand.xml").write_text(HAND)

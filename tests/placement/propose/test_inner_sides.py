@@ -7,8 +7,9 @@ from closing_hands import INNER, MADE, arm, parallel_jaws, slides, world
 from odd_hands import FOUR_BAR
 
 from tgdsl.errors import TgdslError
+from tgdsl.files.find import layout_of
 from tgdsl.formats.robot import load_model
-from tgdsl.placement.links import layout_of, open_robot
+from tgdsl.placement.links import open_robot
 from tgdsl.placement.propose.propose import closing_motion, propose
 from tgdsl.schema.load import load_layout
 from tgdsl.schema.select import matching

@@ -84,7 +84,7 @@ class _Filters:
                 found.add(frozenset(joint.bodies))
             elif joint.is_filtering and any(target and self._static(target) for target in joint.targets):
                 self.stage.drop(
-                    "joints do not keep their bodies from colliding with the static prims that they hang on", joint.prim
+                    "joints do not keep their bodies from colliding with the static prims that they are attached to", joint.prim
                 )
         return found
 

@@ -1,4 +1,4 @@
-"""Points of a surface on the lines of three fixed lattices, so that where they are drawn does not hang on how it is meshed.
+"""Points of a surface on the lines of three fixed lattices, so that where they are drawn does not depend on its triangles.
 
 Each of the three families of lines runs along one axis of the body frame and has one line in each square of a lattice of some
 pitch h that is fixed in space; where in its square a line runs is a hash of the seed, the axis and the square's integer

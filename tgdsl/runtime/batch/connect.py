@@ -8,7 +8,9 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_only, set_control_step
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
+from tgdsl.scene.options import Options
 
 
 def simulate_on_cpu(
@@ -18,6 +20,8 @@ def simulate_on_cpu(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -29,7 +33,16 @@ def simulate_on_cpu(
     """
     if nconmax is not None or njmax is not None:
         raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
-    return BatchSimulation(touch, num_envs, substeps=substeps, threads=threads, keyframe=keyframe, on_fault=on_fault)
+    return BatchSimulation(
+        touch,
+        num_envs,
+        substeps=substeps,
+        threads=threads,
+        keyframe=keyframe,
+        options=options,
+        watch=watch,
+        on_fault=on_fault,
+    )
 
 
 def simulate_at(touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None) -> BatchSimulation:

@@ -6,6 +6,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -16,20 +17,25 @@ from jaxtyping import Float, Int
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.batch.own_fields import OwnFields
 from tgdsl.runtime.batch.reading import BatchReader
 from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
 from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import keyframe_id
-from tgdsl.runtime.simulators.objects import EnvObjects
+from tgdsl.runtime.simulators.objects.choices import EnvObjects
+from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
+from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
-from tgdsl.scene.scene import SceneModels
-from tgdsl.tensors.env_ids import EnvIds, env_indices
+from tgdsl.scene.options import Options
+from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 Array = np.ndarray
+_FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
+"""How far `forward` goes: all that `mj_forward` does; poses and velocities."""
 _DIVERGENCES = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 
 
@@ -46,6 +52,7 @@ class BatchSimulation(Simulation):
         substeps: Physics steps per control step.
     """
 
+    properties: OwnFields
     _objects: EnvObjects | None = None
 
     def __init__(
@@ -57,6 +64,8 @@ class BatchSimulation(Simulation):
         threads: int = 0,
         keyframe: str | None = None,
         model: mujoco.MjModel | None = None,
+        options: Options | None = None,
+        watch: Watch | None = None,
         on_fault: OnFault = "raise",
         prepare: Callable[[mujoco.MjSpec], None] | None = None,
     ):
@@ -70,6 +79,8 @@ class BatchSimulation(Simulation):
             keyframe: Name of the keyframe to start from; default: the model's own initial state.
             model: A model of your own that holds the wanted contact sensors (see `tgdsl.instrument`); default: the
                 artefact's scene. Its objects are the same in all environments.
+            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
+            watch: What `watched` returns.
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
                 them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
                 with controls that are not finite, which "raise" refuses.
@@ -77,13 +88,13 @@ class BatchSimulation(Simulation):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body, a contact sensor or the keyframe, if its integrator is RK4, if its
-                bodies may sleep, if there is nothing to step, more environments than this computer has memory for, or if the
-                module's state is another simulation's or of other environments.
+            SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, if its integrator is
+                RK4, if its bodies may sleep, if there is nothing to step, more environments than this computer has memory for,
+                or if the module's state is another simulation's or of other environments.
         """
-        refuse_unfit(touch, num_envs, substeps, model)
+        refuse_unfit(touch, num_envs, substeps, model, options)
         if model is None:
-            scenes = SceneModels(touch.plan.scene, prepare)
+            scenes = SharedMeshModels(touch.plan.scene, options, prepare)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = EnvObjects(scenes, touch.inputs, num_envs)
@@ -98,12 +109,19 @@ class BatchSimulation(Simulation):
         self._warnings = StepWarnings()
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
+        self._keepers = [self._kept]
+        if watch is not None:
+            self._watch = WatchReader(watch, touch.inputs, self.model, torch.device("cpu"))
+            self._watch_reader = BatchReader(self._watch.inputs, self.model, self.batch)
+            self._watched_joints = KeptJoints(JointColumns.of(self._watch.inputs, self.model), self.batch)
+            self._keepers.append(self._watched_joints)
         with torch.inference_mode(False):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
+        self.properties = OwnFields(self.batch, model, touch.inputs.bodies_of)
         if self._objects is not None:
-            self.batch.set_models(self._objects.models())
+            self.properties.use_models(np.arange(num_envs), self._objects.models())
         claim(touch, self)
         self.reset()
 
@@ -115,7 +133,9 @@ class BatchSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._evaluate(self._ascending(env_ids))
+        ids = self._ascending(env_ids)
+        self._start_contacts.forget(env_mask(torch.from_numpy(ids), self.num_envs, torch.device("cpu")))
+        self._evaluate(ids)
 
     def body_poses(self, env: int) -> tuple[Float[Array, "body 3"], Float[Array, "body 4"]]:
         """Return where all bodies of the model are in one environment [m], and their quaternions w, x, y, z."""
@@ -128,15 +148,15 @@ class BatchSimulation(Simulation):
     def _use_objects(self) -> None:
         assert self._objects is not None
         models = self._objects.models()
-        self._run(lambda: self.batch.set_models(models))
+        self._run(lambda: self.properties.use_models(np.arange(self.num_envs), models))
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         ids = self._ascending(env_ids)
         if not len(ids):
             return
         self._run(lambda: self.batch.reset(ids, keyframe=self._keyframe, stage=mujoco.mjtStage.mjSTAGE_NONE.value))
         self._write(ids, rows)
-        self._evaluate(ids)
+        self._evaluate(ids, _FORWARD if finds_contacts else _VELOCITIES)
         self._touch.reset(torch.from_numpy(ids))
         is_new = torch.zeros(self.num_envs, dtype=torch.bool)
         is_new[torch.from_numpy(ids)] = True
@@ -156,19 +176,21 @@ class BatchSimulation(Simulation):
         for name, values in rows.values.items():
             self._arrays[name][chosen] = values[chosen]
 
-    def _evaluate(self, ids: Int[Array, " n"]) -> None:
+    def _evaluate(self, ids: Int[Array, " n"], stage: int = _FORWARD) -> None:
         if len(ids):
-            self._run(lambda: self.batch.forward(ids))
-            self._kept.keep(ids)
+            self._run(lambda: self.batch.forward(ids, stage=stage))
+            for keeper in self._keepers:
+                keeper.keep(ids)
 
     def _advance(self, num_steps: int) -> None:
         self.batch.warning[...] = 0
-        if self._kept.is_wanted:
-            if num_steps > 1:
-                self._run(lambda: self.batch.step(nstep=num_steps - 1))
-            self._kept.keep()
-            num_steps = 1
-        self._run(lambda: self.batch.step(nstep=num_steps))
+        keepers = [keeper for keeper in self._keepers if keeper.is_wanted]
+        self._physics_steps(num_steps - 1 if keepers else num_steps)
+        if keepers:
+            self._drive()
+            for keeper in keepers:
+                keeper.keep()
+            self._run(lambda: self.batch.step(nstep=1))
         self._faults.note(DIVERGED, torch.from_numpy(self.batch.warning[:, _DIVERGENCES, 1].any(axis=1)))
         is_faulty = self._faults.update()
         if not is_faulty.any():
@@ -179,11 +201,29 @@ class BatchSimulation(Simulation):
         self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
 
+    def _physics_steps(self, num: int) -> None:
+        """Make physics steps: all in one call if nothing drives them."""
+        if self.drive is None and num:
+            self._run(lambda: self.batch.step(nstep=num))
+            return
+        for _ in range(num):
+            self._drive()
+            self._run(lambda: self.batch.step(nstep=1))
+
+    def _drive(self) -> None:
+        if self.drive is not None:
+            self.drive()
+
     def _state(self, dt: float) -> SceneState:
         values = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
         return self._scene_state({name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}, dt)
+
+    def _read_watch(self) -> SceneState:
+        arrays = self._watch_reader.read() | self._watched_joints.read()
+        values: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        return SceneState(**values)
 
     def _run(self, call: Callable[[], None]) -> None:
         try:

@@ -150,7 +150,7 @@ def closing_of(touch: TactileModule) -> Closing | str:
     Raises:
         ArtifactError: If an asset of the scene is missing or has changed.
     """
-    spec = SceneModels(touch.plan.scene, name_all).first()
+    spec = SceneModels(touch.plan.scene, prepare=name_all).first()
     with muted_mujoco():
         scene = Model(Path(touch.plan.origin.robot), spec, spec.compile(), is_urdf=False)
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}

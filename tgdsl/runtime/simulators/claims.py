@@ -10,6 +10,7 @@ import mujoco
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.source import Source
+from tgdsl.scene.options import Options
 
 _READERS: weakref.WeakKeyDictionary[TactileModule, weakref.ref[Source]] = weakref.WeakKeyDictionary()
 """Which simulation reads a module that has state."""
@@ -20,18 +21,22 @@ def _reader(touch: TactileModule) -> Source | None:
     return None if found is None else found()
 
 
-def refuse_unfit(touch: TactileModule, num_envs: int, substeps: int, model: mujoco.MjModel | None) -> None:
+def refuse_unfit(
+    touch: TactileModule, num_envs: int, substeps: int, model: mujoco.MjModel | None, options: Options | None = None
+) -> None:
     """Refuse what no simulation can do.
 
     Raises:
-        SimulationError: If there is nothing to step, a model of one's own is given for objects that differ, or the module's
-            state is another simulation's or of other environments.
+        SimulationError: If there is nothing to step, a model of one's own is given for objects that differ, or options beside
+            it, or the module's state is another simulation's or of other environments.
     """
     if num_envs < 1 or substeps < 1:
         raise SimulationError(f"num_envs is {num_envs} and substeps {substeps}, expected at least 1 of each")
     if model is not None and touch.inputs.objects:
         what = f"object {touch.inputs.objects[0]} differs between environments, which one model cannot"
         raise SimulationError(f"{what}; leave `model` out")
+    if model is not None and options:
+        raise SimulationError("`options` are for the artefact's scene; a model of your own has them in its `opt`")
     if not touch.has_state:
         return
     if _reader(touch) is not None:

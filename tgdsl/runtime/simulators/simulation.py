@@ -6,7 +6,7 @@ Shapes: `env` environments, `nq`, `nv` and `nu` as in MuJoCo's model.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any, Unpack
 
@@ -23,9 +23,12 @@ from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
-from tgdsl.runtime.simulators.objects import ObjectChoices, Values
+from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
+from tgdsl.runtime.simulators.objects.properties import ObjectProperties
+from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.substep_states import SubstepStates
+from tgdsl.runtime.simulators.watch import Watched, WatchReader
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
 
 
@@ -38,15 +41,21 @@ class Simulation(ABC):
     Attributes:
         model: The compiled scene; where objects differ between environments, that of the first.
         substeps: Physics steps per control step.
+        properties: Masses and frictions of objects, which environments may have of their own.
+        drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: what an
+            actuator does that MuJoCo's does not. It is captured with the step on a GPU, so it must not wait for it there.
     """
 
     model: mujoco.MjModel
     substeps: int
+    properties: ObjectProperties
+    drive: Callable[[], None] | None = None
     _touch: TactileModule
     _arrays: Mapping[str, Tensor]
     _faults: EnvFaults
     _table: StateTable
     _objects: ObjectChoices | None = None
+    _watch: WatchReader | None = None
     _is_closed = False
 
     @property
@@ -90,6 +99,11 @@ class Simulation(ABC):
     def _earlier(self) -> SubstepStates:
         """The states of the last control step's earlier physics steps."""
         return SubstepStates(self._touch.inputs)
+
+    @cached_property
+    def _start_contacts(self) -> StartContacts:
+        """The contacts of environments that were placed since the last step without looking for contacts."""
+        return StartContacts(self._touch.inputs)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -179,17 +193,49 @@ class Simulation(ABC):
         are.
         """
         self._refuse_if_closed()
-        return self._earlier.added_to(self._state(self.control_step))
+        return self._earlier.added_to(self._start_contacts.applied_to(self._state(self.control_step)))
 
-    def reset(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
+    def read(self, env_ids: EnvIds | None = None) -> dict[str, Tensor]:
+        """Return the module's readings of the present state: `touch(state())`, for some environments (default: all).
+
+        The others' noise, delays and histories stay where they are, and their rows are as they were handed out before: read
+        all after a step, and after a reset those that were reset.
+
+        Args:
+            env_ids: Indices, or a boolean mask over environments.
+        """
+        if env_ids is None:
+            return self._touch(self.state())
+        return self._touch(self.state(), env_mask(env_ids, self.num_envs, self._touch.device))
+
+    def watched(self) -> Watched:
+        """Return what `watch` named when the simulation was made, of the instant that `state` is of, on the physics' device.
+
+        Raises:
+            SimulationError: If nothing is watched.
+        """
+        self._refuse_if_closed()
+        if self._watch is None:
+            raise SimulationError("nothing is watched: simulate(..., watch=Watch(bodies=(...), joints=(...)))")
+        values = self._start_contacts.applied_to(self._read_watch(), is_stored=False)
+        return self._watch.watched(values, self.state() if self._watch.has_pairs else None)
+
+    def reset(self, env_ids: EnvIds | None = None, *, contacts: Contacts = "evaluate", **values: Unpack[StateValues]) -> None:
         """Begin a new episode in some environments (default: all), in the simulator and in the module.
 
         They start from the keyframe at time 0, then with the values given, as `MjData` after `mj_resetData`, assignments and
         `mj_forward`. Nothing of the others changes. On a GPU a boolean mask and values that are there are used without
         waiting; of indices there, the host waits to see them.
 
+        To look for contacts and their forces costs about a physics step, on a GPU one of all environments. With
+        `contacts="none"` poses and velocities alone follow from where the environments are: until the next step pairs are not
+        in contact and no force acts, `joint_effort` included. A start that was in contact can be stored with what it felt: then
+        `contacts` holds these fields of its state.
+
         Args:
             env_ids: Indices, or a boolean mask over environments.
+            contacts: "evaluate"; "none"; or fields of `SceneState` by name (`contact_found`, `contact_netforce`,
+                `joint_effort`, …), one row for all environments alike or (env, …), those left out being zero.
             **values: MuJoCo's `qpos`, `qvel`, `ctrl` or another array of the state, as for `set_state`.
 
         Raises:
@@ -197,8 +243,13 @@ class Simulation(ABC):
                 MuJoCo reports an environment as failed.
         """
         self._refuse_if_closed()
-        self._begin_episodes(env_ids, self._table.rows(values, env_ids))
-        self._earlier.restart(env_mask(env_ids, self.num_envs, self._faults.mask.device))
+        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._faults.mask.device)
+        if contacts == "evaluate":
+            self._start_contacts.forget(mask)
+        else:
+            self._start_contacts.place(mask, contacts)
+        self._begin_episodes(env_ids, rows, finds_contacts=contacts == "evaluate")
+        self._earlier.restart(mask)
 
     def set_state(self, env_ids: EnvIds | None = None, **values: Unpack[StateValues]) -> None:
         """Put some environments (default: all) into a state; their time and the module's memory go on.
@@ -220,7 +271,9 @@ class Simulation(ABC):
                 and have a fault.
         """
         self._refuse_if_closed()
-        self._put(env_ids, self._table.rows(values, env_ids))
+        rows = self._table.rows(values, env_ids)
+        self._start_contacts.forget(env_mask(env_ids, self.num_envs, self._faults.mask.device))
+        self._put(env_ids, rows)
 
     @abstractmethod
     def forward(self, env_ids: EnvIds | None = None) -> None:
@@ -270,6 +323,10 @@ class Simulation(ABC):
     def _state(self, dt: float) -> SceneState: ...
 
     @abstractmethod
+    def _read_watch(self) -> SceneState:
+        """Return the fields that the watch wants."""
+
+    @abstractmethod
     def _use_objects(self) -> None:
         """Simulate the objects that were chosen."""
 
@@ -278,7 +335,8 @@ class Simulation(ABC):
         """Make physics steps, and see to faults."""
 
     @abstractmethod
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None: ...
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
+        """Begin episodes; without a look for contacts, evaluate poses and velocities alone."""
 
     @abstractmethod
     def _put(self, env_ids: EnvIds | None, rows: Rows) -> None: ...
@@ -290,6 +348,7 @@ class Simulation(ABC):
             SimulationError: If they do not fit, or are the host's and not finite.
         """
         self._refuse_if_closed()
+        self._start_contacts.forget()
         self._faults.begin_step()
         if control is None:
             return

@@ -7,8 +7,10 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_only, set_control_step
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
 from tgdsl.runtime.warp.simulation import WarpSimulation
+from tgdsl.scene.options import Options
 
 
 def _simulate(
@@ -19,6 +21,8 @@ def _simulate(
     substeps: int = 1,
     threads: int = 0,
     keyframe: str | None = None,
+    options: Options | None = None,
+    watch: Watch | None = None,
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -36,6 +40,8 @@ def _simulate(
         device=device,
         substeps=substeps,
         keyframe=keyframe,
+        options=options,
+        watch=watch,
         on_fault=on_fault,
         nconmax=nconmax,
         njmax=njmax,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.simulators.objects import EnvObjects, Values
+from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
 from tgdsl.runtime.warp.stream import libraries
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.scene import Choice, SceneModels, is_absent

@@ -26,7 +26,7 @@ class StateReader:
         model: mujoco.MjModel,
         sources: Mapping[str, Tensor],
         kept: Mapping[str, Tensor],
-        contacts: PairContacts,
+        contacts: PairContacts | None = None,
     ):
         """Look up where everything is.
 
@@ -35,7 +35,7 @@ class StateReader:
             model: The scene.
             sources: The arrays that `STATE_ARRAYS` names and those of `joint_fields.FORCES`, (env, …).
             kept: The arrays of joints and actuators at the state's instant, (env, …).
-            contacts: The contacts that the module wants.
+            contacts: The contacts that are wanted; default: none.
 
         Raises:
             SimulationError: If the model lacks a body, a joint or an actuator.
@@ -51,6 +51,6 @@ class StateReader:
 
     def read(self) -> dict[str, Tensor]:
         """Return the fields of a state that are poses, velocities, contacts or joints, each a tensor of its own."""
-        values = self._bodies.read(self._sources) | self._contacts.read()
+        values = self._bodies.read(self._sources) | ({} if self._contacts is None else self._contacts.read())
         values |= {name: array[:, columns] for name, (array, columns) in self._joints.items()}
         return values

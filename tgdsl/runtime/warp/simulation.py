@@ -19,13 +19,17 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.objects.properties import PER_ENV
+from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import Rows, StateTable
+from tgdsl.runtime.simulators.watch import Watch, WatchReader, merged_joints
 from tgdsl.runtime.warp.objects import OWN_FIELDS, WorldObjects
+from tgdsl.runtime.warp.properties import WorldProperties
 from tgdsl.runtime.warp.reading import StateReader
-from tgdsl.runtime.warp.shared_meshes import SharedMeshModels
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
+from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, env_mask
 
 
@@ -66,6 +70,8 @@ class WarpSimulation(Simulation):
         nconmax: int | None = None,
         njmax: int | None = None,
         model: mujoco.MjModel | None = None,
+        options: Options | None = None,
+        watch: Watch | None = None,
         per_env: Sequence[str] = (),
         device: str = "cuda",
         graph: bool = True,
@@ -82,7 +88,10 @@ class WarpSimulation(Simulation):
             njmax: Capacity for rows of constraints in each environment; default: what `nconmax` contacts and all limits make.
             model: A model of your own; default: the artefact's scene. Its objects are the same in all environments. Contacts
                 are read without the sensors that `tgdsl.instrument` adds to it: it may lack them.
-            per_env: Fields of the model that environments shall have of their own, such as "geom_friction".
+            options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
+            watch: What `watched` returns.
+            per_env: What environments shall have of their own: "mass" and "friction" for `set_properties`, or fields of the
+                model by name, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
             on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step`
@@ -92,40 +101,48 @@ class WarpSimulation(Simulation):
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
-            SimulationError: If the model lacks a body or the keyframe, holds something that MuJoCo Warp does
+            SimulationError: If the model lacks a body, the keyframe or what is watched, holds something that MuJoCo Warp does
                 not support, if there is nothing to step, no such device or library, or if the module's state is another
                 simulation's or of other environments.
         """
-        refuse_unfit(touch, num_envs, substeps, model)
+        refuse_unfit(touch, num_envs, substeps, model, options)
         self._touch, self.substeps = touch, substeps
         self._stream = WarpStream(device, graph)
         if model is None:
-            scenes = SharedMeshModels(touch.plan.scene)
+            scenes = SharedMeshModels(touch.plan.scene, options)
             model = scenes.model({})
             if touch.inputs.objects:
                 self._objects = WorldObjects(scenes, touch.inputs, num_envs, self._stream.device)
         self.model: mujoco.MjModel = model
+        if watch is not None:
+            self._watch = WatchReader(watch, touch.inputs, model, self._stream.device)
+        own = list(OWN_FIELDS) if self._objects else []
         self._worlds = Worlds(
             model if self._objects is None else self._objects.model,
-            touch.inputs,
+            merged_joints(touch.inputs, self._watch),
             num_envs,
             self._stream,
             keyframe=keyframe_id(model, keyframe),
             nconmax=nconmax,
             njmax=njmax,
-            per_env=list(dict.fromkeys([*per_env, *(OWN_FIELDS if self._objects else ())])),
+            per_env=list(dict.fromkeys([f for word in per_env for f in PER_ENV.get(word, (word,))] + own)),
             on_fault=on_fault,
         )
         self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
+        parameters, bodies_of = self._worlds.parameters, touch.inputs.bodies_of
+        self.properties = WorldProperties(parameters, model, bodies_of, num_envs, self._stream.device)
         with self._stream.scope():
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
             self._objects.write_to(self._worlds)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
-        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps))
-        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1))
+        if self._watch is not None:
+            self._watch_reader = StateReader(self._watch.inputs, model, self._worlds.arrays, self._worlds.kept)
+        self._step = GraphedCall(self._stream, lambda: self._worlds.step(self.substeps, self.drive))
+        self._substep = GraphedCall(self._stream, lambda: self._worlds.step(1, self.drive))
         self._step_and_read = GraphedCall(self._stream, self._physics_and_touch)
         self._held: tuple[object, ...] = ()
+        self._driven = self.drive
         claim(touch, self)
         self.reset()
 
@@ -183,7 +200,9 @@ class WarpSimulation(Simulation):
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
         self._refuse_if_closed()
-        self._worlds.make_stale(env_mask(env_ids, self.num_envs, self._stream.device))
+        mask = env_mask(env_ids, self.num_envs, self._stream.device)
+        self._start_contacts.forget(mask)
+        self._worlds.make_stale(mask)
 
     def body_poses(self, env: int) -> tuple[Float[np.ndarray, "body 3"], Float[np.ndarray, "body 4"]]:
         """Return where all bodies are in one environment: origins [m], quaternions w, x, y, z. A GPU is waited for."""
@@ -213,20 +232,20 @@ class WarpSimulation(Simulation):
 
     def _forget_other_tensors(self) -> None:
         """Forget a graph that was captured with other tensors of the module than it has now."""
-        held = (self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
+        held = (self.drive, self._touch.calls.compiled, self._touch.incoming.held_dt, *self._touch.buffers())
         if len(held) != len(self._held) or any(now is not then for now, then in zip(held, self._held, strict=True)):
             self._step_and_read.forget()
             self._held = held
 
     def _physics_and_touch(self) -> dict[str, Tensor]:
         if not self._earlier.are_wanted:
-            self._worlds.step(self.substeps)
+            self._worlds.step(self.substeps, self.drive)
         else:
             self._earlier.begin(self.substeps)
             for i in range(self.substeps):
                 if i:
                     self._earlier.note(self._read(float(self.model.opt.timestep)))
-                self._worlds.step(1)
+                self._worlds.step(1, self.drive)
             self._earlier.restart(self._faults.restarted)
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted)
@@ -243,13 +262,18 @@ class WarpSimulation(Simulation):
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         return self._scene_state(values, dt)
 
+    def _read_watch(self) -> SceneState:
+        self._worlds.refresh()
+        values: dict[str, Any] = dict(self._watch_reader.read())
+        return SceneState(**values)
+
     def _use_objects(self) -> None:
         assert self._objects is not None
         self._objects.write_to(self._worlds)
 
-    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows) -> None:
+    def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         mask = env_mask(env_ids, self.num_envs, self._stream.device)
-        self._worlds.reset(mask, rows)
+        self._worlds.reset(mask, rows, finds_contacts=finds_contacts)
         self._touch.reset(None if env_ids is None else mask.to(self._touch.device))
 
     def _put(self, env_ids: EnvIds | None, rows: Rows) -> None:
@@ -257,6 +281,10 @@ class WarpSimulation(Simulation):
 
     def _advance(self, num_steps: int) -> None:
         self._worlds.prepare()
+        if self.drive is not self._driven:
+            self._driven = self.drive
+            self._step.forget()
+            self._substep.forget()
         (self._step if num_steps == self.substeps else self._substep)()
         if self._faults.on_fault == "reset":
             self._touch.reset(self._worlds.restarted.to(self._touch.device))

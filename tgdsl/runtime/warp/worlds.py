@@ -5,7 +5,7 @@ Shapes: `env` environments (MuJoCo Warp's worlds).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -109,18 +109,25 @@ class Worlds:
         self._has_stale, self._is_in_graphs, self._stream = True, False, stream
         self._has_loops = model.neq > 0
         self._reset, self._refresh = GraphedCall(stream, self._restart), GraphedCall(stream, self.evaluate_stale)
+        self._move = GraphedCall(stream, self._evaluate_poses)
 
-    def step(self, num_steps: int) -> None:
+    def step(self, num_steps: int, drive: Callable[[], None] | None = None) -> None:
         """Advance all environments by some physics steps, and start those anew that shall not wait: for a `GraphedCall`.
 
         Poses, velocities and contacts are then those at the start of the last of them. Only there are sensors evaluated, unless
         some of them remember earlier steps.
+
+        Args:
+            num_steps: How many physics steps.
+            drive: Is called before each of them.
         """
         whole = self.model.opt.disableflags
         idle = whole if self.model.nhistory else whole | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         try:
             for i in reversed(range(num_steps)):
                 self.model.opt.disableflags = idle if i else whole
+                if drive is not None:
+                    drive()
                 if not i:
                     for name, kept in self.kept.items():
                         kept.copy_(self.arrays[name])
@@ -154,14 +161,25 @@ class Worlds:
         if self.faults.on_fault == "reset" and not is_evaluated:
             self._note_stale()
 
-    def reset(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
-        """Start some environments anew, with values. Their poses and contacts are evaluated when they are next asked for."""
+    def reset(self, mask: Bool[Tensor, " env"], rows: Rows, finds_contacts: bool = True) -> None:
+        """Start some environments anew, with values.
+
+        Their poses and contacts are evaluated when they are next asked for; without a look for contacts, their poses at once.
+        """
         self._is_reset.copy_(mask)
         self._reset()
-        self.put(mask, rows)
+        self._write(mask, rows)
+        if finds_contacts:
+            self.make_stale(mask)
+        else:
+            self._move()
 
     def put(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
         """Put values into the state of some environments; those that cannot be used are left out and noted."""
+        self._write(mask, rows)
+        self.make_stale(mask)
+
+    def _write(self, mask: Bool[Tensor, " env"], rows: Rows) -> None:
         with torch.no_grad():
             is_put = mask
             if rows.is_bad is not None:
@@ -171,7 +189,6 @@ class Worlds:
                 array = self.arrays[name]
                 if array.numel():
                     array.copy_(torch.where(_like(is_put, array), values, array))
-        self.make_stale(mask)
 
     def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
         """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
@@ -211,18 +228,34 @@ class Worlds:
         for _ in range(2 if self._has_loops else 1):
             self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)
+        self._give_back(self._is_stale, earlier, arrays)
+        self._is_stale.zero_()
+
+    def _evaluate_poses(self) -> None:
+        """Evaluate poses and velocities of the environments that were just reset: for a `GraphedCall`.
+
+        Those of all are evaluated, which costs little, and the others are given back their earlier instant.
+        """
+        arrays = {name: self.arrays[name] for name in _DERIVED}
+        earlier = {name: array.clone() for name, array in arrays.items()}
+        self._mjw.fwd_kinematics(self.model, self.data)
+        self._mjw.com_vel(self.model, self.data)
+        self._give_back(self._is_reset, earlier, arrays)
+        self._is_stale &= ~self._is_reset
+
+    def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
+        """Give environments that are not new back what they had, and take the joints of those that are."""
         for name, before in earlier.items():
             array = arrays[name]
             if array.numel():
-                array.copy_(torch.where(_like(self._is_stale, array), array, before))
+                array.copy_(torch.where(_like(is_new, array), array, before))
         for name, kept in self.kept.items():
-            kept.copy_(torch.where(_like(self._is_stale, kept), self.arrays[name], kept))
-        self._is_stale.zero_()
+            kept.copy_(torch.where(_like(is_new, kept), self.arrays[name], kept))
 
     def forget_graphs(self) -> None:
         """Capture anew at the next calls."""
-        self._reset.forget()
-        self._refresh.forget()
+        for call in (self._reset, self._refresh, self._move):
+            call.forget()
 
     def message(self) -> str:
         """Return what has gone wrong since the last reset, in words; it waits for a GPU."""

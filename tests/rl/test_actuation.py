@@ -1,0 +1,288 @@
+"""Drives against closed forms of one hinge without gravity: what each imperfection does is seen in how the joint moves."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from warp_cases import warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.rl.actuation import BREAKAWAY_SPEED, PAPER, ActionSpec, Actuation, Actuators, DriveSpec
+from tgdsl.rl.draws import Draws
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+INERTIA, STIFFNESS, LIMIT, DT = 0.01, 2.0, 0.5, 0.001
+HINGE = """
+<mujoco>
+  <compiler angle="radian"/>
+  <option timestep="0.001" gravity="0 0 0" integrator="{integrator}"><flag contact="disable"/></option>
+  <worldbody>
+    <body name="link">
+      <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>
+      <joint name="hinge" axis="0 1 0" range="-2 2" limited="true" damping="{passive}"/>
+      <geom name="link" type="sphere" size="0.01"/>
+    </body>
+    <body name="object" pos="1 0 0"><geom type="sphere" size="0.01"/></body>
+  </worldbody>
+  <actuator><position name="hinge" joint="hinge" kp="2" kv="{kv}" forcerange="-0.5 0.5" inheritrange="1"/></actuator>
+</mujoco>
+"""
+BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
+
+
+def hinge(tmp_path, simulator, num_envs=1, kv=0.0, passive=0.0, substeps=1, drive=None, action=None, integrator="implicitfast"):
+    (tmp_path / "hinge.xml").write_text(HINGE.format(kv=kv, passive=passive, integrator=integrator))
+    points = {"method": "points", "points": [{"pos": [0, 0, 0.01], "normal": [0, 0, 1]}], "radius": 0.005}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "hinge.xml"), "layout": {"resolutions": {"only": {"link": points}}}},
+        "objects": {"object": {"body": "object"}},
+        "sensors": {"touch": {"kind": "contact_depth", "links": "link", "feels": ["object"], "gate": "geometric"}},
+    }
+    sim = simulator(tgdsl.compile(document), num_envs, substeps=substeps)
+    actuators = Actuators.of(sim.model, ["hinge"])
+    spec = ActionSpec(mode="absolute") if action is None else action
+    actuation = Actuation(actuators, sim._arrays, spec, drive or DriveSpec(), Draws(0, num_envs))
+    sim.drive = actuation.drive if actuation.drives else None
+    everywhere = torch.ones(num_envs, dtype=torch.bool)
+    actuation.reset(everywhere, torch.ones(num_envs, dtype=torch.int64))
+    return sim, actuation
+
+
+def targets(sim, radians) -> torch.Tensor:
+    """Return the absolute action whose target is an angle [rad]."""
+    return torch.full((sim.num_envs, 1), radians / 2.0)
+
+
+def acceleration(sim) -> float:
+    return float(sim.qvel[0, 0]) / DT
+
+
+@BOTH
+@pytest.mark.parametrize(("drive", "expected"), [
+    (DriveSpec(), STIFFNESS * 0.1),
+    (DriveSpec(gain=(1.3, 1.3)), 1.3 * STIFFNESS * 0.1),
+    (DriveSpec(bias=(-0.02, -0.02)), STIFFNESS * 0.08),
+    (DriveSpec(deadband=(0.03, 0.03)), STIFFNESS * 0.07),
+    (DriveSpec(deadband=(0.11, 0.11)), 0.0),
+    (DriveSpec(backlash=(0.04, 0.04)), STIFFNESS * 0.08),
+    (DriveSpec(kick=(0.8, 0.8)), 0.8 * STIFFNESS * 0.1),
+    (DriveSpec(strength=(0.2, 0.2)), 0.2 * LIMIT),
+    (DriveSpec(gain=(1.5, 1.5), strength=(2.0, 2.0)), 1.5 * STIFFNESS * 0.1),
+])  # fmt: skip
+def test_the_torque_at_rest_is_seen_in_the_acceleration(tmp_path, simulator, drive, expected):
+    sim, actuation = hinge(tmp_path, simulator, drive=drive)
+    actuation.command(targets(sim, 0.1))
+    sim.step()
+    assert acceleration(sim) == pytest.approx(expected / INERTIA, rel=1e-5, abs=1e-7)
+    if actuation.drives:
+        assert float(actuation.torque[0, 0]) == pytest.approx(expected, rel=1e-5, abs=1e-9)
+
+
+@BOTH
+@pytest.mark.parametrize(("strength", "expected"), [(1.0, LIMIT), (1.1, 1.1 * LIMIT), (0.5, 0.5 * LIMIT)])
+def test_the_stall_torque_is_the_one_that_was_drawn(tmp_path, simulator, strength, expected):
+    sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(strength=(strength, strength)))
+    actuation.command(targets(sim, -1.9))
+    sim.step()
+    assert acceleration(sim) == pytest.approx(-expected / INERTIA, rel=1e-5)
+
+
+@BOTH
+def test_a_target_beyond_the_joints_range_is_reached_by_bias_all_the_same(tmp_path, simulator):
+    sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(bias=(0.05, 0.05)))
+    sim.set_state(qpos=np.array([1.98]))
+    actuation.place(torch.tensor([True]))
+    actuation.command(targets(sim, 2.0))
+    sim.step()
+    assert acceleration(sim) == pytest.approx(STIFFNESS * 0.07 / INERTIA, rel=1e-4)
+
+
+@BOTH
+def test_kick_acts_at_rest_alone(tmp_path, simulator):
+    sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(kick=(1.5, 1.5)))
+    actuation.command(targets(sim, 0.1))
+    speeds = [0.0]
+    for _ in range(8):
+        position = float(sim.qpos[0, 0])
+        sim.step()
+        speeds.append(float(sim.qvel[0, 0]))
+        factor = 1.5 if abs(speeds[-2]) < BREAKAWAY_SPEED else 1.0
+        wanted = factor * STIFFNESS * (0.1 - position) / INERTIA * DT
+        assert speeds[-1] - speeds[-2] == pytest.approx(wanted, rel=2e-4)
+    assert abs(speeds[1]) < BREAKAWAY_SPEED < abs(speeds[-1])
+
+
+@BOTH
+def test_backlash_is_crossed_at_each_reversal(tmp_path, simulator):
+    """The joint, slow and damped, follows a target up, rests while it crosses the play, and follows it down."""
+    sim, actuation = hinge(tmp_path, simulator, kv=0.5, drive=DriveSpec(backlash=(0.2, 0.2)), substeps=400)
+    ends = []
+    for target in (0.5, 0.45, 0.31, 0.2, 0.0, 0.1, 0.2, 0.3):
+        for _ in range(4):
+            actuation.command(targets(sim, target))
+            sim.step()
+        ends.append(float(sim.qpos[0, 0]))
+    # 0.5 − 0.1 going up; at rest down to 0.3; then target + 0.1 going down; at rest up to 0.2; then target − 0.1 going up
+    np.testing.assert_allclose(ends, [0.4, 0.4, 0.4, 0.3, 0.1, 0.1, 0.1, 0.2], atol=2e-3)
+
+
+@BOTH
+@pytest.mark.parametrize("late", [0, 1, 3])
+@pytest.mark.parametrize("noise", [0.0, 1e-9], ids=["ideal", "driven"])
+def test_targets_arrive_late_by_whole_control_steps(tmp_path, simulator, late, noise):
+    sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(delay=(late, late), torque_noise=noise), substeps=3)
+    for step in range(5):
+        actuation.command(targets(sim, 0.1))
+        sim.step()
+        assert (abs(float(sim.qvel[0, 0])) > 1e-3) == (step >= late)
+
+
+@BOTH
+def test_the_largest_torque_falls_to_zero_at_top_speed(tmp_path, simulator):
+    """q̇ = q̇_max (1 − exp(−t/T)) with T = I q̇_max / τ_max, from rest under full torque."""
+    sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(top_speed=4.0))
+    actuation.command(targets(sim, 1.9))
+    time_constant = INERTIA * 4.0 / LIMIT
+    for _ in range(120):
+        sim.step()
+    expected = 4.0 * (1 - (1 - DT / time_constant) ** 120)
+    assert float(sim.qvel[0, 0]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_robots_own_top_speed_is_torque_over_damping(tmp_path):
+    sim, actuation = hinge(tmp_path, BatchSimulation, passive=0.125, drive=DriveSpec(top_speed="robot"))
+    actuation.command(targets(sim, 1.9))
+    sim.step()
+    moving = float(sim.qvel[0, 0])
+    sim.step()
+    assert float(actuation.torque[0, 0]) == pytest.approx(LIMIT * (1 - moving / 4.0), rel=1e-9)
+
+
+def test_an_ideal_drive_is_the_robots_actuator_to_the_bit(tmp_path):
+    sim, actuation = hinge(tmp_path, BatchSimulation, kv=0.05, substeps=5)
+    assert not actuation.drives and sim.drive is None
+    plain = mujoco.MjData(sim.model)
+    for step in range(20):
+        wanted = 0.7 * np.sin(step)
+        actuation.command(torch.full((1, 1), wanted / 2, dtype=torch.float64))
+        sim.step()
+        plain.ctrl[0] = wanted
+        mujoco.mj_step(sim.model, plain, 5)
+    assert float(sim.qpos[0, 0]) == pytest.approx(plain.qpos[0], abs=1e-14)
+
+
+@BOTH
+def test_a_drive_that_does_nothing_else_moves_as_the_robots_actuator(tmp_path, simulator):
+    ends = []
+    for drive in (DriveSpec(), DriveSpec(torque_noise=1e-12)):
+        sim, actuation = hinge(tmp_path, simulator, kv=0.05, substeps=5, drive=drive)
+        for step in range(20):
+            actuation.command(targets(sim, 1.5 * np.sin(step)))
+            sim.step()
+        ends.append(float(sim.qpos[0, 0]))
+    assert ends[0] == pytest.approx(ends[1], abs=1e-10 if simulator is BatchSimulation else 1e-4)
+
+
+def test_relative_actions_add_up_within_the_range_and_are_smoothed(tmp_path):
+    _, actuation = hinge(tmp_path, BatchSimulation, action=ActionSpec(scale=0.5, smoothing=0.25))
+    expected = 0.0
+    for action in (1.0, 1.0, -0.5, 1.0, 1.0, 1.0, 1.0, 1.0):
+        actuation.command(torch.full((1, 1), action, dtype=torch.float64))
+        expected = 0.75 * np.clip(expected + 0.5 * action, -2, 2) + 0.25 * expected
+        assert float(actuation.target[0, 0]) == pytest.approx(expected, abs=1e-12)
+    assert expected > 1.9
+
+
+# What is drawn
+
+
+def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
+    arrays = {name: torch.zeros(num_envs, 3, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
+    model = mujoco.MjModel.from_xml_string(THREE)
+    actuation = Actuation(
+        Actuators.of(model, ["a", "b", "c"]), arrays, ActionSpec(), spec, Draws(seed, num_envs, first_env=first_env)
+    )
+    actuation.reset(torch.ones(num_envs, dtype=torch.bool), torch.full((num_envs,), episode))
+    return actuation
+
+
+JOINT = '<body name="{0}"><joint name="{0}" range="-1 1" limited="true"/><geom size="0.1"/></body>'
+SERVO = '<position name="{0}" joint="{0}" kp="1" forcerange="-1 1"/>'
+THREE = '<mujoco><compiler angle="radian"/><worldbody>{}</worldbody><actuator>{}</actuator></mujoco>'.format(
+    "".join(JOINT.format(name) for name in "abc"), "".join(SERVO.format(name) for name in "abc")
+)
+
+
+def test_draws_are_counted_the_same_for_64_environments_as_for_twice_32():
+    whole, halves = drawn(), [drawn(num_envs=32), drawn(num_envs=32, first_env=32)]
+    for name, value in whole.drawn.items():
+        assert torch.equal(value, torch.cat([half.drawn[name] for half in halves])), name
+    for actuation in (whole, *halves):
+        actuation.drive()
+    assert torch.equal(whole.torque, torch.cat([half.torque for half in halves]))
+
+
+def test_draws_are_uniform_in_their_ranges_over_1e5_resets():
+    """Mean and variance of U(a, b) within 5 standard errors, and no joint's draws go with another's."""
+    actuation = drawn(num_envs=100_000)
+    for name in ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick"):
+        low, high = getattr(PAPER, name)
+        found, width = actuation.drawn[name].numpy(), high - low
+        assert low <= found.min() and found.max() <= high
+        count = found.size
+        assert abs(found.mean() - (low + high) / 2) < 5 * width / np.sqrt(12 * count), name
+        assert abs(found.var() - width**2 / 12) < 5 * width**2 / np.sqrt(180 * count), name
+        assert np.abs(np.corrcoef(found.T) - np.eye(3)).max() < 5 / np.sqrt(len(found)), name
+    gain, kick = actuation.drawn["gain"].flatten(), actuation.drawn["kick"].flatten()
+    assert abs(np.corrcoef(gain, kick)[0, 1]) < 5 / np.sqrt(len(gain))
+
+
+def test_noise_is_uniform_and_another_at_each_physics_step_episode_and_seed():
+    actuation = drawn(num_envs=20_000, spec=DriveSpec(torque_noise=0.1))
+    torques = []
+    for _ in range(3):
+        actuation.drive()
+        torques.append(actuation.torque.flatten().numpy().copy())
+    others = [
+        drawn(num_envs=20_000, episode=2, spec=DriveSpec(torque_noise=0.1)),
+        drawn(seed=1, num_envs=20_000, spec=DriveSpec(torque_noise=0.1)),
+    ]
+    for other in others:
+        other.drive()
+        torques.append(other.torque.flatten().numpy().copy())
+    for found in torques:
+        assert np.abs(found).max() <= 0.1 and abs(found.mean()) < 5 * 0.1 / np.sqrt(3 * found.size)
+        assert abs(found.var() - 0.01 / 3) < 5 * 0.01 * np.sqrt(4 / 45 / found.size)
+    assert np.abs(np.corrcoef(torques) - np.eye(5)).max() < 5 / np.sqrt(60_000)
+
+
+def test_whole_delays_are_drawn_with_both_ends():
+    delays = drawn(num_envs=3000, spec=DriveSpec(delay=(1, 3))).drawn["delay"].flatten()
+    counts = torch.bincount(delays.to(torch.int64), minlength=4)
+    assert counts[0] == 0 and len(counts) == 4
+    assert (counts[1:] - 3000).abs().max() < 5 * np.sqrt(9000 * 2 / 9)
+
+
+def test_only_chosen_environments_are_drawn_anew_and_placed():
+    actuation = drawn(num_envs=4)
+    before = {name: value.clone() for name, value in actuation.drawn.items()}
+    actuation.command(torch.ones(4, 3, dtype=torch.float64))
+    target = actuation.target.clone()
+    actuation.reset(torch.tensor([False, True, False, True]), torch.tensor([1, 2, 1, 2]))
+    for name, value in actuation.drawn.items():
+        assert torch.equal(value[[0, 2]], before[name][[0, 2]])
+        assert name == "delay" or not torch.equal(value[[1, 3]], before[name][[1, 3]])
+    assert torch.equal(actuation.target[[0, 2]], target[[0, 2]]) and not actuation.target[[1, 3]].any()
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (THREE, 'the scene has no joint "d"; known joints: a, b, c'),
+    (THREE.replace('name="a" joint="a"', 'name="a" joint="b"'), 'joint "a" has 0 actuators, expected one position actuator'),
+    (THREE.replace("<position name=\"a\" joint=\"a\" kp=\"1\" forcerange=\"-1 1\"/>", '<motor name="a" joint="a"/>'), 'the actuator of joint "a" is no position servo of gear 1'),
+])  # fmt: skip
+def test_joints_that_cannot_be_driven_are_named(text, message):
+    with pytest.raises(SimulationError) as caught:
+        Actuators.of(mujoco.MjModel.from_xml_string(text), ["b", "a", "d"] if "d" in message.split(";")[0][-3:] else ["a"])
+    assert str(caught.value).startswith(message)

@@ -1,0 +1,62 @@
+"""MuJoCo's options by name: the physics is that of a scene with these in its XML, on both simulators and in every variant."""
+
+import numpy as np
+import pytest
+from warp_cases import SCENE, module, warp
+
+import tgdsl
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
+OPTIONS = {"timestep": 0.004, "cone": "pyramidal", "iterations": 7, "gravity": [0.5, 0, -3], "impratio": 2}
+WRITTEN = '<option timestep="0.004" cone="pyramidal" iterations="7" gravity=".5 0 -3" impratio="2" integrator="implicitfast"/>'
+VARIANTS = {"variants": [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]}
+
+
+@BOTH
+@pytest.mark.parametrize("target", [None, VARIANTS], ids=["one", "variants"])
+def test_options_act_as_those_of_the_scene(tmp_path, simulator, target):
+    given = simulator(module(tmp_path, target=target), 3, options=OPTIONS, substeps=2, keyframe="home")
+    text = SCENE.replace('<option timestep="0.002" cone="elliptic" impratio="10" integrator="implicitfast"/>', WRITTEN)
+    assert text != SCENE
+    written = simulator(module(tmp_path, text, target=target), 3, substeps=2, keyframe="home")
+    assert given.control_step == written.control_step == 0.008
+    for _ in range(5):
+        given.step(np.array([0.1, -0.2]))
+        written.step(np.array([0.1, -0.2]))
+    np.testing.assert_array_equal(given.qpos.numpy(), written.qpos.numpy())
+    assert given.env_model(1).opt.iterations == 7
+
+
+def test_an_artefact_keeps_its_own_options(tmp_path):
+    touch = module(tmp_path)
+    tgdsl.simulate(touch, 1, options={"timestep": 0.01}).close()
+    assert tgdsl.simulate(touch, 1).control_step == 0.002
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"timestp": 1}, 'MuJoCo has no option "timestp"; did you mean "timestep"?'),
+        ({"cone": "eliptic"}, 'option cone is "eliptic"; did you mean "elliptic"?'),
+        ({"timestep": 0}, "option timestep is 0, expected a number more than 0"),
+        ({"timestep": float("nan")}, "option timestep is nan, expected a number more than 0"),
+        ({"iterations": 1.5}, "option iterations is 1.5, expected a whole number at least 0"),
+        ({"tolerance": -1}, "option tolerance is -1, expected a number at least 0"),
+        ({"gravity": 9.81}, "option gravity is 9.81, expected 3 numbers"),
+    ],
+)
+def test_options_that_cannot_be_are_named(tmp_path, simulator, options, message):
+    with pytest.raises(SimulationError) as caught:
+        simulator(module(tmp_path), 1, options=options)
+    assert str(caught.value) == message
+
+
+@BOTH
+def test_a_model_of_ones_own_has_its_own_options(tmp_path, simulator):
+    touch = module(tmp_path)
+    model = tgdsl.simulate(touch, 1).model
+    with pytest.raises(SimulationError, match="`options` are for the artefact's scene"):
+        simulator(touch, 1, model=model, options={"timestep": 0.01})

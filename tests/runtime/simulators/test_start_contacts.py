@@ -1,0 +1,154 @@
+"""Starts without a look for contacts, on both simulators: poses by MuJoCo's kinematics, no forces, and the others untouched."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from warp_cases import SCENE, module, wanting_contacts, warp
+
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulators.start_contacts import FIELDS
+
+BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
+DEEP = np.array([0, 0, 0.0295, 1, 0, 0, 0, 0.4, -0.1])
+"""The cube lies half a millimetre in the table, and the arm is elsewhere."""
+
+
+def tensors(state) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in vars(state).items() if isinstance(value, torch.Tensor)}
+
+
+def started(simulator, tmp_path, num_envs=4, **options):
+    touch, model = wanting_contacts(tmp_path)
+    sim = simulator(touch, num_envs, model=model, keyframe="home", **options)
+    sim.reset(qvel=np.zeros(8))
+    for _ in range(5):
+        sim.step(np.array([0.2, -0.3]))
+    return touch, sim
+
+
+@BOTH
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_poses_and_velocities_are_those_of_mujocos_kinematics_and_no_force_acts(tmp_path, simulator, substeps):
+    touch, sim = started(simulator, tmp_path, substeps=substeps)
+    before = tensors(sim.state())
+    qvel = np.linspace(-0.4, 0.3, sim.model.nv)
+    mask = torch.tensor([False, True, False, True])
+    sim.reset(mask, contacts="none", qpos=DEEP, qvel=qvel)
+    after, data = tensors(sim.state()), mujoco.MjData(sim.model)
+    data.qpos[:], data.qvel[:] = DEEP, qvel
+    mujoco.mj_forward(sim.model, data)
+    assert data.ncon == 4  # who looked for contacts would find some
+    for i, name in enumerate(touch.inputs.bodies):
+        body, velocity = sim.model.body(name).id, np.zeros(6)
+        mujoco.mj_objectVelocity(sim.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+        for env in (1, 3):
+            np.testing.assert_allclose(after["body_pos"][env, i], data.xpos[body], atol=1e-7)
+            np.testing.assert_allclose(after["body_quat"][env, i], data.xquat[body], atol=1e-6)
+            np.testing.assert_allclose(after["body_angvel"][env, i], velocity[:3], atol=1e-6)
+            np.testing.assert_allclose(after["body_linvel"][env, i], velocity[3:], atol=1e-6)
+    assert any(before[name].any() for name in FIELDS if name in before)
+    for name, value in after.items():
+        assert torch.equal(value[[0, 2]], before[name][[0, 2]]), name
+        if name in FIELDS:
+            assert not value[[1, 3]].any(), name
+
+
+@BOTH
+def test_the_step_after_is_that_of_a_start_with_a_look(tmp_path, simulator):
+    ends = []
+    for contacts in ("none", "evaluate"):
+        _, sim = started(simulator, tmp_path)
+        sim.reset([2], contacts=contacts, qpos=DEEP)
+        sim.step(np.array([0.1, 0.1]))
+        ends.append((sim.qpos.clone(), sim.qvel.clone(), tensors(sim.state())))
+    (qpos, qvel, state), (qpos_looked, qvel_looked, state_looked) = ends
+    assert torch.equal(qpos, qpos_looked) and torch.equal(qvel, qvel_looked)
+    assert state["contact_found"][2].any()
+    for name, value in state.items():
+        assert torch.equal(value, state_looked[name]), name
+
+
+@BOTH
+def test_a_start_stored_with_its_contacts_feels_what_it_felt(tmp_path, simulator):
+    _, sim = started(simulator, tmp_path)
+    sim.reset([0], qpos=DEEP)
+    stored = tensors(sim.state())
+    start = {name: stored[name][0] for name in FIELDS if name in stored}
+    assert start["contact_netforce"].any()
+    before = tensors(sim.state())
+    sim.reset([1, 3], contacts=start, qpos=DEEP)
+    sim.reset(torch.tensor([False, False, True, False]), contacts="none", qpos=DEEP)
+    after = tensors(sim.state())
+    for name, value in after.items():
+        assert torch.equal(value[0], before[name][0]), name
+        if name in FIELDS:
+            assert torch.equal(value[1], start[name]) and torch.equal(value[3], start[name]), name
+            assert not value[2].any(), name
+    sim.forward([1])  # who looks after all finds what is there
+    np.testing.assert_allclose(sim.state().contact_netforce[1], start["contact_netforce"], rtol=1e-5, atol=1e-6)
+
+
+@BOTH
+def test_what_contacts_cannot_be_is_named(tmp_path, simulator):
+    _, sim = started(simulator, tmp_path)
+    before = tensors(sim.state())
+    with pytest.raises(
+        SimulationError, match='contacts: this module wants no "contact_netfroce"; did you mean "contact_netforce"'
+    ):
+        sim.reset([0], contacts={"contact_netfroce": torch.zeros(3)})
+    with pytest.raises(SimulationError, match=r"contacts: contact_found has shape \(7,\), expected \(4, \d+\) or \(\d+,\)"):
+        sim.reset([0], contacts={"contact_found": torch.zeros(7)})
+    for name, value in tensors(sim.state()).items():
+        assert torch.equal(value, before[name]), name
+
+
+@BOTH
+def test_reset_environments_alone_are_read_and_the_others_keep_their_rows(tmp_path, simulator):
+    touch = module(tmp_path, noise={"white_noise": 1e-3})
+    sim = simulator(touch, 3, keyframe="home")
+    sim.step(np.zeros(2))
+    first = sim.read()["touch"].clone()
+    sim.reset([1], contacts="none", qpos=np.array([0, 0, 1.0, 1, 0, 0, 0, 0, 0]))
+    second = sim.read(torch.tensor([False, True, False]))["touch"].clone()
+    assert torch.equal(second[[0, 2]], first[[0, 2]]) and not torch.equal(second[1], first[1])
+
+
+# What drives a step, on both
+
+
+@BOTH
+@pytest.mark.parametrize("substeps", [1, 4])
+def test_a_drive_is_called_before_each_physics_step(tmp_path, simulator, substeps):
+    touch = module(
+        tmp_path,
+        SCENE.replace(
+            'type="box" size=".05 .05 .01" friction="1"', 'type="box" size=".05 .05 .01" contype="0" conaffinity="0"'
+        ),
+    )
+    driven, plain = (
+        simulator(touch, 2, keyframe="home", substeps=substeps),
+        mujoco.MjData(mujoco.MjModel.from_xml_string(SCENE)),
+    )
+    torques, model = [], driven.model
+
+    def drive() -> None:
+        """Damp the first joint of the arm by what its speed is now."""
+        torque = -0.02 * driven.qvel[:, 6]
+        driven._arrays["qfrc_applied"][:, 6] = torque
+        torques.append(float(torque[0]))
+
+    driven.drive = drive
+    mujoco.mj_resetDataKeyframe(model, plain := mujoco.MjData(model), model.key("home").id)
+    for _ in range(3):
+        driven.step(np.array([0.1, -0.1]))
+        for _ in range(substeps):
+            plain.qfrc_applied[6] = -0.02 * plain.qvel[6]
+            plain.ctrl[:] = [0.1, -0.1]
+            mujoco.mj_step(model, plain)
+    assert len(torques) == 3 * substeps and len(set(torques)) == len(torques)
+    np.testing.assert_allclose(driven.qvel[0], plain.qvel, rtol=1e-4, atol=1e-5)
+    driven.drive = None
+    driven.step()
+    assert len(torques) == 3 * substeps

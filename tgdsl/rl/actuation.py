@@ -1,0 +1,316 @@
+"""Actuators of a policy: from an action to torques, with what real drives do that ideal ones do not.
+
+An action a ∈ [−1, 1] per joint becomes a target once per control step; before each physics step (time t, position q, speed q̇)
+the drive makes a torque of it:
+
+    absolute    w = q_low + (a + 1)/2 (q_high − q_low)
+    relative    w = clip(w' + s a, q_low, q_high)                  w' the target before, s the action's scale [rad]
+    smoothed    w ← (1 − σ) w + σ w'
+    delayed     w of `delay` control steps ago
+    play        u = clip(u', w + b − β/2, w + b + β/2)             u' before, b position bias, β backlash [rad]
+    deadband    e = sign(u − q) max(|u − q| − δ, 0)
+    drive       τ = clip(g_p k_p e − g_d k_d q̇, ± S τ_max)
+    breakaway   τ ← κ τ  where |q̇| < `BREAKAWAY_SPEED`
+    speed       |τ| ≤ τ_max max(0, 1 − |q̇|/q̇_max)  where τ q̇ > 0    (only with a `top_speed`)
+    noise       τ ← τ + ν τ_max U(−1, 1)
+
+k_p, k_d and τ_max are those of the robot's position actuators. MuJoCo's own actuator is given the control q + e, and what τ
+differs from its torque is a force on the joint: so what is neither drawn nor chosen costs nothing and stays implicit in
+MuJoCo's integrator. Factors g, S, κ and b, δ, β and the delay are drawn for each joint and environment at reset; noise at each
+physics step. A robot whose joint damping is τ_max over its rated speed, as the XHand1's is, has the line of `top_speed`
+already.
+
+Source of gains, strength, bias, deadband, backlash, kick and noise: Chung et al., *Tactile Genesis*, appendix, "Domain
+Randomization". There the bias is printed in metres, and neither deadband, backlash nor kick are defined: the above is ours.
+Delay and top speed are ours.
+
+Shapes: `env` environments, `joint` actuated joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean, listed
+from tgdsl.fields.models import NonNegative, Quantity, Range, RangeOf, SpecModel
+from tgdsl.rl.draws import Draws
+
+BREAKAWAY_SPEED = 0.05
+"""Below this a joint counts as at rest, where its drive has to break away [rad/s]."""
+ONE: Range = (1.0, 1.0)
+ZERO: Range = (0.0, 0.0)
+Factor = Annotated[Range, RangeOf("number", gt=0.0)]
+
+
+class ActionSpec(SpecModel):
+    """How an action of a policy is understood."""
+
+    mode: Literal["relative", "absolute"] = "relative"
+    """Whether an action moves the target, or is the target, −1 and 1 being the ends of the joint's range."""
+    scale: Annotated[float, Quantity("angle", gt=0.0)] = 0.05
+    """s, what an action of 1 moves a target by in a control step [rad]; relative actions alone."""
+    smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
+    """σ, share of the target before in the new one, less than 1."""
+
+
+class DriveSpec(SpecModel):
+    """What drives do that ideal ones do not. All may be ranges, drawn for each joint and environment at reset."""
+
+    gain: Factor = ONE
+    """g_p, factor on the proportional gain."""
+    damping: Factor = ONE
+    """g_d, factor on the derivative gain."""
+    strength: Factor = ONE
+    """S, factor on the largest torque."""
+    bias: Annotated[Range, RangeOf("angle")] = ZERO
+    """b, what is added to a position target [rad]."""
+    deadband: Annotated[Range, RangeOf("angle", ge=0.0)] = ZERO
+    """δ, position error without torque [rad]."""
+    backlash: Annotated[Range, RangeOf("angle", ge=0.0)] = ZERO
+    """β, play that a target crosses at a reversal [rad]."""
+    kick: Factor = ONE
+    """κ, factor on the torque of a joint at rest."""
+    torque_noise: NonNegative = 0.0
+    """ν, uniform noise of the torque at each physics step, as a share of the largest torque."""
+    delay: Annotated[Range, RangeOf("number", ge=0.0)] = ZERO
+    """How many control steps late a target arrives; whole numbers, both ends included."""
+    top_speed: Annotated[float, Quantity("number", gt=0.0)] | Literal["robot"] | None = None
+    """q̇_max, speed at which the largest torque that drives on has fallen to zero [rad/s]; `robot`: τ_max over joint damping."""
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether a drive is the robot's actuator and nothing else."""
+        ideal = DriveSpec()
+        return all(getattr(self, name) == getattr(ideal, name) for name in type(self).model_fields if name != "delay")
+
+
+PAPER = DriveSpec(
+    gain=(0.95, 1.05),
+    damping=(0.95, 1.05),
+    strength=(0.95, 1.05),
+    bias=(-0.01, 0.01),
+    deadband=(0.0, 0.005),
+    backlash=(0.0, 0.01),
+    kick=(0.9, 1.1),
+    torque_noise=0.1,
+)
+"""The paper's ranges; its bias in rad."""
+
+
+@dataclass(frozen=True, eq=False)
+class Actuators:
+    """The position actuators of some joints, and where both stand in a model.
+
+    Attributes:
+        names: The joints.
+        actuator: Index of each one's actuator.
+        qpos: Where each stands in `qpos`.
+        dof: Where each stands in `qvel`.
+        low: Lower end of each range [rad].
+        high: Upper end of each range [rad].
+        stiffness: k_p [N·m/rad].
+        damping: k_d of the actuator, not of the joint [N·m·s/rad].
+        limit: τ_max [N·m]; infinite where there is none.
+        top_speed: Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none.
+    """
+
+    names: tuple[str, ...]
+    actuator: Int[np.ndarray, " joint"]
+    qpos: Int[np.ndarray, " joint"]
+    dof: Int[np.ndarray, " joint"]
+    low: Float[np.ndarray, " joint"]
+    high: Float[np.ndarray, " joint"]
+    stiffness: Float[np.ndarray, " joint"]
+    damping: Float[np.ndarray, " joint"]
+    limit: Float[np.ndarray, " joint"]
+    top_speed: Float[np.ndarray, " joint"]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:
+        """Look up the actuators of joints.
+
+        Raises:
+            SimulationError: If there is no such joint, it has no limits, or no position actuator of its own.
+        """
+        known = [model.joint(i).name for i in range(model.njnt)]
+        rows = []
+        for name in names:
+            if name not in known:
+                raise SimulationError(f'the scene has no joint "{name}"; {did_you_mean(name, known, "joints")}')
+            rows.append(_actuator_row(model, name))
+        columns = [np.array(column) for column in zip(*rows, strict=True)]
+        return cls(tuple(names), *columns)
+
+
+def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
+    """Return the columns of `Actuators` for one joint."""
+    joint = model.joint(name)
+    own = np.flatnonzero((model.actuator_trnid[:, 0] == joint.id) & (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
+    if len(own) != 1:
+        raise SimulationError(f'joint "{name}" has {len(own)} actuators, expected one position actuator')
+    i = int(own[0])
+    stiffness, (bias, spring, damper) = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, :3]
+    is_position = (
+        model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
+        and model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
+        and model.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
+        and spring == -stiffness
+        and not bias
+        and model.actuator_gear[i, 0] == 1
+    )
+    if not is_position or not model.jnt_limited[joint.id]:
+        what = f'the actuator of joint "{name}" is no position servo of gear 1, or the joint has no range'
+        raise SimulationError(f"{what}; a policy's actions are targets within it")
+    limit = float(model.actuator_forcerange[i, 1]) if model.actuator_forcelimited[i] else np.inf
+    dof = int(model.jnt_dofadr[joint.id])
+    passive = float(model.dof_damping[dof])
+    low, high = model.jnt_range[joint.id].tolist()
+    top_speed = limit / passive if passive and np.isfinite(limit) else np.inf
+    return (i, int(model.jnt_qposadr[joint.id]), dof, low, high, float(stiffness), -float(damper), limit, top_speed)
+
+
+class Actuation:
+    """The drives of all environments: their targets, what was drawn for each, and their torques.
+
+    Attributes:
+        target: Position targets after the last action [rad].
+        torque: What each drive exerted in the last physics step [N·m].
+        drawn: What was drawn for each drive, by the names of `DriveSpec`.
+    """
+
+    target: Float[Tensor, "env joint"]
+    torque: Float[Tensor, "env joint"]
+    drawn: Mapping[str, Float[Tensor, "env joint"]]
+
+    def __init__(
+        self,
+        actuators: Actuators,
+        arrays: Mapping[str, Tensor],
+        action: ActionSpec,
+        drive: DriveSpec,
+        draws: Draws,
+    ):
+        """Begin with all drives ideal, at their joints' present positions; `reset` draws.
+
+        Args:
+            actuators: The actuators.
+            arrays: A simulation's live tensors (env, …): `qpos`, `qvel`, `ctrl`, `qfrc_applied`.
+            action: How actions are understood.
+            drive: What drives do that ideal ones do not.
+            draws: Where random numbers are from.
+
+        Raises:
+            SimulationError: If a drive's noise, kick or speed limit needs a largest torque that a joint does not have.
+        """
+        self._arrays, self._draws, self.spec, self.action = arrays, draws, drive, action
+        qpos = arrays["qpos"]
+        device, dtype, num_envs, num = qpos.device, qpos.dtype, len(qpos), len(actuators.names)
+        unlimited = [name for name, limit in zip(actuators.names, actuators.limit, strict=True) if not np.isfinite(limit)]
+        if unlimited and (drive.torque_noise or drive.top_speed or drive.strength != ONE):
+            raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
+        self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
+        values = [f.name for f in fields(actuators) if f.name not in ("names", *self._index)]
+        self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
+        self.drawn = {
+            name: torch.full((num_envs, num), getattr(DriveSpec(), name)[0], device=device, dtype=dtype) for name in _DRAWN
+        }
+        self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
+        self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
+        self._play = torch.zeros_like(self.target)
+        self._count = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of physics steps, above them of episodes
+        self._is_ideal = drive.is_ideal
+        self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
+        self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> None:
+        """Draw the drives of some environments anew, which hold the positions that their joints now have.
+
+        Args:
+            chosen: The environments.
+            episode: How often each was reset.
+        """
+        for name, own in self.drawn.items():
+            low, high = getattr(self.spec, name)
+            if low == high == getattr(DriveSpec(), name)[0]:
+                continue
+            if name == "delay":
+                new = self._draws.integers(name, episode, own.shape[1], int(low), int(high))
+            else:
+                new = self._draws.uniform(name, episode, own.shape[1], low, high)
+            own.copy_(torch.where(chosen[:, None], new.to(own.dtype), own))
+        self._count.copy_(torch.where(chosen, episode << 32, self._count))
+        self.place(chosen)
+
+    def place(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Have the drives of some environments hold the positions that their joints now have."""
+        now = self._arrays["qpos"][:, self._index["qpos"]]
+        for held in (self.target, self._play, *self._past):
+            held.copy_(torch.where(chosen[:, None], now, held))
+        self._play.copy_(torch.where(chosen[:, None], now + self.drawn["bias"], self._play))
+        self.torque.masked_fill_(chosen[:, None], 0.0)
+
+    def command(self, action: Float[Tensor, "env joint"]) -> None:
+        """Take an action of each environment: new targets, of which the drives know once they arrive."""
+        low, high, action = self._values["low"], self._values["high"], action.to(self.target.dtype).clamp(-1.0, 1.0)
+        if self.action.mode == "absolute":
+            wanted = low + 0.5 * (action + 1.0) * (high - low)
+        else:
+            wanted = torch.minimum(torch.maximum(self.target + self.action.scale * action, low), high)
+        self.target.copy_(torch.lerp(wanted, self.target, self.action.smoothing))
+        for i in range(len(self._past) - 1, 0, -1):
+            self._past[i].copy_(self._past[i - 1])
+        self._past[0].copy_(self.target)
+        if self._is_ideal:
+            self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()
+
+    @property
+    def drives(self) -> bool:
+        """Whether `drive` has to be called before each physics step."""
+        return not self._is_ideal
+
+    def drive(self) -> None:
+        """Make a torque of each target, before a physics step: see the top of this page."""
+        arrays, own, drawn = self._arrays, self._values, self.drawn
+        pos, speed = arrays["qpos"][:, self._index["qpos"]], arrays["qvel"][:, self._index["dof"]]
+        wanted, half = self._arrived() + drawn["bias"], 0.5 * drawn["backlash"]
+        self._play.copy_(torch.minimum(torch.maximum(self._play, wanted - half), wanted + half))
+        error = self._play - pos
+        error = error.sign() * (error.abs() - drawn["deadband"]).clamp(min=0.0)
+        # MuJoCo clips controls to the joint's range: what is beyond it is part of the force on the joint.
+        control = torch.minimum(torch.maximum(pos + error, own["low"]), own["high"])
+        plain = _within(own["stiffness"] * (control - pos) - own["damping"] * speed, own["limit"])
+        torque = drawn["gain"] * own["stiffness"] * error - drawn["damping"] * own["damping"] * speed
+        torque = _within(torque, drawn["strength"] * own["limit"])
+        torque = torch.where(speed.abs() < BREAKAWAY_SPEED, drawn["kick"] * torque, torque)
+        if self.spec.top_speed is not None:
+            share = (1.0 - speed.abs() / self._top_speed).clamp(min=0.0)
+            torque = torch.where(torque * speed > 0, _within(torque, share * own["limit"]), torque)
+        if self.spec.torque_noise:
+            noise = self._draws.uniform("torque_noise", self._count, torque.shape[1], -1.0, 1.0)
+            torque = torque + self.spec.torque_noise * own["limit"] * noise.to(torque.dtype)
+        self._count += 1
+        self.torque.copy_(torque)
+        arrays["ctrl"][:, self._index["actuator"]] = control
+        arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
+
+    def _arrived(self) -> Float[Tensor, "env joint"]:
+        """Return the targets that have arrived at the drives."""
+        if len(self._past) == 1:
+            return self._past[0]
+        return self._past.gather(0, self.drawn["delay"].to(torch.int64)[None])[0]
+
+
+_DRAWN = ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick", "delay")
+"""What is drawn for each drive."""
+
+
+def _within(value: Tensor, limit: Tensor) -> Tensor:
+    return torch.minimum(torch.maximum(value, -limit), limit)

@@ -1,0 +1,68 @@
+"""Random quantities of environments, counted and not drawn: each is a hash of what it is for.
+
+A number depends on the seed, on what it is for, on its environment, counted over all processes, and on a count of that
+environment's own, such as its episode. So it is the same on every device, in any batch, and whatever else is random.
+
+The words are those of the sensors' noise: see `tgdsl.sensors.noise.random`.
+
+Shapes: `env` environments, `num` numbers of one environment.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.sensors.noise.random import Stream, mix, normal_pair, sensor_key, uniform, words
+
+
+class Draws:
+    """The random numbers of some environments."""
+
+    def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0):
+        """Begin.
+
+        Args:
+            seed: Another seed, other numbers.
+            num_envs: Number of environments.
+            device: Where the numbers are wanted.
+            first_env: Number of the first environment, counted over all processes.
+        """
+        self._seed, self._device = seed, torch.device(device)
+        self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
+        self._keys: dict[str, Int[Tensor, " half"]] = {}
+        self._index: dict[int, Int[Tensor, " num"]] = {}
+
+    def uniform(
+        self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
+    ) -> Float[Tensor, "env num"]:
+        """Return numbers between two bounds, float32.
+
+        Args:
+            what: What they are for, such as "friction".
+            counter: A count of each environment's own: other numbers at each count.
+            num: How many each environment has.
+            low: Lower bound.
+            high: Upper bound.
+        """
+        return low + (high - low) * uniform(self._words(what, counter, num), torch.float32)
+
+    def normal(self, what: str, counter: Int[Tensor, " env"], num: int) -> Float[Tensor, "env num"]:
+        """Return numbers of mean 0 and variance 1, float32: see `uniform`."""
+        first, second = normal_pair(self._words(what, counter, (num + 1) // 2), torch.float32)
+        return torch.cat([first, second], dim=1)[:, :num]
+
+    def integers(self, what: str, counter: Int[Tensor, " env"], num: int, low: int, high: int) -> Int[Tensor, "env num"]:
+        """Return whole numbers from `low` to `high`, both included: see `uniform`."""
+        share = uniform(self._words(what, counter, num), torch.float32)
+        return low + (share * (high - low + 1)).to(torch.int64).clamp(max=high - low)
+
+    def _words(self, what: str, counter: Int[Tensor, " env"], num: int) -> Int[Tensor, "env num"]:
+        if what not in self._keys:  # at the first call: a graph that is captured later copies nothing from the host
+            self._keys[what] = torch.tensor(sensor_key(self._seed, what), dtype=torch.int32, device=self._device)
+        if num not in self._index:
+            self._index[num] = torch.arange(num, dtype=torch.int32, device=self._device)
+        low, high = counter.to(torch.int32)[:, None], mix((counter >> 32).to(torch.int32))[:, None]
+        begun = mix(mix(mix(self._envs.to(torch.int32)[:, None] ^ self._keys[what]) ^ low) ^ high)
+        return words(Stream(begun[:, :1], begun[:, 1:]), self._index[num])

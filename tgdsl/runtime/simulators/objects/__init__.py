@@ -1,0 +1,1 @@
+"""Objects that differ between environments: variants, sizes, masses and frictions."""

@@ -1,0 +1,95 @@
+"""Contacts of environments that a reset has placed without looking for any: none, or those that were stored with the start.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.module.state import SceneState, shape_of
+from tgdsl.plan.inputs import Inputs
+
+FIELDS = (
+    *("contact_found", "contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce"),
+    "joint_effort",
+)
+"""Fields of a state that follow from forces."""
+Contacts = Literal["evaluate", "none"] | Mapping[str, Tensor]
+"""How the contacts of a start are found: see `Simulation.reset`."""
+
+
+class StartContacts:
+    """The contacts of environments that were placed since the last step, in the place of what the simulator has."""
+
+    def __init__(self, inputs: Inputs):
+        """Begin: nothing was placed."""
+        self._inputs = inputs
+        self._is_placed: Bool[Tensor, " env"] | None = None
+        self._values: dict[str, Tensor] = {}
+
+    def forget(self, chosen: Bool[Tensor, " env"] | None = None) -> None:
+        """Forget some environments (default: all), whose contacts the simulator has evaluated."""
+        if chosen is None:
+            self._is_placed, self._values = None, {}
+        elif self._is_placed is not None:
+            self._is_placed = self._is_placed & ~chosen
+
+    def place(self, chosen: Bool[Tensor, " env"], contacts: Contacts) -> None:
+        """Note environments that were placed, and their contacts.
+
+        Args:
+            chosen: The environments.
+            contacts: "none", or fields of a state by name, one row for all environments alike or (env, …); those left out are
+                zero.
+
+        Raises:
+            SimulationError: If there is no such field, or a shape does not fit.
+        """
+        given = {} if isinstance(contacts, str) else {name: self._fitting(name, contacts[name], chosen) for name in contacts}
+        for name in {**self._values, **given}:
+            old, new = self._values.get(name), given.get(name)
+            like = old if new is None else new
+            assert like is not None
+            old, new = (torch.zeros_like(like) if value is None else value for value in (old, new))
+            self._values[name] = torch.where(_over(chosen, like), new, old.to(new.dtype))
+        self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
+
+    def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
+        """Return a state in which placed environments have the contacts of their start.
+
+        Args:
+            state: What the simulator has.
+            is_stored: Whether those that were stored are of this state's pairs and joints; if not, all are zero.
+        """
+        if self._is_placed is None:
+            return state
+        values: dict[str, Any] = {}
+        for name in FIELDS:
+            now = getattr(state, name)
+            if now is not None:
+                start = self._values.get(name) if is_stored else None
+                value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
+                values[name] = torch.where(_over(self._is_placed.to(now.device), now), value, now)
+        return dataclasses.replace(state, **values)
+
+    def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:
+        known = [field for field in FIELDS if field in self._inputs.fields]
+        if name not in known:
+            raise SimulationError(f'contacts: this module wants no "{name}"; {did_you_mean(name, known, "fields")}')
+        shape = (len(chosen), *shape_of(name, self._inputs))
+        if tuple(value.shape) not in (shape, shape[1:]):
+            raise SimulationError(f"contacts: {name} has shape {tuple(value.shape)}, expected {shape} or {shape[1:]}")
+        return value.to(chosen.device).expand(shape)
+
+
+def _over(chosen: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:
+    """Return a mask over environments that broadcasts over their values."""
+    return chosen.view(-1, *[1] * (values.ndim - 1))

@@ -1,0 +1,206 @@
+"""What a task looks at besides touch: bodies, sites, joints and pairs by name, all of the instant that readings are of.
+
+Shapes: `env` environments, `body`, `site`, `joint`, `actuator` and `pair` as a `Watch` lists them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.module.state import SceneState
+from tgdsl.plan.inputs import Inputs
+
+_BODY_FIELDS = ("body_pos", "body_quat", "body_linvel", "body_angvel")
+_JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Names of what is looked at: see `tgdsl.simulate`.
+
+    Attributes:
+        bodies: Bodies, for their poses and velocities.
+        sites: Sites, for their poses.
+        joints: Hinges and slides, for positions, velocities and efforts.
+        actuators: Actuators, for the controls that acted.
+        pairs: Pairs (link, object) whose whole force is read; a sensor of the module has to read it too.
+    """
+
+    bodies: tuple[str, ...] = ()
+    sites: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    actuators: tuple[str, ...] = ()
+    pairs: tuple[tuple[str, str], ...] = ()
+
+
+class BodyMotion(NamedTuple):
+    """A body's frame in the world: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s]."""
+
+    pos: Float[Tensor, "env 3"]
+    quat: Float[Tensor, "env 4"]
+    linvel: Float[Tensor, "env 3"]
+    angvel: Float[Tensor, "env 3"]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What was looked at, of one instant, in world axes.
+
+    Attributes:
+        watch: The names, in the order of the tensors.
+        body_pos: Position of each body's frame [m].
+        body_quat: Orientation of each body, w, x, y, z.
+        body_linvel: Velocity of each body frame's origin [m/s].
+        body_angvel: Angular velocity of each body [rad/s].
+        site_pos: Position of each site [m].
+        site_quat: Orientation of each site, w, x, y, z.
+        joint_pos: Position of each joint [rad; slides: m].
+        joint_vel: Velocity of each joint [rad/s; slides: m/s].
+        joint_effort: What the actuators exert on each joint [N·m; slides: N].
+        last_action: Control of each actuator that acted, in its own unit.
+        pair_force: Whole force of each pair's object on its link [N].
+    """
+
+    watch: Watch
+    body_pos: Float[Tensor, "env body 3"]
+    body_quat: Float[Tensor, "env body 4"]
+    body_linvel: Float[Tensor, "env body 3"]
+    body_angvel: Float[Tensor, "env body 3"]
+    site_pos: Float[Tensor, "env site 3"]
+    site_quat: Float[Tensor, "env site 4"]
+    joint_pos: Float[Tensor, "env joint"]
+    joint_vel: Float[Tensor, "env joint"]
+    joint_effort: Float[Tensor, "env joint"]
+    last_action: Float[Tensor, "env actuator"]
+    pair_force: Float[Tensor, "env pair 3"]
+
+    def body(self, name: str) -> BodyMotion:
+        """Return the motion of a body by name.
+
+        Raises:
+            SimulationError: If it is not watched.
+        """
+        if name not in self.watch.bodies:
+            raise SimulationError(
+                f'the body "{name}" is not watched; {did_you_mean(name, self.watch.bodies, "watched bodies")}'
+            )
+        i = self.watch.bodies.index(name)
+        return BodyMotion(self.body_pos[:, i], self.body_quat[:, i], self.body_linvel[:, i], self.body_angvel[:, i])
+
+
+class WatchReader:
+    """Makes a `Watched` of what a simulator reads."""
+
+    def __init__(self, watch: Watch, inputs: Inputs, model: mujoco.MjModel, device: torch.device):
+        """Look up sites and pairs.
+
+        Args:
+            watch: What is looked at.
+            inputs: What the module wants.
+            model: The scene.
+            device: Where the tensors are.
+
+        Raises:
+            SimulationError: If the model has no such site, or the module does not read a pair.
+        """
+        self._watch, self._device = watch, device
+        sites = np.array([_site(model, name) for name in watch.sites], dtype=np.int64)
+        of_sites = [model.body(int(model.site_bodyid[site])).name for site in sites]
+        bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
+        self.inputs = _inputs(watch, bodies)
+        """What a simulator has to read for it."""
+        self._carriers = [bodies.index(name) for name in of_sites]
+        self._site_pos = torch.from_numpy(model.site_pos[sites]).to(device)
+        self._site_quat = torch.from_numpy(model.site_quat[sites]).to(device)
+        self._pairs = [_pair(inputs, pair) for pair in watch.pairs]
+
+    @property
+    def has_pairs(self) -> bool:
+        """Whether forces of pairs are watched."""
+        return bool(self._pairs)
+
+    def watched(self, values: SceneState, state: SceneState | None) -> Watched:
+        """Return what was looked at.
+
+        Args:
+            values: The fields of `inputs`.
+            state: The module's state of the same instant; only needed if pairs are watched.
+        """
+        pos, quat, linvel, angvel = (_present(getattr(values, name)) for name in _BODY_FIELDS)
+        joint_pos, joint_vel, joint_effort, last_action = (_present(getattr(values, name)) for name in _JOINT_FIELDS)
+        num, carried = len(self._watch.bodies), quat[:, self._carriers]
+        site_pos, site_quat = self._site_pos.to(pos.dtype), self._site_quat.to(pos.dtype).expand(len(pos), -1, -1)
+        force = pos.new_zeros((len(pos), 0, 3))
+        if self._pairs:
+            assert state is not None and state.contact_netforce is not None
+            force = state.contact_netforce[:, self._pairs]
+        return Watched(
+            watch=self._watch,
+            body_pos=pos[:, :num],
+            body_quat=quat[:, :num],
+            body_linvel=linvel[:, :num],
+            body_angvel=angvel[:, :num],
+            site_pos=pos[:, self._carriers] + rotated(carried, site_pos.expand(len(pos), -1, -1)),
+            site_quat=product(carried, site_quat),
+            joint_pos=joint_pos,
+            joint_vel=joint_vel,
+            joint_effort=joint_effort,
+            last_action=last_action,
+            pair_force=force,
+        )
+
+
+def rotated(quat: Float[Tensor, "*n 4"], vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Return vectors turned by unit quaternions w, x, y, z."""
+    w, axis = quat[..., :1], quat[..., 1:]
+    twice = 2.0 * torch.linalg.cross(axis, vector)
+    return vector + w * twice + torch.linalg.cross(axis, twice)
+
+
+def product(left: Float[Tensor, "*n 4"], right: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
+    """Return products of quaternions w, x, y, z: first the right one turns, then the left one."""
+    w, v, other, u = left[..., :1], left[..., 1:], right[..., :1], right[..., 1:]
+    scalar = w * other - (v * u).sum(dim=-1, keepdim=True)
+    return torch.cat([scalar, w * u + other * v + torch.linalg.cross(v, u)], dim=-1)
+
+
+def _inputs(watch: Watch, bodies: Sequence[str]) -> Inputs:
+    """Return what a simulator has to read: all fields of bodies and joints."""
+    return Inputs((*_BODY_FIELDS, *_JOINT_FIELDS), tuple(bodies), (), {}, 0, joints=watch.joints, actuators=watch.actuators)
+
+
+def merged_joints(inputs: Inputs, watch: WatchReader | None) -> Inputs:
+    """Return inputs with the joints' fields that a watch needs besides: what is to be kept from before a physics step."""
+    if watch is None:
+        return inputs
+    return replace(inputs, fields=tuple(dict.fromkeys((*inputs.fields, *watch.inputs.fields))))
+
+
+def _present(value: Tensor | None) -> Tensor:
+    assert value is not None  # `inputs` wants all of them
+    return value
+
+
+def _site(model: mujoco.MjModel, name: str) -> int:
+    try:
+        return int(model.site(name).id)
+    except KeyError as error:
+        known = [model.site(i).name for i in range(model.nsite)]
+        raise SimulationError(f'the scene has no site "{name}"; {did_you_mean(name, known, "sites")}') from error
+
+
+def _pair(inputs: Inputs, wanted: tuple[str, str]) -> int:
+    known = [(pair.link, pair.object) for pair in inputs.pairs]
+    if "contact_netforce" not in inputs.fields or wanted not in known:
+        what = f"no sensor of this module reads the whole force of {wanted[1]} on {wanted[0]}"
+        raise SimulationError(f"{what}; add one of kind link_contact on {wanted[0]} that feels {wanted[1]}")
+    return known.index(wanted)

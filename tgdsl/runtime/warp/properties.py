@@ -1,0 +1,82 @@
+"""Mass and friction of objects in MuJoCo Warp's environments, as fields of the model that each has of its own.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS, PER_ENV, ObjectProperties, RigidObject
+
+
+class WorldProperties(ObjectProperties):
+    """Masses and frictions of objects, changed on the device without waiting."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        model: mujoco.MjModel,
+        bodies_of: Mapping[str, str],
+        num_envs: int,
+        device: torch.device,
+    ):
+        """Begin: all environments are as the scene has them.
+
+        Args:
+            parameters: The fields that environments have of their own, (env, …).
+            model: The scene.
+            bodies_of: Body of each of the document's objects.
+            num_envs: Number of environments.
+            device: Where physics runs.
+        """
+        super().__init__(model, bodies_of, num_envs, device)
+        self._parameters = parameters
+        self._indices: dict[tuple[str, str], Tensor] = {}
+
+    def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
+        self._check("mass")
+        if not target.is_tree:
+            what = f'"{target.name}" is part of a kinematic tree, or its joints have armature'
+            raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
+        own, inertia, subtree, body, dof = (self._parameters[name] for name in MASS_FIELDS)
+        bodies, above, dofs = (self._index(target, name, own.device) for name in ("bodies", "above", "dofs"))
+        before = own[:, bodies].sum(dim=1)
+        factor = torch.where(mask, mass.to(own.dtype) / before, 1.0)[:, None]
+        for array, columns, scale in ((own, bodies, factor), (subtree, bodies, factor), (dof, dofs, 1.0 / factor)):
+            array[:, columns] = array[:, columns] * scale
+        for array, scale in ((inertia, factor), (body, 1.0 / factor)):
+            array[:, bodies] = array[:, bodies] * scale[:, :, None]
+        subtree[:, above] = subtree[:, above] + before[:, None] * (factor - 1.0)
+
+    def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
+        self._check("friction")
+        own = self._parameters["geom_friction"]
+        geoms = self._index(target, "geoms", own.device)
+        own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
+
+    def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
+        self._check("mass")
+        own = self._parameters["body_mass"]
+        return own[:, self._index(target, "bodies", own.device)].sum(dim=1)
+
+    def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
+        self._check("friction")
+        own = self._parameters["geom_friction"]
+        return own[:, self._index(target, "geoms", own.device), 0].amax(dim=1)
+
+    def _check(self, word: str) -> None:
+        if not self._parameters.keys() >= set(PER_ENV[word]):
+            raise SimulationError(f'environments share each {word}; simulate(..., per_env=("{word}",)) gives them their own')
+
+    def _index(self, target: RigidObject, name: str, device: torch.device) -> Tensor:
+        key = (target.name, name)
+        if key not in self._indices:
+            self._indices[key] = torch.from_numpy(getattr(target, name)).to(device)
+        return self._indices[key]
