@@ -8,6 +8,7 @@ The evidence, in the order in which it decides:
 2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
    other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
    against its range. A hinge of a curling finger that has its range against it stays undecided.
+   The jaw that turns against a fixed one closes at the end at which it is beside that, see `jaws`.
 3. The range alone: the only hinge of a chain closes at the far end of a range that bends away from its start; that is weak.
 """
 
@@ -170,25 +171,42 @@ class Closing:
         """Return the joints of which to find the closed end: those that spread fingers are not among them."""
         curled = {self.chain[self.segment(joint)] for joint in self.sense}
         one_way = {joint for joint in candidates if abs(self.lean[joint]) == 1.0}
+        hinges = {joint for joint in candidates if int(self.tree.model.jnt_type[joint]) == _HINGE}
+        free = hinges - self.sense.keys() - one_way
+        spreading = self._spreading(free, one_way)
         found = []
         for joint in candidates:
             segment = self.segment(joint)
             own = [other for other in candidates if self.segment(other) == segment]
             rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
-            is_free = joint not in self.sense and joint not in one_way and int(self.tree.model.jnt_type[joint]) == _HINGE
-            spreads = is_free and (self.chain[segment] in curled or self._is_across(joint, one_way))
+            spreads = joint in spreading or (joint in free and self.chain[segment] in curled)
             if rivals == [joint] and not spreads:
                 found.append(joint)
         return found
 
-    def _is_across(self, joint: int, one_way: Set[int]) -> bool:
-        """Return whether hinges that bend one way follow a joint in its chain, none of them about an axis parallel to its own."""
+    def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
+        """Return the joints that spread two fingers or more: about parallel axes, across those of hinges that bend one way.
+
+        A thumb's, which no other finger has, may bring it before the palm.
+
+        Args:
+            free: Hinges that bend to neither side.
+            one_way: Joints that bend one way only.
+        """
         path = {other: self.tree.path(self.segment(other)) for other in one_way}
-        beyond = [other for other in one_way if other != joint and self.segment(joint) in path[other][1:]]
-        return bool(beyond) and not any(abs(cosine) > PARALLEL for o in beyond for cosine in self._cosines(joint, o))
+        axes = []
+        for joint in sorted(free):
+            beyond = [other for other in one_way if other != joint and self.segment(joint) in path[other][1:]]
+            if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
+                axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.turned[joint].items()]
+        return {
+            one
+            for one, chain, axis in axes
+            if any(chain != own_chain and abs(axis @ own) > PARALLEL for _, own_chain, own in axes)
+        }
 
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
-        gain = half + whole if _is_clear(half, whole) else 0.0
+        gain = self.hand.closes or (half + whole if _is_clear(half, whole) else 0.0)
         sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
         siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
         doubt = ""
@@ -218,9 +236,9 @@ class Closing:
         return (at_low - at_high) / max(at_low, at_high, 1e-9)
 
     def _points(self, values: Mapping[int, float]) -> Float[np.ndarray, "point 3"]:
-        """Return the centres of the tips, and of the palm or the fixed jaw if there is one, in the world [m]."""
+        """Return the centres of the tips, and of the palm if there is one, in the world [m]."""
         data = self.poses.kinematics(self.poses.posed(values))
-        bodies = [*self.hand.tips, *(body for body in (self.hand.palm, self.hand.jaw) if body is not None)]
+        bodies = [*self.hand.tips, *([self.hand.palm] if self.hand.palm is not None else [])]
         return np.array([self.tree.centre(body, data) for body in bodies]).reshape(-1, 3)
 
 

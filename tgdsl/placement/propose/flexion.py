@@ -2,8 +2,8 @@
 
 A link's inner side faces where it is carried, in the open pose, as the nearest joint above it that has a lever on it closes. A
 link before all joints that close takes the side of the nearest link beyond. The last links of two chains that close on each
-other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close, a fixed
-jaw's the moving one.
+other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close, a
+fixed jaw's the moving one.
 """
 
 from __future__ import annotations

@@ -150,6 +150,7 @@ class Hand:
         fingers: All bodies that move against the base, tips included.
         length: Length of the longest chain [m].
         jaw: Of a gripper of one jaw, the body of the base that this closes on.
+        closes: Toward which end of its range, ±1, this jaw closes; 0 of other hands.
     """
 
     base: int
@@ -160,6 +161,7 @@ class Hand:
     fingers: list[int]
     length: float
     jaw: int | None = None
+    closes: float = 0.0
 
 
 def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTree:

@@ -33,8 +33,8 @@ def angles_are_misread(model: mujoco.MjModel) -> bool:
 def as_meant(model: mujoco.MjModel) -> mujoco.MjModel:
     """Return a model whose joints have the limits that are meant; the same model if they have.
 
-    Position servos narrow the limits of hinges and slides to their setpoints, where these are within. Where radians were read as
-    degrees, limits and initial angles are larger by 180/π; the bodies' initial poses stay.
+    Position servos narrow the limits of hinges and slides to their setpoints, where these are within. Where radians were
+    read as degrees, limits and initial angles are larger by 180/π; the bodies' initial poses stay.
     """
     servos, is_misread = _servo_limits(model), angles_are_misread(model)
     if not servos and not is_misread:

@@ -1,4 +1,4 @@
-"""The surfaces of a robot's links: triangles, which say where links are, and samples of what can be touched, which cost time."""
+"""The surfaces of a robot's links: triangles, which say where links are; and samples of what can be touched, which are slow."""
 
 from __future__ import annotations
 
