@@ -76,7 +76,7 @@ def parallel_jaws(level: float = -1.0, follow: float = 1.0) -> str:
     sides = "".join(
         f"""<body name="{s}_bar" pos="{x:.3g} 0 .02" euler="0 0 {turn}"><joint name="{s}_drive" axis="0 1 0" range="0 45"/>
           <geom type="box" size=".004 .006 .024" pos="0 0 .03"/>
-          <body name="{s}_tip" pos="0 0 .06"><joint name="{s}_level" axis="0 1 0" range="{'-45 0' if level < 0 else '0 45'}"/>
+          <body name="{s}_tip" pos="0 0 .06"><joint name="{s}_level" axis="0 1 0" range="{"-45 0" if level < 0 else "0 45"}"/>
             <geom type="box" size=".005 .01 .02" pos=".006 0 .02"/></body></body>
         <body name="{s}_second" pos="{0.7 * x:.3g} 0 .02" euler="0 0 {turn}"><joint name="{s}_follow" axis="0 1 0" range="0 45"/>
           <geom type="box" size=".002 .006 .02" pos="0 0 .03"/></body>"""
@@ -140,9 +140,7 @@ def spread_fingers() -> str:
 
 def single_links(joint: str = 'range="0 60" ref="40"', rest: str = "") -> str:
     """Return three fingers of one link, upright at the start, which close toward the low end of their range."""
-    finger = (
-        f'<body name="#" @><joint name="#_hinge" axis="0 -1 0" {joint}/><geom type="box" size=".005 .008 .03" pos="0 0 .035"/></body>'
-    )
+    finger = f'<body name="#" @><joint name="#_hinge" axis="0 -1 0" {joint}/><geom type="box" size=".005 .008 .03" pos="0 0 .035"/></body>'
     return f"<mujoco>{_three(finger)}{rest}</mujoco>"
 
 
