@@ -47,7 +47,7 @@ class KinematicTree:
 
     @cached_property
     def area(self) -> dict[int, float]:
-        """Surface of each body that has one [m²]; at most its convex hull's, as meshes may have much inside."""
+        """Surface of each body that has one [m²]; at most its convex hull's, as geoms may overlap."""
         return {body: min(float(own.face_areas.sum()), _hull_area(own)) for body, own in self.surface.items()}
 
     @cached_property

@@ -36,7 +36,10 @@ class LinkSurface:
 
 
 def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]]:
-    """Return the touchable triangles of each named body, and the bodies that have none, and why."""
+    """Return the touchable triangles of each named body, and the bodies that have none, and why.
+
+    Meshes are their convex hulls, as MuJoCo collides them: what is inside of a mesh would shift its middle.
+    """
     meshes: dict[str, Surface] = {}
     left_out = [("world", "no link")] if robot.touchable("world") else []
     for body in robot.bodies[1:]:
@@ -45,7 +48,7 @@ def link_meshes(robot: Model) -> tuple[dict[str, Surface], list[tuple[str, str]]
             left_out.append((body, "no geoms"))
             continue
         try:
-            surface = robot.surface(geoms)
+            surface = robot.surface(geoms, as_collided=True)
         except RobotError as error:
             left_out.append((body, _reason(robot, error)))
             continue
@@ -94,7 +97,7 @@ class Sampler:
     def sampled(self, name: str) -> LinkSurface | str:
         """Return what can be touched of a link, or why nothing can."""
         try:
-            pool = surface_pool(self.meshes[name])
+            pool = surface_pool(self.robot.surface(self.robot.touchable(name)))
         except (RobotError, SampleError) as error:
             return _reason(self.robot, error)
         if pool is None:
