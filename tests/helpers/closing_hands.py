@@ -66,23 +66,82 @@ def hinged_jaws(geom: str = '<geom type="box" size=".05 .02 .015"/>') -> str:
     return f'<body name="base">{geom}{jaws}</body>'
 
 
-def parallel_jaws() -> str:
-    """Return two linkages that keep their tips upright by mimicked joints; each has a second bar whose loop stays open."""
+def parallel_jaws(level: float = -1.0, follow: float = 1.0) -> str:
+    """Return two linkages of mimicked joints; each has a second bar whose loop stays open.
+
+    Args:
+        level: How far a tip turns on its bar, of how far this turns; by -1 it stays upright, above 0 it curls.
+        follow: How far the second bar turns.
+    """
     sides = "".join(
         f"""<body name="{s}_bar" pos="{x:.3g} 0 .02" euler="0 0 {turn}"><joint name="{s}_drive" axis="0 1 0" range="0 45"/>
           <geom type="box" size=".004 .006 .024" pos="0 0 .03"/>
-          <body name="{s}_tip" pos="0 0 .06"><joint name="{s}_level" axis="0 1 0" range="-45 0"/>
+          <body name="{s}_tip" pos="0 0 .06"><joint name="{s}_level" axis="0 1 0" range="{"-45 0" if level < 0 else "0 45"}"/>
             <geom type="box" size=".005 .01 .02" pos=".006 0 .02"/></body></body>
         <body name="{s}_second" pos="{0.7 * x:.3g} 0 .02" euler="0 0 {turn}"><joint name="{s}_follow" axis="0 1 0" range="0 45"/>
           <geom type="box" size=".002 .006 .02" pos="0 0 .03"/></body>"""
         for s, x, turn in (("left", 0.06, 180), ("right", -0.06, 0))
     )
-    mimics = "".join(
-        f'<joint joint1="{one}" joint2="left_drive" polycoef="0 {gear} 0 0 0"/>'
-        for one, gear in (("left_level", -1), ("left_follow", 1), ("right_drive", 1), ("right_level", -1), ("right_follow", 1))
-    )
+    gears = {"left_level": level, "left_follow": follow, "right_drive": 1.0, "right_level": level, "right_follow": follow}
+    mimics = "".join(f'<joint joint1="{one}" joint2="left_drive" polycoef="0 {gear:g} 0 0 0"/>' for one, gear in gears.items())
     return f"""<mujoco><worldbody><body name="base"><geom type="box" size=".08 .02 .012"/>{sides}</body></worldbody>
       <equality>{mimics}</equality></mujoco>"""
+
+
+def looped_jaws() -> str:
+    """Return two parallelograms: an outer knuckle and the finger on it, to which a connect holds an inner knuckle."""
+    sides = "".join(
+        f"""<body name="{s}_outer" pos="{x:.3g} 0 .02" euler="0 0 {turn}"><joint name="{s}_drive" axis="0 1 0" range="-10 40"/>
+          <geom type="box" size=".004 .006 .018" pos="0 0 .025"/>
+          <body name="{s}_finger" pos="0 0 .05"><joint axis="0 1 0" range="-60 60"/>
+            <geom type="box" size=".005 .008 .025" pos="0 0 .03"/></body></body>
+        <body name="{s}_inner" pos="{0.6 * x:.3g} 0 .02" euler="0 0 {turn}"><joint axis="0 1 0"/>
+          <geom type="box" size=".002 .006 .018" pos="0 0 .025"/></body>"""
+        for s, x, turn in (("left", 0.05, 180), ("right", -0.05, 0))
+    )
+    loops = "".join(f'<connect body1="{s}_inner" body2="{s}_finger" anchor="0 0 .05"/>' for s in ("left", "right"))
+    return f"""<mujoco><worldbody><body name="base"><geom type="box" size=".08 .02 .012"/>{sides}</body></worldbody>
+      <equality>{loops}</equality></mujoco>"""
+
+
+def one_jaw(span: str = "0 70", ref: float = 0.0, side: int = 1, pos: str = "0 0 0") -> str:
+    """Return a jaw that closes on a fixed one, which is at -x for the side 1; at the angle `ref` it is beside it."""
+    turn = 180 if side > 0 else 0
+    return (
+        f'<body name="fixed" pos="{pos}"><geom type="box" size=".03 .02 .015"/>'
+        f'<geom type="box" size=".006 .01 .05" pos="{-0.016 * side:.3g} 0 .05"/>'
+        f'<body name="jaw" pos="{0.006 * side:.3g} 0 .04" euler="0 0 {turn}">'
+        f'<joint name="hinge" axis="0 -1 0" range="{span}" ref="{ref:g}"/>'
+        '<geom type="box" size=".005 .01 .03" pos="0 0 .035"/></body></body>'
+    )
+
+
+def _three(finger: str) -> str:
+    """Return a palm whose inner side is z, and three fingers around it: names and frames stand in for `#` and `@`."""
+    places = (("a", "-.04 0 .02", 0), ("b", ".04 .025 .02", 180), ("c", ".04 -.025 .02", 180))
+    fingers = "".join(finger.replace("#", n).replace("@", f'pos="{pos}" euler="0 0 {turn}"') for n, pos, turn in places)
+    return f'<worldbody><body name="palm"><geom type="box" size=".06 .05 .01"/>{fingers}</body></worldbody>'
+
+
+def spread_fingers() -> str:
+    """Return three fingers whose outer links stay upright; two of them spread together, from one end of ±30 deg."""
+    finger = (
+        '<body name="#0" @><joint name="#_spread" axis="0 0 1" range="-30 30" ref="30"/>'
+        '<geom type="box" size=".006 .006 .003" pos="0 0 .002"/>'
+        '<body name="#1" pos="0 0 .01"><joint name="#_flex" axis="0 1 0" range="0 60"/>'
+        '<geom type="box" size=".005 .008 .018" pos="0 0 .02"/>'
+        '<body name="#2" pos="0 0 .045"><joint name="#_level" axis="0 1 0" range="-60 0"/>'
+        '<geom type="box" size=".005 .008 .018" pos="0 0 .02"/></body></body></body>'
+    )
+    body = _three(finger).replace('<joint name="a_spread" axis="0 0 1" range="-30 30" ref="30"/>', "")
+    mimics = "".join(f'<joint joint1="{n}_level" joint2="{n}_flex" polycoef="0 -1 0 0 0"/>' for n in "abc")
+    return f'<mujoco>{body}<equality>{mimics}<joint joint1="c_spread" joint2="b_spread" polycoef="0 -1 0 0 0"/></equality></mujoco>'
+
+
+def single_links(joint: str = 'range="0 60" ref="40"', rest: str = "") -> str:
+    """Return three fingers of one link, upright at the start, which close toward the low end of their range."""
+    finger = f'<body name="#" @><joint name="#_hinge" axis="0 -1 0" {joint}/><geom type="box" size=".005 .008 .03" pos="0 0 .035"/></body>'
+    return f"<mujoco>{_three(finger)}{rest}</mujoco>"
 
 
 def world(inside: str) -> str:
@@ -132,7 +191,9 @@ _ARCH = (
     '<geom type="box" size=".01 .04 .03" pos="0 0 .03"/>'
     f"{''.join(finger(f'f{i}_', f'0 {0.02 * i - 0.02:.3g} .065') for i in range(3))}</body></body>"
 )
-_UP = {"gripper": (0.0, 0.0, 1.0), "base": (0.0, 0.0, 1.0)}
+_UP = {"gripper": (0.0, 0.0, 1.0), "base": (0.0, 0.0, 1.0), "palm": (0.0, 0.0, 1.0)}
+_JAWS = frozenset({"fixed", "jaw"})
+_OUTWARD = (-1.0, 0.0, 0.0)
 
 MADE = {
     "five_fingers": MadeHand(world(palm_and_fingers(thumb(1))), frozenset(_fingertips())),
@@ -160,4 +221,12 @@ MADE = {
     ),
     "branched_metacarpal": MadeHand(world(palm_and_fingers(_BRANCHED + thumb(1))), frozenset(_fingertips() | {"a3", "b3"})),
     "arch": MadeHand(world(arm(_ARCH)), frozenset({"thumb2", "f0_3", "f1_3", "f2_3"}), _arm()),
+    "one_jaw": MadeHand(world(one_jaw()), _JAWS, doubted=_JAWS),
+    "one_jaw_of_the_other_side": MadeHand(world(one_jaw(side=-1)), _JAWS, facing={"fixed": _OUTWARD}, doubted=_JAWS),
+    "one_jaw_on_an_arm": MadeHand(world(arm(one_jaw("-40 40", -40, pos="0 0 .2"))), _JAWS, _arm()),
+    "looped_jaws": MadeHand(looped_jaws(), frozenset({"left_finger", "right_finger"}), facing=_UP),
+    "curling_jaws_with_slow_bars": MadeHand(parallel_jaws(0.6, 0.2), frozenset({"left_tip", "right_tip"}), facing=_UP),
+    "spread_fingers": MadeHand(spread_fingers(), frozenset({"a2", "b2", "c2"}), facing={**_UP, "a0": (0.0, 0.0, 1.0)}),
+    "single_links": MadeHand(single_links(), frozenset("abc"), facing=_UP),
+    "radians_read_as_degrees": MadeHand(single_links('range="0 1.05" ref="0.7"'), frozenset("abc"), facing=_UP),
 }

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from closing_hands import INNER, MADE, arm, parallel_jaws, slides, world
+from closing_hands import INNER, MADE, arm, one_jaw, parallel_jaws, single_links, slides, spread_fingers, world
 from odd_hands import FOUR_BAR
 
 from tgdsl.errors import TgdslError
@@ -11,6 +11,7 @@ from tgdsl.files.find import layout_of
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.links import open_robot
 from tgdsl.placement.propose.propose import closing_motion, propose
+from tgdsl.placement.propose.surfaces import Sampler
 from tgdsl.schema.load import load_layout
 from tgdsl.schema.select import matching
 
@@ -154,3 +155,81 @@ def test_an_arm_alone_closes_nothing(tmp_path):
     assert closing_motion(robot) == {}
     proposal = propose(robot, DENSITY)
     assert len(proposal.links) == 5 and {link.facing for link in proposal.links} == {None}
+
+
+@pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
+def test_a_jaw_closes_beside_the_fixed_one(tmp_path, side):
+    """From open to upright, wherever in its range it starts."""
+    for span, ref, ends in (("0 70", 0, (70.0, 0.0)), ("-40 40", -40, (40.0, -40.0)), ("0 70", 30, (0.0, 70.0))):
+        text = one_jaw(span, ref, side)
+        if ref == 30:  # about the opposite axis, and opened by 40 deg at the start
+            turn = 180 if side > 0 else 0
+            text = text.replace(f'euler="0 0 {turn}"', f'euler="0 {40 * side} {turn}"').replace('axis="0 -1 0"', 'axis="0 1 0"')
+        found = closing_motion(loaded(tmp_path, world(text)))
+        np.testing.assert_allclose(found["hinge"], np.radians(ends), rtol=0, atol=1e-12)
+
+
+def test_an_elbow_that_folds_is_no_jaw(tmp_path):
+    """A forearm as long as the upper arm, which folds onto it by 150 deg."""
+    forearm = '<body name="fore" pos="0 0 .1"><joint axis="0 1 0" range="0 150"/><geom type="box" size=".01 .01 .04" pos="0 0 .05"/></body>'
+    upper = f'<body name="upper" pos="0 0 .05"><joint axis="0 1 0" range="-20 90"/><geom type="box" size=".01 .01 .04" pos="0 0 .05"/>{forearm}</body>'
+    robot = loaded(tmp_path, world(f'<body name="base"><geom size=".02"/>{upper}</body>'))
+    assert closing_motion(robot) == {}
+
+
+def test_joints_that_spread_fingers_close_nothing(tmp_path):
+    found = closing_motion(loaded(tmp_path, spread_fingers()))
+    assert found.keys() == {f"{finger}_{joint}" for finger in "abc" for joint in ("flex", "level")}
+    for name, ends in found.items():
+        expected = np.radians(60.0 if name.endswith("flex") else -60.0)
+        np.testing.assert_allclose(ends, (0.0, expected), rtol=0, atol=1e-4)
+
+
+def test_servos_say_how_far_joints_go_that_have_no_limits(tmp_path):
+    """A servo's setpoints are radians of its own shaft, here geared by 2; also where its joint could go farther."""
+    expected = {f"{finger}_hinge": tuple(np.radians((60.0, 0.0))) for finger in "abc"}
+    servos = "".join(f'<position joint="{n}_hinge" kp="3" gear="2" ctrlrange="0 {2 * np.radians(60.0)}"/>' for n in "abc")
+    for joint in ('ref="40"', 'ref="40" range="-30 60"'):
+        found = closing_motion(loaded(tmp_path, single_links(joint, f"<actuator>{servos}</actuator>")))
+        assert found.keys() == expected.keys()
+        np.testing.assert_allclose([*found.values()], [*expected.values()], rtol=0, atol=1e-12)
+    assert closing_motion(loaded(tmp_path, single_links('ref="40"'))) == {}
+
+
+def test_radians_that_were_read_as_degrees(tmp_path, here):
+    """The guess is that of the same hand in radians; the motion keeps to the limits that MuJoCo has; the command says so."""
+    (tmp_path / "meant.xml").write_text(single_links('range="0 1.05" ref="0.7"', '<compiler angle="radian"/>'))
+    (tmp_path / "hand.xml").write_text(MADE["radians_read_as_degrees"].text)
+    meant, misread = (load_model(tmp_path / name) for name in ("meant.xml", "hand.xml"))
+    assert [propose(model, DENSITY).is_misread for model in (meant, misread)] == [False, True]
+    ends = closing_motion(misread)
+    assert ends.keys() == {f"{finger}_hinge" for finger in "abc"}
+    np.testing.assert_allclose([*ends.values()], [np.radians((1.05, 0.0))] * 3, rtol=0, atol=1e-12)
+    code, said, _ = here(tmp_path, "layout", "new", "hand.xml")
+    line = "no hinge of this robot turns by more than 6.28 degrees: its limits look like radians"
+    assert code == 0 and f"limits: {line}" in said and f"# Mind: {line}" in (tmp_path / "layout.yaml").read_text()
+
+
+def test_a_covered_tip_is_no_part_of_a_hand(tmp_path):
+    """It is named, and the link before it is the tip."""
+    text = MADE["single_links"].text.replace(
+        '<geom type="box" size=".005 .008 .03" pos="0 0 .035"/></body>',
+        '<geom type="box" size=".005 .008 .03" pos="0 0 .035"/><body name="core" pos="0 0 .03"><joint axis="0 1 0" range="0 90"/>'
+        '<geom type="box" size=".002 .002 .002"/></body></body>',
+        1,
+    )
+    proposal = propose(loaded(tmp_path, text), DENSITY)
+    assert proposal.left_out == (("core", "all of it is inside other links in the initial state"),)
+    assert set(proposal.groups["tips"]) == set("abc") and "core" not in {link.name for link in proposal.links}
+    assert {link.facing for link in proposal.links if link.name in "abc"} == {INNER}
+
+
+def test_only_links_with_taxels_are_sampled(tmp_path, monkeypatch):
+    sampled, original = list[str](), Sampler.sampled
+    monkeypatch.setattr(Sampler, "sampled", lambda own, name: sampled.append(name) or original(own, name))
+    robot = loaded(tmp_path, world(arm(slides())))
+    assert sampled == []
+    propose(robot, DENSITY, include=("arm2",))
+    assert sorted(sampled) == ["arm2", "gripper", "jaw0", "jaw1"]
+    closing_motion(robot)
+    assert len(sampled) == 4

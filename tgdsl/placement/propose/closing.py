@@ -8,29 +8,30 @@ The evidence, in the order in which it decides:
 2. The tips draw nearer: any other joint closes at the end at which the tips that it moves are clearly nearer to those of the
    other chains and to the palm, with the other joints half closed and closed; a slide, and the only hinge of a chain, even
    against its range. A hinge of a curling finger that has its range against it stays undecided.
+   The jaw that turns against a fixed one closes at the end at which it is beside that, see `jaws`.
 3. The range alone: the only hinge of a chain closes at the far end of a range that bends away from its start; that is weak.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.placement.propose.hands import Hand, KinematicTree
+from tgdsl.placement.propose.hands import MAX_FINGER, Hand, KinematicTree
 from tgdsl.placement.propose.poses import Poses
 
 ONE_SIDED, LEANING = 3.0, 1.5
 """A joint bends one way, or leans to one, if its range from the start is this many times longer on one side."""
+SYMMETRIC = 0.05
+"""Limits are the same both ways if their middle is nearer to zero than half this share of the range."""
 MIN_CLOSING = 0.03
 """Least share by which the tips must draw nearer for an end of a joint's range to count as closed."""
 MIN_BEND = np.radians(30.0)
 """A hinge that turns by less than this does not close a finger, but shapes a palm."""
-MAX_FINGER = 0.35
-"""A longer chain is an arm or a leg, of which nothing closes [m]."""
 PARALLEL = 0.7
 """Least cosine of the angle between two axes about which a finger curls."""
 _HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -108,8 +109,14 @@ class Closing:
         return max(start - low, 0.0), max(high - start, 0.0)
 
     def _lean(self, joint: int) -> float:
-        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide."""
+        """Return toward which end a hinge bends: ±1 if one way only, ±0.5 if it leans there, 0 if neither or of a slide.
+
+        One with limits that are the same both ways bends to neither side, even if it starts at one of them.
+        """
         down, up = self._sides(joint)
+        low, high = self._range(joint)
+        if abs(low + high) < SYMMETRIC * (high - low):
+            return 0.0
         if int(self.tree.model.jnt_type[joint]) != _HINGE or max(down, up) < LEANING * min(down, up):
             return 0.0
         return float(np.sign(up - down)) * (1.0 if max(down, up) >= ONE_SIDED * min(down, up) else 0.5)
@@ -161,22 +168,45 @@ class Closing:
         return found
 
     def _bending(self, candidates: list[int]) -> list[int]:
-        """Return the joints of which to find the closed end: those that spread a curling finger are not among them."""
+        """Return the joints of which to find the closed end: those that spread fingers are not among them."""
         curled = {self.chain[self.segment(joint)] for joint in self.sense}
         one_way = {joint for joint in candidates if abs(self.lean[joint]) == 1.0}
+        hinges = {joint for joint in candidates if int(self.tree.model.jnt_type[joint]) == _HINGE}
+        free = hinges - self.sense.keys() - one_way
+        spreading = self._spreading(free, one_way)
         found = []
         for joint in candidates:
             segment = self.segment(joint)
             own = [other for other in candidates if self.segment(other) == segment]
             rivals = [other for other in own if other in self.sense] or [other for other in own if other in one_way] or own
-            is_hinge = int(self.tree.model.jnt_type[joint]) == _HINGE
-            spreads = is_hinge and joint not in self.sense and joint not in one_way and self.chain[segment] in curled
+            spreads = joint in spreading or (joint in free and self.chain[segment] in curled)
             if rivals == [joint] and not spreads:
                 found.append(joint)
         return found
 
+    def _spreading(self, free: Set[int], one_way: Set[int]) -> set[int]:
+        """Return the joints that spread two fingers or more: about parallel axes, across those of hinges that bend one way.
+
+        A thumb's, which no other finger has, may bring it before the palm.
+
+        Args:
+            free: Hinges that bend to neither side.
+            one_way: Joints that bend one way only.
+        """
+        path = {other: self.tree.path(self.segment(other)) for other in one_way}
+        axes = []
+        for joint in sorted(free):
+            beyond = [other for other in one_way if other != joint and self.segment(joint) in path[other][1:]]
+            if beyond and not any(abs(cosine) > PARALLEL for other in beyond for cosine in self._cosines(joint, other)):
+                axes += [(joint, self.chain[self.segment(i)], axis) for i, axis in self.turned[joint].items()]
+        return {
+            one
+            for one, chain, axis in axes
+            if any(chain != own_chain and abs(axis @ own) > PARALLEL for _, own_chain, own in axes)
+        }
+
     def _motion(self, joint: int, half: float, whole: float) -> Motion | None:
-        gain = half + whole if _is_clear(half, whole) else 0.0
+        gain = self.hand.closes or (half + whole if _is_clear(half, whole) else 0.0)
         sense, lean = self.sense.get(joint, 0.0), self.lean[joint] if abs(self.lean[joint]) == 1.0 else 0.0
         siblings = [j for j in self.sense if self.chain[self.segment(j)] == self.chain[self.segment(joint)]]
         doubt = ""

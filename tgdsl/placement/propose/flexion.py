@@ -2,7 +2,8 @@
 
 A link's inner side faces where it is carried, in the open pose, as the nearest joint above it that has a lever on it closes. A
 link before all joints that close takes the side of the nearest link beyond. The last links of two chains that close on each
-other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close.
+other without curling face each other along the line on which they meet. A palm's inner side faces the tips as they close, a
+fixed jaw's the moving one.
 """
 
 from __future__ import annotations
@@ -14,16 +15,19 @@ import numpy as np
 from jaxtyping import Float
 
 from tgdsl.placement.propose.closing import Closing
-from tgdsl.placement.propose.hands import Hand, KinematicTree
+from tgdsl.placement.propose.hands import Hand, KinematicTree, length_of
 
 MIN_LEVER = 0.25
-"""A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place."""
+"""A link whose centre is nearer to its hinge than this share of the square root of its surface turns in place, unless it is a
+single jaw."""
 LINK_SNAP, PALM_SNAP = np.radians(30.0), np.radians(40.0)
 """A direction this close to an axis of the link's frame is taken to be that axis; a palm's that is farther is not taken."""
 STEP = 0.02
 """Share of its way by which a joint closes to see where a link goes."""
 ALIKE = 0.5
 """Least cosine of the angle between directions to which fingers curl for these to say where the palm faces."""
+PARALLEL, BESIDE = 0.99, 0.25
+"""A bar beside a finger turns about an axis with at least this cosine to the finger's, nearer than this share of its length."""
 UNCLEAR = "which side is the inner one is not clear"
 """Why a link has no inner side, where nothing better is known."""
 
@@ -60,8 +64,9 @@ class Flexion:
 
     @property
     def tips(self) -> list[int]:
-        """Bodies at the ends of the fingers, those that are bars of linkages left out."""
-        return [tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars]
+        """Bodies at the ends of the fingers, those that are bars of linkages left out; of a single jaw, both jaws."""
+        fixed = [] if self.hand.jaw is None else [self.hand.jaw]
+        return [*fixed, *(tip for tip in self.hand.tips if self.tree.segment[tip] not in self.bars)]
 
     def motion(self) -> dict[int, tuple[float, float]]:
         """Return the open and closed end of each hinge and slide that closes, those that others drive included."""
@@ -72,7 +77,7 @@ class Flexion:
     def inner_side(self, body: int) -> InnerSide:
         """Return where the inner side of a body faces."""
         if body in self.hand.mounts:
-            return self._palm_side(body)
+            return self._palm_side(body) if self.hand.jaw is None else self._fixed_side(body)
         if (facing := self._meeting(body)) is not None:
             return InnerSide(facing, self._doubt(self.tree.segment[body]))
         if (carried := self._carried(body)) is not None:
@@ -82,24 +87,32 @@ class Flexion:
         return self._taken_over(body)
 
     def _bars(self) -> set[int]:
-        """Return the segments that are alone in their chain and turn just as the first one of a longer chain does.
+        """Return the segments that are alone in their chain and are driven together with the longer chain beside them.
 
-        They are the second bars of parallel linkages, whose loop a tree of links leaves open.
+        They are the second bars of parallel linkages, whose loop a tree of links leaves open. Where nothing would be left for
+        a hand to close on, none is.
         """
-        chains, turns = self.hand.chains, {}
-        joints = {s: [j for j in self.tree.joints(s) if j in self.closing.poses.joints] for chain in chains for s in chain[:1]}
-        for joint, pose in self.steps.items():
-            for s, own in joints.items():
-                at = [self.closing.poses.at(j) for j in own]
-                axes = self._frames(self.open).xaxis[own]
-                turns[joint, s] = (pose[at] - self.open[at]) @ axes if own else np.zeros(3)
+        chains = self.hand.chains
         single, longer = ([chain[0] for chain in chains if (len(chain) == 1) == is_single] for is_single in (True, False))
+        bars = {s for s in single if any(self._is_bar(s, other) for other in longer)}
+        return bars if len(chains) - len(bars) > 1 else set()
 
-        def is_bar(s: int, other: int) -> bool:
-            both = [(turns[j, s], turns[j, other]) for j in self.steps if self.closing.is_opposed(j)]
-            return any(np.linalg.norm(a) > 1e-6 for a, _ in both) and all(np.allclose(a, b, atol=1e-6) for a, b in both)
+    def _is_bar(self, segment: int, other: int) -> bool:
+        """Return whether a segment is driven together with another, about axes that are parallel to and near that one's."""
+        turns = [(self._turn(pose, segment), self._turn(pose, other)) for pose in self.steps.values()]
+        moved = [(one, two) for one, two in turns if np.linalg.norm(one) > 1e-6]
+        parallel = all(abs(one @ two) > PARALLEL * np.linalg.norm(one) * np.linalg.norm(two) > 0 for one, two in moved)
+        first = [self.tree.joints(s)[:1] for s in (segment, other)]
+        if not moved or not parallel or not all(first):
+            return False
+        one, two = (self._frames(self.open).xanchor[own[0]].copy() for own in first)
+        return float(np.linalg.norm(one - two)) < BESIDE * length_of(self.tree, other)
 
-        return {s for s in single if any(is_bar(s, other) for other in longer)}
+    def _turn(self, pose: Float[np.ndarray, " qpos"], segment: int) -> Float[np.ndarray, " 3"]:
+        """Return how far a segment turns against its parent from the open pose to one near to it, about its axes [rad]."""
+        own = [joint for joint in self.tree.joints(segment) if joint in self.closing.poses.joints]
+        at = [self.closing.poses.at(joint) for joint in own]
+        return (pose[at] - self.open[at]) @ self._frames(self.open).xaxis[own] if own else np.zeros(3)
 
     def _stepped(self, joint: int) -> Float[np.ndarray, " qpos"]:
         """Return the open pose with one joint a small step closed."""
@@ -133,7 +146,8 @@ class Flexion:
             along = self.tree.centre(body, data) - centre
             cosine = 0.5 * (np.trace(data.xmat[body].reshape(3, 3) @ rotation.T) - 1.0)
             angle, size = float(np.arccos(np.clip(cosine, -1.0, 1.0))), float(np.linalg.norm(along))
-            if size > 1e-9 and size >= MIN_LEVER * np.sqrt(self.tree.area[body]) * angle:
+            lever = MIN_LEVER * np.sqrt(self.tree.area[body]) if self.hand.jaw is None else 0.0
+            if size > 1e-9 and size >= lever * angle:
                 return joint, along / size
         return None
 
@@ -153,7 +167,7 @@ class Flexion:
     def _meeting(self, body: int) -> tuple[float, ...] | None:
         """Return where a body faces the tip of the other chain, of two that close on each other without curling."""
         segment, chain = self.tree.segment[body], self.closing.chain
-        tips, jaws = self.tips, {self.tree.segment[tip] for tip in self.tips}
+        tips, jaws = self.tips, {self.tree.segment[tip] for tip in self.tips} & chain.keys()
         is_jaw = segment in jaws and len({chain[jaw] for jaw in jaws}) == 2
         if not is_jaw or not self.closing.motions or any(motion.is_curling for motion in self.closing.motions.values()):
             return None
@@ -169,6 +183,17 @@ class Flexion:
             return None
         rotation = self._frames(self.shut).xmat[body].reshape(3, 3)
         return _snapped(rotation.T @ along, LINK_SNAP, keeps_oblique=True)
+
+    def _fixed_side(self, body: int) -> InnerSide:
+        """Return where a fixed jaw faces: against the moving one, as that comes to it."""
+        tip = self.hand.tips[0]
+        if (carried := self._carried(tip)) is None:
+            return InnerSide(None, UNCLEAR)
+        joint, along = carried
+        in_tip = self._frames(self.open).xmat[tip].reshape(3, 3).T @ along
+        data = self._frames(self.shut)
+        facing = -data.xmat[body].reshape(3, 3).T @ data.xmat[tip].reshape(3, 3) @ in_tip
+        return InnerSide(_snapped(facing, LINK_SNAP, keeps_oblique=True), self.closing.motions[joint].doubt)
 
     def _palm_side(self, body: int) -> InnerSide:
         turned = self._frames(self.open).xmat[body].reshape(3, 3).copy()

@@ -20,9 +20,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
 
 from tgdsl.formats.model import Model
+from tgdsl.placement.propose.limits import as_meant
+from tgdsl.surfaces.surface import Surface
 
+MAX_FINGER = 0.35
+"""A longer chain is an arm or a leg, of which nothing closes [m]."""
 MAX_STEM = 1.5
 """Chains part within a hand if they do so nearer to its beginning than this many lengths of the longest chain beyond."""
 _LOOPS = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -33,14 +38,22 @@ class KinematicTree:
     """The segments of a robot, and the surface that their bodies carry.
 
     Attributes:
-        model: MuJoCo's model.
-        area: Surface of each body that has one [m²].
-        centroid: Centre of that surface, in the body's frame [m].
+        model: MuJoCo's model, with the limits of its joints as they are meant.
+        surface: Surface of each body that has one, in the body's frame.
     """
 
     model: mujoco.MjModel
-    area: Mapping[int, float]
-    centroid: Mapping[int, Float[np.ndarray, " 3"]]
+    surface: Mapping[int, Surface]
+
+    @cached_property
+    def area(self) -> dict[int, float]:
+        """Surface of each body that has one [m²]; at most its convex hull's, as geoms may overlap."""
+        return {body: min(float(own.face_areas.sum()), _hull_area(own)) for body, own in self.surface.items()}
+
+    @cached_property
+    def centroid(self) -> dict[int, Float[np.ndarray, " 3"]]:
+        """Centre of that surface, in the body's frame [m]."""
+        return {b: own.face_areas @ own.corners.mean(axis=1) / own.face_areas.sum() for b, own in self.surface.items()}
 
     @cached_property
     def segment(self) -> list[int]:
@@ -118,6 +131,11 @@ class KinematicTree:
         """Return the centre of a body's surface in the world [m]."""
         return data.xpos[body] + data.xmat[body].reshape(3, 3) @ self.centroid[body]
 
+    def points(self, body: int, data: mujoco.MjData) -> Float[np.ndarray, "corner 3"]:
+        """Return the corners of a body's surface in the world [m]."""
+        own = self.surface[body]
+        return data.xpos[body] + own.vertices[np.unique(own.faces)] @ data.xmat[body].reshape(3, 3).T
+
 
 @dataclass(frozen=True, eq=False)
 class Hand:
@@ -131,6 +149,8 @@ class Hand:
         tips: Bodies at the ends of the chains.
         fingers: All bodies that move against the base, tips included.
         length: Length of the longest chain [m].
+        jaw: Of a gripper of one jaw, the body of the base that this closes on.
+        closes: Toward which end of its range, ±1, this jaw closes; 0 of other hands.
     """
 
     base: int
@@ -140,18 +160,27 @@ class Hand:
     tips: list[int]
     fingers: list[int]
     length: float
+    jaw: int | None = None
+    closes: float = 0.0
 
 
-def kinematic_tree(robot: Model, area: Mapping[str, float], centroid: Mapping[str, Float[np.ndarray, " 3"]]) -> KinematicTree:
+def kinematic_tree(robot: Model, surface: Mapping[str, Surface]) -> KinematicTree:
     """Return the tree of a robot.
 
     Args:
         robot: The robot.
-        area: Surface of each body that has one, by name [m²].
-        centroid: Centre of that surface in the body's frame, by name [m].
+        surface: Surface of each body that has one, in the body's frame, by name.
     """
-    ids = {name: int(robot.compiled.body(name).id) for name in area}
-    return KinematicTree(robot.compiled, {ids[n]: area[n] for n in area}, {ids[n]: centroid[n] for n in area})
+    model = as_meant(robot.compiled)
+    return KinematicTree(model, {int(model.body(name).id): own for name, own in surface.items()})
+
+
+def _hull_area(surface: Surface) -> float:
+    """Return the area of a surface's convex hull [m²]; infinite if it is flat."""
+    try:
+        return float(ConvexHull(surface.vertices[np.unique(surface.faces)]).area)
+    except QhullError:
+        return np.inf
 
 
 def free_standing(tree: KinematicTree) -> list[int]:
@@ -199,17 +228,17 @@ def _parts_within(tree: KinematicTree, base: int, other: int) -> bool:
     stem = tree.path(other)[: tree.path(other).index(base)]
     starts = [_anchor(tree, child) for child in tree.children(other)]
     points = [*(_anchor(tree, s) for s in reversed(stem)), np.mean(starts, axis=0)]
-    longest = max(_length(tree, child) for child in tree.children(other))
+    longest = max(length_of(tree, child) for child in tree.children(other))
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()) <= MAX_STEM * longest
 
 
-def _length(tree: KinematicTree, segment: int) -> float:
+def length_of(tree: KinematicTree, segment: int) -> float:
     """Return the length from where a segment moves against its parent to the end of what it carries [m]."""
     own = [float(np.linalg.norm(tree.centre(b, tree.start) - _anchor(tree, segment))) for b in tree.bodies[segment]]
     reach = [distance + 0.5 * tree.area[b] ** 0.5 for distance, b in zip(own, tree.bodies[segment], strict=True)]
     for child in tree.children(segment):
         stem = float(np.linalg.norm(_anchor(tree, child) - _anchor(tree, segment)))
-        reach.append(stem + _length(tree, child))
+        reach.append(stem + length_of(tree, child))
     return max(reach, default=0.0)
 
 
@@ -231,7 +260,7 @@ def _hand(tree: KinematicTree, base: int, segments: Sequence[int] | None = None)
     fingers = sorted(body for s in beyond for body in tree.bodies[s])
     tips = sorted(body for s in ends for body in _last(tree, s))
     first = [s for s in beyond if tree.parent[s] not in beyond]
-    return Hand(base, mounts, palm, chains, tips, fingers, max((_length(tree, s) for s in first), default=0.0))
+    return Hand(base, mounts, palm, chains, tips, fingers, max((length_of(tree, s) for s in first), default=0.0))
 
 
 def _mounts(tree: KinematicTree, base: int) -> list[int]:

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tgdsl.errors import RobotError, SampleError, TgdslError
+from tgdsl.errors import TgdslError
 from tgdsl.formats.model import Model
-from tgdsl.placement.propose.exposure import MIN_AREA, Options, exposed_pool, surface_pool
+from tgdsl.placement.propose.exposure import Options
 from tgdsl.placement.propose.flexion import UNCLEAR, Flexion, InnerSide
-from tgdsl.placement.propose.hands import KinematicTree, free_standing, kinematic_tree
+from tgdsl.placement.propose.hands import kinematic_tree
+from tgdsl.placement.propose.limits import RADIANS_AS_DEGREES, angles_are_misread
 from tgdsl.placement.propose.scope import chosen_hands, included, outside
-from tgdsl.placement.reach import Colliders
-from tgdsl.placement.sample.poisson import Pool
+from tgdsl.placement.propose.surfaces import LinkSurface, Sampler, link_meshes
 
 FACTORS = {"low": 0.25, "med": 1.0, "high": 4.0}
 """Each resolution's share of the density."""
@@ -32,33 +32,6 @@ COVERING = 0.75
 """Radius over the square root of the area per taxel: discs on a triangular grid cover it from 0.62 on."""
 MAX_COUNT = 1_000_000
 """The most taxels that the grammar lets a link have."""
-_USUAL = 4e4
-"""The density that `closing_motion` takes [1/m²]: 4/cm²."""
-NOT_COLLIDED = "the simulator does not collide it, so contacts never reach it"
-COVERED = "all of it is inside other links in the initial state"
-
-
-@dataclass(frozen=True, eq=False)
-class LinkSurface:
-    """Samples of the outer surface of a body, in its frame.
-
-    Attributes:
-        pool: Points on it.
-        options: Options of a placement that samples it.
-    """
-
-    pool: Pool
-    options: Options = field(default_factory=dict)
-
-    @property
-    def area(self) -> float:
-        """Its whole surface [m²]."""
-        return self.pool.area
-
-    @property
-    def centroid(self) -> Float[np.ndarray, " 3"]:
-        """Its centre [m]."""
-        return self.pool.point_area @ self.pool.pos / self.pool.area
 
 
 @dataclass(frozen=True)
@@ -93,6 +66,7 @@ class Proposal:
         left_out: Bodies without taxels, and why.
         shared: Names of links that other links' geoms or meshes have too.
         is_collided: Whether the simulator collides its links; else none of them.
+        is_misread: Whether limits of its hinges look like radians that were read as degrees.
     """
 
     density: float
@@ -101,6 +75,7 @@ class Proposal:
     left_out: tuple[tuple[str, str], ...]
     shared: tuple[str, ...]
     is_collided: bool
+    is_misread: bool = False
 
     def radius_mm(self, resolution: str) -> float:
         """Return the sensing radius at a resolution, to two digits [mm]."""
@@ -134,103 +109,54 @@ def propose(robot: Model, density: float, with_groups: bool = True, include: Seq
         TgdslError: If no link can be sampled, if the density asks for more taxels than a link can have, or if a name to include
             matches no link that can have taxels.
     """
-    surfaces, left_out, is_collided = _touchable(robot, density)
-    asked = included(include, tuple(surfaces), dict(left_out))
-    tree = _tree(robot, surfaces)
-    names = {int(robot.compiled.body(name).id): name for name in surfaces}
-    found = chosen_hands(tree)
-    for body, why in outside(tree, found).items():
-        if names[body] not in asked:
-            del surfaces[names[body]]
-            left_out.append((names[body], why))
+    sampler = Sampler(robot, 0.95 * COVERING / np.sqrt(density * max(FACTORS.values())))
+    found, surfaces = _sampled_hands(sampler, include)
+    left_out = tuple(sampler.left_out)
     if not surfaces:
         what = "; ".join(f'"{name}": {why}' for name, why in left_out)
         raise TgdslError(f"{robot.file}: no link has a surface for taxels" + (f" ({what})" if what else ""))
+    names = {int(robot.compiled.body(name).id): name for name in surfaces}
     sides = {names[b]: flexion.inner_side(b) for flexion in found for b in (*flexion.hand.mounts, *flexion.hand.fingers)}
     asked_for = InnerSide(None, "asked for with --include")
     links = tuple(_link(name, surfaces[name], sides.get(name, asked_for), density) for name in robot.bodies if name in surfaces)
     groups = _groups(found, names, tuple(surfaces)) if with_groups else {}
-    return Proposal(density, groups, links, tuple(left_out), _shared(robot, tuple(surfaces)), is_collided)
+    shared, is_misread = _shared(robot, tuple(surfaces)), angles_are_misread(robot.compiled)
+    return Proposal(density, groups, links, left_out, shared, sampler.is_collided, is_misread)
 
 
 def closing_motion(robot: Model) -> Mapping[str, tuple[float, float]]:
     """Return how the hands of a robot close: by name, each joint's open and closed end [rad, of slides m].
 
-    A joint that has no name, or of which it is not clear which end is the closed one, is not in it.
+    A joint that has no name, or of which it is not clear which end is the closed one, is not in it. Where limits are misread,
+    see `angles_are_misread`, the ends are those that the simulator keeps to.
     """
-    surfaces, _, _ = _touchable(robot, _USUAL)
+    scale = RADIANS_AS_DEGREES if angles_are_misread(robot.compiled) else 1.0
     motion: dict[str, tuple[float, float]] = {}
-    for flexion in chosen_hands(_tree(robot, surfaces)):
-        motion |= {robot.compiled.joint(joint).name: ends for joint, ends in flexion.motion().items()}
+    for flexion in chosen_hands(kinematic_tree(robot, link_meshes(robot)[0])):
+        motion |= {robot.compiled.joint(i).name: (one / scale, two / scale) for i, (one, two) in flexion.motion().items()}
     return {name: ends for name, ends in motion.items() if name}
 
 
-def _touchable(robot: Model, density: float) -> tuple[dict[str, LinkSurface], list[tuple[str, str]], bool]:
-    """Return what can be touched of each link, the others and why nothing can, and whether the simulator collides any."""
-    surfaces, left_out = _link_surfaces(robot)
-    is_collided = _keep_what_feels(robot, surfaces, left_out, density)
-    return surfaces, left_out, is_collided
+def _sampled_hands(sampler: Sampler, include: Sequence[str]) -> tuple[list[Flexion], dict[str, LinkSurface]]:
+    """Return the hands, and samples of their links and of those to include, in the robot's body order.
 
-
-def _tree(robot: Model, surfaces: Mapping[str, LinkSurface]) -> KinematicTree:
-    return kinematic_tree(robot, {n: s.area for n, s in surfaces.items()}, {n: s.centroid for n, s in surfaces.items()})
-
-
-def _keep_what_feels(robot: Model, surfaces: dict[str, LinkSurface], left_out: list[tuple[str, str]], density: float) -> bool:
-    """Leave of each link's surface what can be touched in the simulator, and leave out links of which nothing can be.
-
-    Links that the simulator does not collide are kept if it collides none, as those of a robot that is only seen.
-
-    Returns:
-        Whether it collides any that is no scenery.
+    Only these are sampled. A link of which nothing can be touched is left out, and the hands are looked for again without it.
     """
-    colliders, radius = Colliders(robot), 0.95 * COVERING / np.sqrt(density * max(FACTORS.values()))
-    ids = {name: int(robot.compiled.body(name).id) for name in surfaces}
-    scenery = set(free_standing(_tree(robot, surfaces))) if surfaces else set()
-    links = [name for name in surfaces if ids[name] not in scenery]
-    collided = [name for name in links if colliders.collides(ids[name])]
-    for name in links if collided else []:
-        own = surfaces.pop(name)
-        pool, options = exposed_pool(robot, colliders, name, own.pool, radius) if name in collided else (None, {})
-        if pool is not None:
-            surfaces[name] = LinkSurface(pool, options)
-        else:
-            left_out.append((name, COVERED if name in collided else NOT_COLLIDED))
-    return bool(collided)
-
-
-def _link_surfaces(robot: Model) -> tuple[dict[str, LinkSurface], list[tuple[str, str]]]:
-    """Return what can be touched of each named body with geoms, and why some cannot be sampled."""
     surfaces: dict[str, LinkSurface] = {}
-    left_out = [("world", "no link")] if robot.touchable("world") else []
-    for body in robot.bodies[1:]:
-        geoms = robot.touchable(body)
-        if not geoms:
-            left_out.append((body, "no geoms"))
-            continue
-        try:
-            surface = _link_surface(robot, body)
-        except (RobotError, SampleError) as error:
-            left_out.append((body, str(error).removeprefix(f"{robot.file}: ")))
-            continue
-        if isinstance(surface, LinkSurface):
-            surfaces[body] = surface
-        else:
-            left_out.append((body, surface))
-    model = robot.compiled
-    unnamed = [i for i in range(model.nbody) if not model.body(i).name and model.body_geomnum[i]]
-    left_out += [(robot.body_path(i), "no name, so no document can mean it") for i in unnamed]
-    return surfaces, left_out
-
-
-def _link_surface(robot: Model, body: str) -> LinkSurface | str:
-    """Return what can be touched of a body, or why nothing can."""
-    surface = robot.surface(robot.touchable(body))
-    pool = surface_pool(surface) if surface.face_areas.sum() > MIN_AREA else None
-    if pool is None:
-        has_area = surface.face_areas.sum() > MIN_AREA
-        return "nothing that can be touched from outside" if has_area else "a surface without area"
-    return LinkSurface(pool) if pool.area >= MIN_AREA else "a surface without area"
+    while True:
+        asked = included(include, tuple(sampler.meshes), dict(sampler.left_out))
+        tree = kinematic_tree(sampler.robot, sampler.meshes)
+        found = chosen_hands(tree)
+        outer = {sampler.robot.compiled.body(body).name: why for body, why in outside(tree, found).items()}
+        wanted = [name for name in sampler.meshes if name not in outer or name in asked]
+        fresh = {name: sampler.sampled(name) for name in wanted if name not in surfaces}
+        surfaces |= {name: own for name, own in fresh.items() if isinstance(own, LinkSurface)}
+        dropped = {name: own for name, own in fresh.items() if isinstance(own, str)}
+        for name, why in dropped.items():
+            sampler.drop(name, why)
+        if not dropped:
+            sampler.left_out += [(name, why) for name, why in outer.items() if name not in asked]
+            return found, {name: surfaces[name] for name in wanted}
 
 
 def _link(name: str, surface: LinkSurface, side: InnerSide, density: float) -> LinkProposal:

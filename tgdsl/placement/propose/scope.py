@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.placement.propose.flexion import Flexion
 from tgdsl.placement.propose.hands import KinematicTree, free_standing, hands
+from tgdsl.placement.propose.jaws import with_jaws
 from tgdsl.schema.select import matching
 
 BEFORE = "before the link from which the fingers part; --include adds it"
@@ -15,9 +16,9 @@ SCENERY = "stands or floats by itself: taken for scenery or an object; --include
 
 
 def chosen_hands(tree: KinematicTree) -> list[Flexion]:
-    """Return the hands of a robot: those of which two chains or more are known to close, or else all that may be one."""
-    found = [Flexion(tree, hand) for hand in hands(tree)]
-    return [flexion for flexion in found if flexion.num_closing > 1] or found
+    """Return the hands of a robot: those of which two chains or a jaw are known to close, or else all that may be one."""
+    found = [Flexion(tree, own) for hand in hands(tree) for own in with_jaws(tree, hand)]
+    return [flexion for flexion in found if flexion.num_closing > (flexion.hand.jaw is None)] or found
 
 
 def outside(tree: KinematicTree, found: Sequence[Flexion]) -> dict[int, str]:

@@ -28,7 +28,7 @@ _HEADER = """\
 # A document takes it as `robot: {{model: ..., layout: THIS FILE}}` and says which resolution with `resolution: med`.
 """
 _ABOUT = {
-    "tips": "guessed: the last links of all chains",
+    "tips": "guessed: the last links of all chains, and what a single jaw closes on",
     "palm": "guessed: the largest link from which the chains part",
     "fingers": "all that moves against it",
     "hand": "the fingers, the palm and what is fixed to it",
@@ -38,6 +38,10 @@ _OPTIONS = {
     "exposed": "without what is inside other colliding geoms in the initial state",
 }
 _NOT_COLLIDED = "the simulator collides none of these links, so taxels feel with `gate: geometric` alone"
+_MISREAD = (
+    "no hinge of this robot turns by more than 6.28 degrees: its limits look like radians, and its file lacks "
+    '`<compiler angle="radian"/>`; sides are guessed as if it said so, but the simulator keeps to the limits as they are'
+)
 _NO_PALM = "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n"
 
 USUAL_DENSITY = (100.0, math.inf)
@@ -83,6 +87,7 @@ def new_layout(
         *(f"all around: {line}" for line in _doubts(proposal, has_side=False)),
         *(f"{option}: {listed([link.name for link in links])}: {_OPTIONS[key]}" for key, option, links in _chosen(proposal)),
         *([] if proposal.is_collided else [f"not collided: {_NOT_COLLIDED}"]),
+        *([f"limits: {_MISREAD}"] if proposal.is_misread else []),
         f"{out}: every guess in it is marked; please look at them",
     ]
 
@@ -97,6 +102,7 @@ def layout_text(proposal: Proposal, robot: str) -> str:
     parts = [_HEADER.format(robot=quoted(robot), density=proposal.density * 1e-4)]
     parts += [f"# Left out: {line}\n" for line in _left_out(proposal)]
     parts += [] if proposal.is_collided else [f"# Mind: {_NOT_COLLIDED}.\n"]
+    parts += [f"# Mind: {_MISREAD}.\n"] if proposal.is_misread else []
     if proposal.groups and proposal.shared:
         names = ", ".join(map(quoted, proposal.shared))
         parts.append(f"# Mind: geoms or meshes of other links are also called {names}; a selection by that name takes both.\n")
