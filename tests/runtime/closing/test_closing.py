@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from closing_hands import hinged_jaws, world
 from odd_hands import CAPSULES, FOUR_BAR, TENDON
 from unscripted_hands import GRIPPER, URDF
 
@@ -207,6 +208,18 @@ def test_a_fixed_object_within_reach_is_pressed(tmp_path):
 def test_why_a_hand_does_not_close(tmp_path, joint, why):
     text = f"<mujoco><worldbody><body name='pad'>{joint}<geom type='box' size='.03 .03 .01'/></body></worldbody></mujoco>"
     assert closing_of(module(tmp_path, "pad.xml", text)) == why
+
+
+def test_limits_that_look_like_radians_read_as_degrees_are_warned_of(tmp_path):
+    text = world(hinged_jaws())
+    misread = text.replace('range="0 40"', 'range="0 .7"')
+    assert misread != text
+    ball = {"ball": {"geom": {"type": "sphere", "size": [0.012]}}}
+    with pytest.warns(UserWarning, match='no hinge turns by more than 2π degrees: is `angle="radian"` missing'):
+        closing_of(module(tmp_path, "misread.xml", misread, ball))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        closing_of(module(tmp_path, "hand.xml", text, ball))
 
 
 def test_objects_that_differ_between_environments(tmp_path):

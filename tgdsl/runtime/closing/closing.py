@@ -9,6 +9,7 @@ another, and the object moves as through oil, so that it waits for the last fing
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from tgdsl.errors import listed
 from tgdsl.formats.model import Model
 from tgdsl.module.module import TactileModule
+from tgdsl.placement.propose.limits import angles_are_misread
 from tgdsl.runtime.closing.moving import Movement, movement
 from tgdsl.runtime.closing.place import OVERLAP, Sweep
 from tgdsl.scene.mujoco_warnings import muted_mujoco
@@ -147,12 +149,17 @@ class Closing:
 def closing_of(touch: TactileModule) -> Closing | str:
     """Return how the hand of a module's scene closes on the first object that it can close on, or why it does not.
 
+    It warns of joints whose limits look like radians that were read as degrees: they hardly move.
+
     Raises:
         ArtifactError: If an asset of the scene is missing or has changed.
     """
     spec = SceneModels(touch.plan.scene, prepare=name_all).first()
     with muted_mujoco():
         scene = Model(Path(touch.plan.origin.robot), spec, spec.compile(), is_urdf=False)
+    if angles_are_misread(scene.compiled):
+        what = f"{touch.plan.origin.robot}: no hinge turns by more than 2π degrees"
+        warnings.warn(f'{what}: is `angle="radian"` missing in its <compiler>? The hand hardly moves', stacklevel=2)
     links = {link.body for sensor in touch.plan.sensors for link in touch.plan.layout_of(sensor).links}
     moving = movement(scene, frozenset(links))
     if not moving.ends:
