@@ -210,6 +210,17 @@ def test_why_a_hand_does_not_close(tmp_path, joint, why):
     assert closing_of(module(tmp_path, "pad.xml", text)) == why
 
 
+def test_the_servos_take_nothing_of_the_scene_s_defaults(tmp_path):
+    ball, ends = {"ball": {"geom": {"type": "sphere", "size": [0.012]}}}, []
+    plain = GRIPPER.replace('<position name="grip" joint="left slide" kp="200" ctrlrange="0 .04"/>', "")
+    defaults = plain.replace("<default>", '<default><general gear="3" ctrllimited="true" forcerange="-1 1" biasprm="1 2 3"/>')
+    assert plain != GRIPPER and defaults != plain
+    for name, text in (("plain", plain), ("defaults", defaults)):
+        _, sim, _ = closed(module(tmp_path, f"{name}.xml", text.replace('<motor name="up" joint="lift"/>', ""), ball))
+        ends.append(sim.qpos[0].numpy())
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-9)
+
+
 def test_limits_that_look_like_radians_read_as_degrees_are_warned_of(tmp_path):
     text = world(hinged_jaws())
     misread = text.replace('range="0 40"', 'range="0 .7"')

@@ -286,6 +286,9 @@ def _add_servo(spec: mujoco.MjSpec, servo: Servo, group: int) -> None:
     actuator = spec.add_actuator(
         name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=group
     )
+    # Nothing of the scene's own <default> for actuators: neither gear nor a range.
+    actuator.gear, actuator.inheritrange = [1, 0, 0, 0, 0, 0], 0.0
+    actuator.ctrllimited = actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
     actuator.set_to_position(kp=servo.stiffness)
     actuator.forcelimited, actuator.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-servo.limit, servo.limit]
 
