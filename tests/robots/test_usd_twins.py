@@ -160,7 +160,7 @@ def test_a_squeeze_reads_the_same(hand, tmp_path):
         assert off < FULL_SCALE, f"{name} differs by {off:.1e} of {np.abs(values).max():.3g}"
 
 
-@pytest.mark.filterwarnings("ignore:.*collides the convex hull", "ignore::tgdsl.errors.UnfeltWarning")  # its own tip is felt
+@pytest.mark.filterwarnings("ignore:.*collides the convex hull", "ignore::tgdsl.errors.UnfeltWarning")  # its own palm is felt
 def test_an_artefact_of_a_usd_robot_is_kept_and_run(tmp_path):
     model = ROOT / "robots" / "xhand1" / "xhand1_right.usda"
     for name in ("first", "second"):
