@@ -7,7 +7,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.rollout import Recorder, Step, recorded_controls, rollout, scripted_controls
+from tgdsl.runtime.rollout import Recorder, Step, is_touched, recorded_controls, rollout, scripted_controls
 from tgdsl.runtime.simulate import simulate
 
 SCENE = """
@@ -189,3 +189,12 @@ def test_a_recording_that_fails_leaves_nothing(document, tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"no space"):
         recorder.write(tmp_path / "r.npz", np.zeros((1, 2)))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("clearance", [-1e-3, 1e-3])
+def test_an_object_is_touched_where_it_is_less_than_its_size_away(document, clearance):
+    touch = tgdsl.compile(document)
+    sim = simulate(touch, 2)
+    sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # the scene has it a millimetre deep
+    sim.set_state([1], qpos=np.array([0.001 - clearance, 0.0]))
+    assert is_touched(touch, sim) == (clearance < 0)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tgdsl.module.module import TactileModule
+    from tgdsl.runtime.batch.simulation import BatchSimulation
     from tgdsl.runtime.rollout import Controls, Recorder
-    from tgdsl.runtime.source import Simulator
 
 _FILES = {"readings": "npz", "picture": "png", "overview": "png"}
 
@@ -49,7 +49,7 @@ class Run:
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
         from tgdsl.files.write import check_writable, with_folder
-        from tgdsl.runtime.rollout import Recorder
+        from tgdsl.runtime.rollout import Recorder, is_touched
         from tgdsl.view.cameras import angles_of
 
         if self.view is not None:
@@ -63,11 +63,13 @@ class Run:
             sim, controls = self._start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
+        if touch.plan.objects and not is_touched(touch, sim):
+            print("at the end nothing touches an object")
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 
-    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[Simulator, Controls]:
+    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
         from tgdsl.runtime.rollout import default_keyframes, recorded_controls, scripted_controls
         from tgdsl.runtime.simulate import simulate
@@ -84,7 +86,7 @@ class Run:
         sim.close()
         return simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0]), controls
 
-    def _closing(self, touch: TactileModule) -> tuple[Simulator, Controls]:
+    def _closing(self, touch: TactileModule) -> tuple[BatchSimulation, Controls]:
         """Return a scene without keyframes whose hand closes on an object, or, if it cannot, its initial state, held."""
         from tgdsl.runtime.batch.simulation import BatchSimulation
         from tgdsl.runtime.closing.closing import START, closing_of
@@ -101,7 +103,7 @@ class Run:
         sim = BatchSimulation(touch, self.num_envs, substeps=self.substeps, keyframe=START, prepare=closing.prepare)
         return sim, controls_between(closing.targets(sim.model.nu), self.seconds, sim.control_step)
 
-    def _steps(self, touch: TactileModule, sim: Simulator, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
+    def _steps(self, touch: TactileModule, sim: BatchSimulation, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
         """Make all steps, and return the last readings."""
         from tqdm import tqdm
 
@@ -121,7 +123,7 @@ class Run:
                     live.show([f"t = {step.time:.2f} s", *table(touch, readings)], is_last=step.index == len(controls) - 1)
         return readings
 
-    def _draw(self, touch: TactileModule, sim: Simulator, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
+    def _draw(self, touch: TactileModule, sim: BatchSimulation, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
         from tgdsl.view.overview import overview
         from tgdsl.view.picture import picture
         from tgdsl.view.table import outputs_on_taxels

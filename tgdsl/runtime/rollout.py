@@ -20,6 +20,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.files.write import atomic_open
 from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.controls import control_tensor
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
 from tgdsl.runtime.source import Simulator
@@ -144,6 +145,23 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
         except SimulationError as error:
             raise SimulationError(f"control step {index} of {len(controls)}: {error}") from error
         yield Step(index, (index + 1) * sim.control_step, touch(sim.state()))
+
+
+def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
+    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now."""
+    model = sim.env_model(0)
+    data = mujoco.MjData(model)
+    data.qpos[:] = sim.qpos[0].cpu().numpy()
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    objects = {
+        int(model.body_weldid[model.body(target.body).id]) or int(model.body(target.body).id) for target in touch.plan.objects
+    }
+    rigid = [
+        {int(model.body_weldid[model.geom_bodyid[geom]]) or int(model.geom_bodyid[geom]) for geom in c.geom}
+        for c in data.contact
+    ]
+    return any(len(bodies) == 2 and bodies & objects for bodies in rigid)
 
 
 class Recorder:
