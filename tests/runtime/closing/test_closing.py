@@ -88,7 +88,8 @@ def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]
 
 @pytest.mark.parametrize("name", HANDS)
 def test_at_least_two_links_are_pressed(tmp_path, name):
-    ball = {"geom": {"type": "sphere", "size": [0.02 if name == "capsules.xml" else 0.012]}}
+    # A ball that the hand can hold between fingers and palm: of 12 mm the tendon hand presses it 3 mm into its palm.
+    ball = {"geom": {"type": "sphere", "size": [{"capsules.xml": 0.02, "tendon.xml": 0.016}.get(name, 0.012)]}}
     touch = module(tmp_path, name, HANDS[name], {"ball": ball})
     closing, sim, load = closed(touch)
     pressed = {link for link, force in forces_on(sim, "ball").items() if force > 0}
