@@ -15,6 +15,8 @@ UNITS: dict[str, dict[str, float]] = {
     "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
     "frequency": {"Hz": 1.0, "kHz": 1e3},
+    "mass": {"kg": 1.0, "g": 1e-3},
+    "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "number": {},
 }
 """Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""

@@ -1,0 +1,124 @@
+"""What the document of every task says: sensors, joints, physics, touch, actions, and what is random."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StrictInt
+
+from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Range, RangeOf, SpecModel
+from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
+from tgdsl.rl.pushes import PushSpec
+
+TouchType = Literal[
+    *("none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel")
+]
+"""What a policy feels, by one word: none, the paper's eight types, and forces that match the load."""
+SENSED: dict[str, tuple[str, str]] = {
+    "bool": ("contact", "bool"),
+    "agg_bool": ("contact", "agg_bool"),
+    "depth": ("contact_depth", "depth"),
+    "agg_force": ("contact_depth", "agg_force"),
+    "force": ("kinematic_taxel", "force"),
+    "force_torque": ("kinematic_taxel", "force_torque"),
+    "elastomer": ("elastomer", "elastomer"),
+    "proximity": ("proximity", "proximity"),
+    "force_taxel": ("force_taxel", "force"),
+}
+"""The kind of sensor that each type reads, and the observation that is made of it."""
+Time = Annotated[float, Quantity("time", gt=0.0)]
+Whole = Annotated[StrictInt, Field(ge=1)]
+Weight = Number
+"""Weight of a term of the reward: of a gain more than 0, of a penalty less."""
+
+
+class PhysicsSpec(SpecModel):
+    """How physics is stepped; what is left out is the scene's."""
+
+    timestep: Time = 0.005
+    """Duration of a physics step [s]."""
+    substeps: Whole = 5
+    """Physics steps per control step."""
+    cone: Literal["elliptic", "pyramidal"] | None = None
+    """Friction cone."""
+    solver: Literal["Newton", "CG", "PGS"] | None = None
+    """Solver of the constraints."""
+    integrator: Literal["Euler", "implicit", "implicitfast"] | None = None
+    """Integrator."""
+    iterations: Whole | None = None
+    """Most iterations of the solver."""
+    ls_iterations: Whole | None = None
+    """Most iterations of its line search."""
+    tolerance: NonNegative | None = None
+    """Where the solver stops."""
+    impratio: Positive | None = None
+    """Ratio of friction's impedance to that of the normal force."""
+    nconmax: Whole | None = None
+    """On a GPU, capacity for contacts per environment."""
+    njmax: Whole | None = None
+    """On a GPU, capacity for rows of constraints in each environment."""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """MuJoCo's options that differ from the scene's."""
+        given = self.model_dump(exclude={"substeps", "nconmax", "njmax"}, exclude_none=True)
+        return {name: value.lower() if isinstance(value, str) else value for name, value in given.items()}
+
+    @property
+    def capacities(self) -> dict[str, int]:
+        """Capacities of the GPU's simulator."""
+        return self.model_dump(include={"nconmax", "njmax"}, exclude_none=True)
+
+
+class RandomSpec(SpecModel):
+    """What is random, drawn at each reset; what is left out is not."""
+
+    friction: Factor = ONE
+    """Factor on the object's coefficient of sliding friction."""
+    mass: Annotated[Range, RangeOf("mass", ge=0.0)] = ZERO
+    """What is added to the object's mass [kg]."""
+    drive: DriveSpec = DriveSpec()
+    """The drives of the joints."""
+    push: PushSpec = PushSpec()
+    """Forces that push the object."""
+
+
+class PlacedRandomSpec(RandomSpec):
+    """Of a task whose object is put down freely: where."""
+
+    xy: Annotated[Range, RangeOf("length")] = ZERO
+    """What is added to the object's place along the world's x and y, each [m]."""
+    yaw: Annotated[Range, RangeOf("angle")] = ZERO
+    """By how much the object is turned about the vertical [rad]."""
+
+
+class TaskSpec(SpecModel):
+    """What all tasks have in common."""
+
+    tgdsl: Literal[1]
+    """Version of the grammar."""
+    task: str
+    """A task of tgdsl by name, such as `in_palm_rotate`; one of your own as `package.module:Class`, or as `file.py:Class`
+    beside this document."""
+    document: str
+    """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those that are needed are taken."""
+    object: str
+    """The document's object that the task is about."""
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Joints that the policy moves: names or shell wildcards, in the order of the actuators; the others are held."""
+    keyframe: str | None = None
+    """The scene's keyframe that episodes start from; default: the model's own initial state."""
+    physics: PhysicsSpec = PhysicsSpec()
+    """How physics is stepped."""
+    episode: Time = 10.0
+    """Duration of an episode [s]."""
+    touch: TouchType = "force_torque"
+    """What a policy feels."""
+    placement: str = "hand"
+    """Links that feel: a link group of the layout."""
+    resolution: str | None = None
+    """How densely, as the layout has it; default: as the sensors' document says."""
+    noise: str = "clean"
+    """A noise profile of the sensors' document, or the built-in `clean` or `noisy`."""
+    action: ActionSpec = ActionSpec()
+    """How an action is understood."""

@@ -1,0 +1,191 @@
+"""A task: how an episode begins and ends, what is observed and rewarded, and how well it went.
+
+A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done, its groups and every term of its reward as an
+equation; the spec; `reference`, the reward and the end of an episode in float64 NumPy; then the class, with `reset`, `advance`,
+`is_over`, `reward`, `observe`, `score`.
+
+All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be captured
+as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host.
+
+Shapes: `env` environments, `joint` joints that the policy moves, `link` links that carry the `link_contact` sensor, `probe` probes
+of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Generic, NamedTuple, TypeVar
+
+import mujoco
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.rl.actuation import Actuators
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.runtime.simulators.joints import Joints
+from tgdsl.runtime.simulators.start_contacts import Contacts
+from tgdsl.runtime.simulators.state_values import StateValues
+from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
+
+S = TypeVar("S", bound=TaskSpec)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What a task is made for.
+
+    Attributes:
+        num_envs: Number of environments.
+        device: Where physics runs, and a task's tensors are.
+        dtype: Dtype of physics: float64 on a CPU, float32 on a GPU.
+        control_step: Duration of a control step Δt [s].
+        model: The compiled scene.
+        joints: Where each joint stands in `qpos` and `qvel`.
+        actuators: The joints that the policy moves, with their limits [rad].
+        object: Body of the task's object.
+        links: Bodies of the rows of `Now.link_force`.
+        qpos: Where episodes start, before anything is random: the keyframe.
+        half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
+        draws: Random numbers.
+    """
+
+    num_envs: int
+    device: torch.device
+    dtype: torch.dtype
+    control_step: float
+    model: mujoco.MjModel
+    joints: Joints
+    actuators: Actuators
+    object: str
+    links: tuple[str, ...]
+    qpos: Float[Tensor, " nq"]
+    half_height: Float[Tensor, " env"]
+    draws: Draws
+
+
+@dataclass(frozen=True, eq=False)
+class Now:
+    """One instant of all environments: that of the readings; world axes unless said.
+
+    Attributes:
+        watched: What the task watches, by name: see `Task.watch`.
+        object: Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s].
+        joint_pos: Positions of the joints that the policy moves [rad].
+        joint_vel: Their velocities [rad/s].
+        torque: What their drives exert [N·m].
+        action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
+        last_action: What it had asked for one control step before.
+        link_force: The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`.
+        distance: Distance from each probe to the object's surface, negative inside [m]; no probes if the task takes no
+            `surface_distance`.
+        friction: Coefficient of sliding friction of the object.
+        mass: Mass of the object [kg].
+        readings: All readings of the module by name.
+    """
+
+    watched: Watched
+    object: BodyMotion
+    joint_pos: Float[Tensor, "env joint"]
+    joint_vel: Float[Tensor, "env joint"]
+    torque: Float[Tensor, "env joint"]
+    action: Float[Tensor, "env joint"]
+    last_action: Float[Tensor, "env joint"]
+    link_force: Float[Tensor, "env link 3"]
+    distance: Float[Tensor, "env probe"]
+    friction: Float[Tensor, " env"]
+    mass: Float[Tensor, " env"]
+    readings: Mapping[str, Tensor]
+
+
+class Start(NamedTuple):
+    """How episodes begin.
+
+    Attributes:
+        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing.
+        contacts: As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp.
+    """
+
+    values: StateValues
+    contacts: Contacts = "none"
+
+
+class Task(ABC, Generic[S]):
+    """A task of all environments.
+
+    Attributes:
+        Spec: Model of its document.
+        senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels.
+        score_unit: Unit of its score.
+        spec: Its document.
+        setup: What it is made for.
+        memory: Its own state, (env, …) each, kept by `state_dict`.
+    """
+
+    Spec: ClassVar[type[TaskSpec]]
+    senses: ClassVar[tuple[str, ...]] = ("link_contact", "surface_distance")
+    score_unit: ClassVar[str]
+    spec: S
+    setup: Setup
+    memory: dict[str, Tensor]
+
+    def __init__(self, spec: S, setup: Setup):
+        """Begin with nothing remembered; what a task remembers it takes from `keep`."""
+        self.spec, self.setup, self.memory = spec, setup, {}
+
+    @classmethod
+    def watch(cls, spec: S) -> Watch:
+        """Return which bodies, sites, joints and pairs it looks at, besides the object and the joints that the policy moves."""
+        return Watch()
+
+    def keep(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        """Return a tensor (env, *shape) of zeros that the task remembers, in physics' dtype unless another is given."""
+        setup = self.setup
+        self.memory[name] = torch.zeros((setup.num_envs, *shape), dtype=dtype or setup.dtype, device=setup.device)
+        return self.memory[name]
+
+    def begin(self, chosen: Bool[Tensor, " env"], **values: Tensor | float) -> None:
+        """Set what is remembered of some environments, by name."""
+        for name, value in values.items():
+            own = self.memory[name]
+            mask = chosen.view(-1, *[1] * (own.ndim - 1))
+            own.copy_(torch.where(mask, torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
+
+    @abstractmethod
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Return where episodes of some environments begin, and begin what is remembered of them.
+
+        Args:
+            chosen: The environments.
+            episode: How often each was reset: the count of its random numbers.
+        """
+
+    @abstractmethod
+    def advance(self, now: Now) -> None:
+        """Bring what is remembered up to date: once per control step, after its physics."""
+
+    @abstractmethod
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return which episodes end for good: not those that merely have lasted long enough."""
+
+    @abstractmethod
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward by name, weights included, as rates: the reward is their sum times Δt [1/s].
+
+        Args:
+            now: The instant after the control step.
+            is_over: Which episodes have ended for good.
+        """
+
+    @abstractmethod
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+
+    @abstractmethod
+    def score(self) -> Float[Tensor, " env"]:
+        """Return how well each environment's episode has gone so far, in `score_unit`."""
+
+

@@ -1,0 +1,217 @@
+"""Turn an object that lies on the palm about the vertical, with some of the fingers, one quarter turn after another.
+
+An episode begins with the object upright near the middle of the palm. The goal is a quarter turn further about the vertical n, and
+each time that it is reached, another one. With q the object's orientation, q_0 that at the start, p and p_0 its positions,
+
+    ψ_t = ψ_{t−1} + twist_n(q_t q_{t−1}⁻¹)                      angle turned so far [rad]
+    θ   = swing_n(q q_0⁻¹)                                      tilt [rad]
+    g   = (k + 1) π/2                                           goal; k goals were reached, k ← k + 1 where g − ψ < ε, θ < θ_max
+
+Groups: `goal` holds six numbers of the goal's orientation, rot_n(g) q_0, and the angle from there to q [rad]; `priv_obj_state`
+and `priv_obj_props` as in `groups`.
+
+The reward is the sum of these terms times Δt; weights are the paper's.
+
+    success            w · (goal reached in this step)                           150 1/s
+    spin               w · clip(Δψ/Δt, −ω_max, ω_max)                            2 1/rad
+    near               w · mean_p exp(−max(0, d_p)/λ)                            0.1 1/s
+    tilt               w · θ                                                     −1 1/(rad s)
+    object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
+    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max                       −5 1/s
+    drop               w · (dropped in this step)                                −100 1/s
+    action_rate        w · |a_t − a_{t−1}|²                                      −5e-4 1/s
+    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −40 1/(rad s)
+    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
+
+An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names; formulas,
+Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back counts against `spin` and pays nothing:
+goals that were reached stay reached.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
+from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Weight
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks.placing import placed
+
+QUARTER = 0.5 * math.pi
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    success: Weight = 150.0
+    """Goal reached [1/s]."""
+    spin: Weight = 2.0
+    """Angular velocity about the vertical, the right way [1/rad]."""
+    near: Weight = 0.1
+    """How near fingers are to the object [1/s]."""
+    tilt: Weight = -1.0
+    """Tilt of the object [1/(rad s)]."""
+    object_distance: Weight = -100.0
+    """Distance of the object from where it started, beyond `free_distance` [1/(m s)]."""
+    contact_force: Weight = -5.0
+    """Force on links beyond `max_force` [1/s]."""
+    drop: Weight = -100.0
+    """Object dropped [1/s]."""
+    action_rate: Weight = -5e-4
+    """Change of the action [1/s]."""
+    joint_limit: Weight = -40.0
+    """Joints near the ends of their ranges [1/(rad s)]."""
+    work: Weight = -5e-3
+    """Power of the drives [1/J]."""
+
+
+class InPalmRotateSpec(TaskSpec):
+    """Turn an object on the palm about the vertical."""
+
+    randomise: PlacedRandomSpec = PlacedRandomSpec()
+    """What is random."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    goal_tolerance: Angle = 0.1
+    """ε: a goal is reached this close to it [rad]."""
+    max_tilt: Angle = 0.4
+    """θ_max: no goal is reached with a larger tilt [rad]."""
+    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
+    """ω_max: what is faster pays no more [rad/s]."""
+    near_width: PositiveLength = 0.02
+    """λ, decay length of `near` [m]."""
+    free_distance: PositiveLength = 0.02
+    """r: closer to where it started, the object costs nothing [m]."""
+    drop_distance: PositiveLength = 0.07
+    """Further from where it started, the object is lost [m]."""
+    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
+    """f_max: less force on a link costs nothing [N]."""
+
+
+def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
+            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, the joints' limits [rad].
+        dt: Δt [s].
+    """
+    weights = spec.rewards
+    pos, quat, low, high = record["pos"], record["quat"], record["low"], record["high"]
+    angle, reached, rows = 0.0, 0, []
+    for t in range(1, len(pos)):
+        w, x, y, z = _quat_product(quat[t], quat[t - 1] * [1, -1, -1, -1])
+        step = 2.0 * math.atan2(z if w >= 0 else -z, abs(w))
+        angle += step
+        w, x, y, z = _quat_product(quat[t], quat[0] * [1, -1, -1, -1])
+        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
+        is_reached = (reached + 1) * QUARTER - angle < spec.goal_tolerance and tilt < spec.max_tilt
+        reached += is_reached
+        distance, force = np.linalg.norm(pos[t] - pos[0]), np.linalg.norm(record["link_force"][t], axis=1)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        is_over = distance > spec.drop_distance
+        row = {
+            "success": weights.success * is_reached,
+            "spin": weights.spin * min(max(step / dt, -spec.max_spin), spec.max_spin),
+            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
+            "tilt": weights.tilt * tilt,
+            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
+            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
+            "drop": weights.drop * is_over,
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
+            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        }
+        rows.append(row | {"is_over": is_over, "score": reached})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _quat_product(left: np.ndarray, right: np.ndarray) -> Any:
+    (a, *v), (b, *u) = left, right
+    return np.concatenate([[a * b - np.dot(v, u)], a * np.array(u) + b * np.array(v) + np.cross(v, u)])
+
+
+class InPalmRotate(Task[InPalmRotateSpec]):
+    """The task."""
+
+    Spec = InPalmRotateSpec
+    score_unit = "quarter turns"
+
+    def __init__(self, spec: InPalmRotateSpec, setup: Setup):
+        """Begin with all objects where the keyframe has them."""
+        super().__init__(spec, setup)
+        self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        limits = (setup.actuators.low, setup.actuators.high)
+        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
+        self.quat = self.keep("quat", 4)
+        self.angle, self.rate, self.tilt = self.keep("angle"), self.keep("rate"), self.keep("tilt")
+        self.reached, self.is_reached = self.keep("reached"), self.keep("is_reached", dtype=torch.bool)
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Put objects upright on the palm, moved and turned at random."""
+        qpos, pos, quat = placed(self.setup, self.spec.randomise, episode)
+        self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
+        self.begin(chosen, is_reached=0.0)
+        return Start({"qpos": qpos})
+
+    def advance(self, now: Now) -> None:
+        """Add up what the object has turned, and give it another goal where it has reached one."""
+        quat = now.object.quat
+        step = rotations.twist(rotations.product(quat, rotations.inverse(self.quat)), self.up)
+        self.angle += step
+        self.rate.copy_(step / self.setup.control_step)
+        self.tilt.copy_(rotations.swing(rotations.product(quat, rotations.inverse(self.start_quat)), self.up))
+        self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
+        self.reached += self.is_reached
+        self.quat.copy_(quat)
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped."""
+        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        spec, weights = self.spec, self.spec.rewards
+        distance = (now.object.pos - self.start_pos).norm(dim=1)
+        return {
+            "success": weights.success * self.is_reached,
+            "spin": weights.spin * self.rate.clamp(-spec.max_spin, spec.max_spin),
+            "near": weights.near * terms.near(now, spec.near_width),
+            "tilt": weights.tilt * self.tilt,
+            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
+            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
+            "drop": weights.drop * (distance > spec.drop_distance),
+            "action_rate": weights.action_rate * terms.action_rate(now),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "work": weights.work * terms.work(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the goal, and what is privileged of the object."""
+        goal = rotations.product(rotations.about(self.up, self._goal()), self.start_quat)
+        error = rotations.angle(rotations.product(goal, rotations.inverse(now.object.quat)))
+        return {
+            "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return how many quarter turns were reached."""
+        return self.reached
+
+    def _goal(self) -> Float[Tensor, " env"]:
+        """Return the angle of the next goal [rad]."""
+        return (self.reached + 1.0) * QUARTER

@@ -1,0 +1,52 @@
+"""Where a free object starts: upright where the keyframe has it, moved and turned at random.
+
+Shapes: `env` environments, `nq` as in MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.rl import rotations
+from tgdsl.rl.spec import PlacedRandomSpec
+from tgdsl.rl.task import Setup
+
+
+def object_qpos(setup: Setup) -> slice:
+    """Return where a free object's position and quaternion stand in `qpos`.
+
+    Raises:
+        SimulationError: If its body does not move freely.
+    """
+    body = setup.model.body(setup.object)
+    if int(body.dofnum[0]) != 6 or int(body.jntnum[0]) != 1:
+        raise SimulationError(f'the object\'s body "{setup.object}" has no free joint, by which it could be put elsewhere')
+    first = int(setup.model.jnt_qposadr[int(body.jntadr[0])])
+    return slice(first, first + 7)
+
+
+def placed(
+    setup: Setup, spec: PlacedRandomSpec, episode: Int[Tensor, " env"]
+) -> tuple[Float[Tensor, "env nq"], Float[Tensor, "env 3"], Float[Tensor, "env 4"]]:
+    """Return `qpos` with the object at its start, and its position [m] and quaternion there, in the world.
+
+    Objects of other heights than the first environment's stand where that one stands.
+
+    Args:
+        setup: What the task is made for.
+        spec: What is random.
+        episode: How often each environment was reset.
+    """
+    own, draws, dtype = object_qpos(setup), setup.draws, setup.dtype
+    qpos = setup.qpos.repeat(setup.num_envs, 1)
+    xy = draws.uniform("placement", episode, 2, *spec.xy).to(dtype)
+    yaw = draws.uniform("yaw", episode, 1, *spec.yaw)[:, 0].to(dtype)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=setup.device).expand(setup.num_envs, 3)
+    rise = setup.half_height - setup.half_height[:1]
+    pos = qpos[:, own.start : own.start + 3] + torch.cat([xy, rise[:, None]], dim=1)
+    quat = rotations.product(rotations.about(up, yaw), qpos[:, own.start + 3 : own.stop])
+    qpos[:, own] = torch.cat([pos, quat], dim=1)
+    return qpos, pos, quat
