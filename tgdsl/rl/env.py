@@ -27,7 +27,7 @@ from tgdsl.rl.episodes import Episodes
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
-from tgdsl.rl.start import make_setup, make_simulation, moved_joints
+from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
 
 Observations = dict[str, Float[Tensor, "env feature"]]
@@ -100,6 +100,7 @@ class TouchEnv:
         device: str = "cpu",
         seed: int = 0,
         overrides: Mapping[str, Any] | None = None,
+        simulator: str | None = None,
         threads: int = 0,
         compiled: bool | None = None,
         first_env: int = 0,
@@ -113,6 +114,7 @@ class TouchEnv:
             device: "cpu" (MuJoCo on its threads) or "cuda", "cuda:1" (MuJoCo Warp).
             seed: What all that is random follows from.
             overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
+            simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether the module is compiled by torch; default: on a GPU.
             first_env: Number of the first environment among those of all processes.
@@ -122,13 +124,14 @@ class TouchEnv:
             SpecError: All mistakes of the document, at their places.
             SimulationError: If the scene cannot be simulated as the document says.
         """
+        chosen = simulator_of(device, simulator)
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress)
         self.touch, self._sensed = sensed.touch, sensed
         if compiled if compiled is not None else self.touch.device.type == "cuda":
             self.touch.compile()
         self._joints = moved_joints(loaded, sensed)
-        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, threads)
+        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
         self.task = loaded.task(self.spec, setup)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import torch
@@ -15,13 +17,14 @@ from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.sensed import Sensed
 from tgdsl.rl.task import Setup
 from tgdsl.runtime.batch.simulation import BatchSimulation
-from tgdsl.runtime.simulate import simulate
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.scene.scene import SceneModels
 from tgdsl.schema.select import is_plain, matching
 
+SIMULATORS = ("mujoco", "warp")
+"""What steps physics: MuJoCo's threads, or MuJoCo Warp."""
 EnvSimulation = BatchSimulation | WarpSimulation
 
 
@@ -49,7 +52,7 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
 
 
 def make_simulation(
-    loaded: LoadedTask, sensed: Sensed, joints: tuple[str, ...], num_envs: int, device: str, threads: int = 0
+    loaded: LoadedTask, sensed: Sensed, joints: tuple[str, ...], num_envs: int, device: str, simulator: str, threads: int = 0
 ) -> EnvSimulation:
     """Simulate the task's scene; environments with faults wait for a reset.
 
@@ -59,6 +62,7 @@ def make_simulation(
         joints: The joints that the policy moves.
         num_envs: Number of environments.
         device: As for `tgdsl.simulate`.
+        simulator: "mujoco" or "warp".
         threads: CPU threads; 0: one per CPU.
 
     Raises:
@@ -75,19 +79,27 @@ def make_simulation(
     )
     random = spec.randomise
     per_env = [name for name, value, rest in (("mass", random.mass, ZERO), ("friction", random.friction, ONE)) if value != rest]
-    return simulate(
-        sensed.touch,
-        num_envs,
-        device=device,
-        substeps=spec.physics.substeps,
-        threads=threads,
-        keyframe=spec.keyframe,
-        options=spec.physics.options,
-        watch=watch,
-        per_env=per_env,
-        on_fault="note",
-        **(spec.physics.capacities if device != "cpu" else {}),
-    )
+    given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
+    given |= {"watch": watch, "on_fault": "note"}
+    if simulator == "warp":
+        capacities = spec.physics.capacities
+        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **given, **capacities)
+    return BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
+
+
+def simulator_of(device: str, simulator: str | None) -> str:
+    """Return the simulator that is taken: on a GPU MuJoCo Warp, else MuJoCo unless another is asked for.
+
+    Raises:
+        SimulationError: If there is no such simulator, or it is not for this device.
+    """
+    is_cpu = device.partition(":")[0] == "cpu"
+    chosen = simulator or ("mujoco" if is_cpu else "warp")
+    if chosen not in SIMULATORS:
+        raise SimulationError(f'simulator is "{chosen}"; {did_you_mean(chosen, SIMULATORS, "simulators")}')
+    if chosen == "mujoco" and not is_cpu:
+        raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
+    return chosen
 
 
 def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: tuple[str, ...], draws: Draws) -> Setup:
