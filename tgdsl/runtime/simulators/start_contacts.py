@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -22,8 +22,8 @@ FIELDS = (
     "joint_effort",
 )
 """Fields of a state that follow from forces."""
-Contacts = Literal["evaluate", "none"] | Mapping[str, Tensor]
-"""How the contacts of a start are found: see `Simulation.reset`."""
+Contacts = str | Mapping[str, Tensor]
+"""How the contacts of a start are found, "evaluate" or "none", or what they are: see `Simulation.reset`."""
 
 
 class StartContacts:
@@ -51,9 +51,9 @@ class StartContacts:
                 zero.
 
         Raises:
-            SimulationError: If there is no such field, or a shape does not fit.
+            SimulationError: If there is no such word or field, or a shape does not fit.
         """
-        given = {} if isinstance(contacts, str) else {name: self._fitting(name, contacts[name], chosen) for name in contacts}
+        given = self._given(contacts, chosen)
         for name in {**self._values, **given}:
             old, new = self._values.get(name), given.get(name)
             like = old if new is None else new
@@ -79,6 +79,14 @@ class StartContacts:
                 value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
                 values[name] = torch.where(_over(self._is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
+
+    def _given(self, contacts: Contacts, chosen: Bool[Tensor, " env"]) -> dict[str, Tensor]:
+        """Return the fields that are given for the environments, (env, …)."""
+        if not isinstance(contacts, str):
+            return {name: self._fitting(name, contacts[name], chosen) for name in contacts}
+        if contacts != "none":
+            raise SimulationError(f'contacts is "{contacts}"; {did_you_mean(contacts, ("evaluate", "none"), "choices")}')
+        return {}
 
     def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:
         known = [field for field in FIELDS if field in self._inputs.fields]
