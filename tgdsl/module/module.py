@@ -36,7 +36,7 @@ from tgdsl.sensors import KINDS, Kind
 from tgdsl.sensors.known import kinds_by_sensor, quantities_of
 from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.devices import check_dtype
-from tgdsl.tensors.env_ids import EnvIds, env_mask
+from tgdsl.tensors.env_ids import EnvIds, broadcast_over, env_mask
 from tgdsl.tensors.torch_internals import HookedModule
 
 
@@ -228,8 +228,7 @@ class TactileModule(HookedModule):
         updated = chosen_only(memory, updated, mask)
         for name, reading in readings.items():
             if f"{KEPT}{name}" in memory:
-                chosen = mask.view(-1, *[1] * (reading.ndim - 1))
-                made = torch.where(chosen, reading.transpose(-2, -1), memory[f"{KEPT}{name}"])
+                made = torch.where(broadcast_over(mask, reading), reading.transpose(-2, -1), memory[f"{KEPT}{name}"])
                 readings[name] = made.transpose(-2, -1)
             elif f"{WINDOW}{name}" in memory:
                 readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")

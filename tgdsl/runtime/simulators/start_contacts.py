@@ -16,6 +16,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module.state import SceneState, shape_of
 from tgdsl.plan.inputs import Inputs
+from tgdsl.tensors.env_ids import broadcast_over
 
 FIELDS = (
     *("contact_found", "contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce"),
@@ -59,7 +60,7 @@ class StartContacts:
             like = old if new is None else new
             assert like is not None
             old, new = (torch.zeros_like(like) if value is None else value for value in (old, new))
-            self._values[name] = torch.where(_over(chosen, like), new, old.to(new.dtype))
+            self._values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
         self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
 
     def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
@@ -77,7 +78,7 @@ class StartContacts:
             if now is not None:
                 start = self._values.get(name) if is_stored else None
                 value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
-                values[name] = torch.where(_over(self._is_placed.to(now.device), now), value, now)
+                values[name] = torch.where(broadcast_over(self._is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
 
     def _given(self, contacts: Contacts, chosen: Bool[Tensor, " env"]) -> dict[str, Tensor]:
@@ -96,8 +97,3 @@ class StartContacts:
         if tuple(value.shape) not in (shape, shape[1:]):
             raise SimulationError(f"contacts: {name} has shape {tuple(value.shape)}, expected {shape} or {shape[1:]}")
         return value.to(chosen.device).expand(shape)
-
-
-def _over(chosen: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:
-    """Return a mask over environments that broadcasts over their values."""
-    return chosen.view(-1, *[1] * (values.ndim - 1))
