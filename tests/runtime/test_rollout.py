@@ -198,3 +198,17 @@ def test_an_object_is_touched_where_it_is_less_than_its_size_away(document, clea
     sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # the scene has it a millimetre deep
     sim.set_state([1], qpos=np.array([0.001 - clearance, 0.0]))
     assert is_touched(touch, sim) == (clearance < 0)
+
+
+@pytest.mark.parametrize(("clearance", "is_contact"), [(-1e-3, True), (1e-3, True), (3e-3, False), (6e-3, False)])
+def test_within_a_gap_nothing_is_touched(document, tmp_path, clearance, is_contact):
+    """Nearer than the margin of 2 mm MuJoCo makes constraints; in the gap of 3 mm beyond it only finds the contact."""
+    (tmp_path / "gap.xml").write_text(SCENE.replace('size=".03 .03 .01"', 'size=".03 .03 .01" margin=".002" gap=".003"'))
+    touch = tgdsl.compile({**document, "robot": {**document["robot"], "model": str(tmp_path / "gap.xml")}})
+    sim = simulate(touch, 1)
+    sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))
+    data = mujoco.MjData(sim.model)
+    data.qpos[:] = 0.001 + clearance, 0.0
+    mujoco.mj_forward(sim.model, data)
+    assert (data.ncon > 0) == (clearance < 5e-3)
+    assert is_touched(touch, sim) == is_contact == (data.nefc > 0)

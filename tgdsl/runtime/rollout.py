@@ -148,7 +148,10 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
 
 
 def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
-    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now."""
+    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now.
+
+    A contact is one that MuJoCo makes constraints for: what is nearer than the geoms' margin, and not within their gap alone.
+    """
     model = sim.env_model(0)
     data = mujoco.MjData(model)
     data.qpos[:] = sim.qpos[0].cpu().numpy()
@@ -160,6 +163,7 @@ def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
     rigid = [
         {int(model.body_weldid[model.geom_bodyid[geom]]) or int(model.geom_bodyid[geom]) for geom in c.geom}
         for c in data.contact
+        if not c.exclude
     ]
     return any(len(bodies) == 2 and bodies & objects for bodies in rigid)
 
