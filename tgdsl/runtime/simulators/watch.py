@@ -111,11 +111,11 @@ class WatchReader:
             device: Where the tensors are.
 
         Raises:
-            SimulationError: If the model has no such site, or the module does not read a pair.
+            SimulationError: If the model has no such site, or its body no name, or the module does not read a pair.
         """
         self._watch = watch
         sites = np.array([site_id(model, name) for name in watch.sites], dtype=np.int64)
-        of_sites = [model.body(int(model.site_bodyid[site])).name for site in sites]
+        of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         self.inputs = _inputs(watch, bodies)
         """What a simulator has to read for it."""
@@ -189,6 +189,14 @@ def merged_joints(inputs: Inputs, watch: WatchReader | None) -> Inputs:
 def _present(value: Tensor | None) -> Tensor:
     assert value is not None  # `inputs` wants all of them
     return value
+
+
+def _carrier(model: mujoco.MjModel, site: int) -> str:
+    """Return the name of the body that a site is on."""
+    name = model.body(int(model.site_bodyid[site])).name
+    if not name:
+        raise SimulationError(f'the site "{model.site(site).name}" is on a body without a name; name it in the scene')
+    return name
 
 
 def _pair(inputs: Inputs, wanted: tuple[str, str]) -> int:
