@@ -14,6 +14,7 @@ from torch import Tensor
 from tgdsl.module.memory.clock import ENV, SHARED
 from tgdsl.module.memory.history import reduced
 from tgdsl.module.memory.memory import KEPT, WINDOW, chosen_only
+from tgdsl.tensors.env_ids import broadcast_over
 
 Tensors = dict[str, Tensor]
 LARGEST_SHARE = 0.5
@@ -34,8 +35,9 @@ def chosen_rows(
     updated, found = chosen_only(memory, updated, mask), dict(readings)
     for name, reading in readings.items():
         if f"{KEPT}{name}" in memory:
-            chosen = mask.view(-1, *[1] * (reading.ndim - 1))
-            found[name] = torch.where(chosen, reading.transpose(-2, -1), memory[f"{KEPT}{name}"]).transpose(-2, -1)
+            found[name] = torch.where(
+                broadcast_over(mask, reading), reading.transpose(-2, -1), memory[f"{KEPT}{name}"]
+            ).transpose(-2, -1)
         elif f"{WINDOW}{name}" in memory:
             found[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
     return found, updated
