@@ -152,7 +152,8 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            own.copy_(torch.where(broadcast_over(chosen, own), torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
+            new = value.to(own.dtype) if isinstance(value, Tensor) else value
+            own.copy_(torch.where(broadcast_over(chosen, own), new, own))
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
