@@ -310,6 +310,7 @@ class TouchEnv:
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
+            target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
