@@ -77,6 +77,7 @@ class Now:
         object: Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s].
         joint_pos: Positions of the joints that the policy moves [rad].
         joint_vel: Their velocities [rad/s].
+        target: What their drives are to reach, after the last action [rad].
         torque: What their drives exert [N·m].
         action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
         last_action: What it had asked for one control step before.
@@ -92,6 +93,7 @@ class Now:
     object: BodyMotion
     joint_pos: Float[Tensor, "env joint"]
     joint_vel: Float[Tensor, "env joint"]
+    target: Float[Tensor, "env joint"]
     torque: Float[Tensor, "env joint"]
     action: Float[Tensor, "env joint"]
     last_action: Float[Tensor, "env joint"]
