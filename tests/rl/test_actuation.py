@@ -44,7 +44,7 @@ def hinge(tmp_path, simulator, num_envs=1, kv=0.0, passive=0.0, substeps=1, driv
     actuators = Actuators.of(sim.model, ["hinge"])
     spec = ActionSpec(mode="absolute") if action is None else action
     actuation = Actuation(actuators, sim._arrays, spec, drive or DriveSpec(), Draws(0, num_envs))
-    sim.drive = actuation.drive if actuation.drives else None
+    sim.drive = None if actuation.is_ideal else actuation.drive
     everywhere = torch.ones(num_envs, dtype=torch.bool)
     actuation.reset(everywhere, torch.ones(num_envs, dtype=torch.int64))
     return sim, actuation
@@ -76,7 +76,7 @@ def test_the_torque_at_rest_is_seen_in_the_acceleration(tmp_path, simulator, dri
     actuation.command(targets(sim, 0.1))
     sim.step()
     assert acceleration(sim) == pytest.approx(expected / INERTIA, rel=1e-5, abs=1e-7)
-    if actuation.drives:
+    if not actuation.is_ideal:
         assert float(actuation.torque[0, 0]) == pytest.approx(expected, rel=1e-5, abs=1e-9)
 
 
@@ -162,7 +162,7 @@ def test_the_robots_own_top_speed_is_torque_over_damping(tmp_path):
 
 def test_an_ideal_drive_is_the_robots_actuator_to_the_bit(tmp_path):
     sim, actuation = hinge(tmp_path, BatchSimulation, kv=0.05, substeps=5)
-    assert not actuation.drives and sim.drive is None
+    assert actuation.is_ideal and sim.drive is None
     plain = mujoco.MjData(sim.model)
     for step in range(20):
         wanted = 0.7 * np.sin(step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import version
 from os import PathLike
 from typing import Any, NamedTuple
@@ -39,6 +39,7 @@ def compile_plan(
     overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
     progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
 ) -> Plan:
     """Return the Plan of a document.
 
@@ -47,13 +48,14 @@ def compile_plan(
         overrides: By dotted path YAML text, or a plain value, set before anything is read: `{"resolution": "high"}`.
         kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         progress: Is told in a line what is being done, each time that something begins.
+        sensors: Names of the document's sensors that are wanted; default: all.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
     """
     known, tell = known_kinds(kinds), progress or silent
-    loaded = load(document, overrides, known)
+    loaded = load(document, overrides, known, sensors=sensors)
     resolved = resolve(loaded, tell)
     plan = lower.plan(loaded, resolved, known, _origin(loaded), tell)
     tell("compiling the scene")
@@ -123,6 +125,7 @@ def compile(
     document: Document,
     *,
     resolution: str | None = None,
+    sensors: Collection[str] | None = None,
     overrides: Mapping[str, Any] | None = None,
     kinds: Sequence[Kind] = (),
     dtype: torch.dtype | str = torch.float32,
@@ -134,6 +137,7 @@ def compile(
     Args:
         document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
         resolution: Instead of the document's own.
+        sensors: Names of the document's sensors that are wanted: of the others nothing is computed; default: all.
         overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
         kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
@@ -156,7 +160,7 @@ def compile(
     if not isinstance(overrides, Mapping | None):
         raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
     chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, chosen, kinds, progress)
+    plan = compile_plan(document, chosen, kinds, progress, sensors)
     return TactileModule(plan, known_kinds(kinds), dtype).to(device)
 
 

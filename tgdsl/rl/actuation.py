@@ -226,7 +226,8 @@ class Actuation:
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
         self._play = torch.zeros_like(self.target)
         self._count = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of physics steps, above them of episodes
-        self._is_ideal = drive.is_ideal
+        self.is_ideal = drive.is_ideal
+        """Whether the robot's own actuators do all; if not, `drive` has to be called before each physics step."""
         self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
@@ -258,23 +259,22 @@ class Actuation:
         self.torque.masked_fill_(chosen[:, None], 0.0)
 
     def command(self, action: Float[Tensor, "env joint"]) -> None:
-        """Take an action of each environment: new targets, of which the drives know once they arrive."""
+        """Take an action of each environment: new targets, of which the drives know once they arrive.
+
+        What is beyond −1 and 1 is clipped; where an action is no number, its target stays.
+        """
         low, high, action = self._values["low"], self._values["high"], action.to(self.target.dtype).clamp(-1.0, 1.0)
         if self.action.mode == "absolute":
             wanted = low + 0.5 * (action + 1.0) * (high - low)
         else:
             wanted = torch.minimum(torch.maximum(self.target + self.action.scale * action, low), high)
-        self.target.copy_(torch.lerp(wanted, self.target, self.action.smoothing))
+        wanted = torch.lerp(wanted, self.target, self.action.smoothing)
+        self.target.copy_(torch.where(action.isfinite(), wanted, self.target))
         for i in range(len(self._past) - 1, 0, -1):
             self._past[i].copy_(self._past[i - 1])
         self._past[0].copy_(self.target)
-        if self._is_ideal:
+        if self.is_ideal:
             self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()
-
-    @property
-    def drives(self) -> bool:
-        """Whether `drive` has to be called before each physics step."""
-        return not self._is_ideal
 
     def drive(self) -> None:
         """Make a torque of each target, before a physics step: see the top of this page."""
@@ -300,6 +300,11 @@ class Actuation:
         self.torque.copy_(torque)
         arrays["ctrl"][:, self._index["actuator"]] = control
         arrays["qfrc_applied"][:, self._index["dof"]] = torque - plain
+
+    def memory(self) -> dict[str, Tensor]:
+        """Return what is kept, by name: live tensors."""
+        own = {"target": self.target, "torque": self.torque, "play": self._play, "past": self._past, "count": self._count}
+        return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _arrived(self) -> Float[Tensor, "env joint"]:
         """Return the targets that have arrived at the drives."""

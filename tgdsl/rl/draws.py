@@ -18,7 +18,11 @@ from tgdsl.sensors.noise.random import Stream, mix, normal_pair, sensor_key, uni
 
 
 class Draws:
-    """The random numbers of some environments."""
+    """The random numbers of some environments.
+
+    Attributes:
+        seed: What they follow from.
+    """
 
     def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0):
         """Begin.
@@ -29,10 +33,16 @@ class Draws:
             device: Where the numbers are wanted.
             first_env: Number of the first environment, counted over all processes.
         """
-        self._seed, self._device = seed, torch.device(device)
+        self.seed, self._device = seed, torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._keys: dict[str, Int[Tensor, " half"]] = {}
         self._index: dict[int, Int[Tensor, " num"]] = {}
+
+    def reseed(self, seed: int) -> None:
+        """Choose another seed, in place: graphs that were captured draw its numbers."""
+        self.seed = seed
+        for what, key in self._keys.items():
+            key.copy_(torch.tensor(sensor_key(seed, what), dtype=torch.int32))
 
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
@@ -60,7 +70,7 @@ class Draws:
 
     def _words(self, what: str, counter: Int[Tensor, " env"], num: int) -> Int[Tensor, "env num"]:
         if what not in self._keys:  # at the first call: a graph that is captured later copies nothing from the host
-            self._keys[what] = torch.tensor(sensor_key(self._seed, what), dtype=torch.int32, device=self._device)
+            self._keys[what] = torch.tensor(sensor_key(self.seed, what), dtype=torch.int32, device=self._device)
         if num not in self._index:
             self._index[num] = torch.arange(num, dtype=torch.int32, device=self._device)
         low, high = counter.to(torch.int32)[:, None], mix((counter >> 32).to(torch.int32))[:, None]

@@ -102,6 +102,10 @@ class Pushes:
         self._count += ends
         self._left.copy_(torch.where(ends, self._interval(), self._left))
 
+    def memory(self) -> dict[str, Tensor]:
+        """Return what is kept, by name: live tensors."""
+        return {"force": self.force, "left": self._left, "count": self._count}
+
     def _interval(self) -> Int[Tensor, " env"]:
         """Return after how many control steps the next push begins."""
         return self._draws.integers("push interval", self._count, 1, self._first, self._last)[:, 0]

@@ -101,7 +101,7 @@ class TaskSpec(SpecModel):
     """A task of tgdsl by name, such as `in_palm_rotate`; one of your own as `package.module:Class`, or as `file.py:Class`
     beside this document."""
     document: str
-    """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those that are needed are taken."""
+    """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those needed are taken."""
     object: str
     """The document's object that the task is about."""
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
@@ -122,3 +122,5 @@ class TaskSpec(SpecModel):
     """A noise profile of the sensors' document, or the built-in `clean` or `noisy`."""
     action: ActionSpec = ActionSpec()
     """How an action is understood."""
+    randomise: RandomSpec = RandomSpec()
+    """What is random at each reset."""

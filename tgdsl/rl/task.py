@@ -4,11 +4,11 @@ A task is one file in `tgdsl/rl/tasks`, in a fixed order: what is to be done, it
 equation; the spec; `reference`, the reward and the end of an episode in float64 NumPy; then the class, with `reset`, `advance`,
 `is_over`, `reward`, `observe`, `score`.
 
-All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be captured
-as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host.
+All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be
+captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host.
 
-Shapes: `env` environments, `joint` joints that the policy moves, `link` links that carry the `link_contact` sensor, `probe` probes
-of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
+Shapes: `env` environments, `joint` joints that the policy moves, `link` links that carry the `link_contact` sensor, `probe`
+probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
 """
 
 from __future__ import annotations
@@ -187,5 +187,3 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def score(self) -> Float[Tensor, " env"]:
         """Return how well each environment's episode has gone so far, in `score_unit`."""
-
-

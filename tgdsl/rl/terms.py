@@ -6,10 +6,11 @@
     contact_force     Σ_l max(0, |f_l| − f_max) / f_max                                     [1]
     near              mean_p exp(−max(0, d_p) / λ)                                          [1]
 
-with a the action, q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half width
-of their ranges, s the share of these that is free, f_l the object's force on link l, d_p the distance from probe p to the object.
+with a the action, q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
+width of their ranges, s the share of these that is free, f_l the object's force on link l, d_p the distance from probe p to the
+object.
 
-Source of the terms' names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
+Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
 
 Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal, overload
 
 from tgdsl.errors import SimulationError, listed
@@ -21,6 +22,7 @@ _DEFAULTS = {
     "keyframe": None,
     "options": None,
     "watch": None,
+    "per_env": (),
     "on_fault": "raise",
     "nconmax": None,
     "njmax": None,
@@ -38,6 +40,7 @@ def simulate(
     keyframe: str | None = None,
     options: Options | None = None,
     watch: Watch | None = None,
+    per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
 ) -> BatchSimulation: ...
 @overload
@@ -51,6 +54,7 @@ def simulate(
     keyframe: str | None = None,
     options: Options | None = None,
     watch: Watch | None = None,
+    per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -65,6 +69,7 @@ def simulate(
     keyframe: str | None = None,
     options: Options | None = None,
     watch: Watch | None = None,
+    per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -82,9 +87,12 @@ def simulate(
         keyframe: Name of the keyframe to start from.
         options: Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
             `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`; no XML is edited.
+        per_env: What environments shall have of their own: "mass" and "friction" for `sim.properties`, on a GPU also fields of
+            MuJoCo's model by name. On the CPU environments may always have these.
         watch: Names of bodies, sites, joints, actuators and pairs that `sim.watched()` returns, of the instant of readings.
         on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step` raise
-            until they are reset, "reset" starts them anew, in the simulator and in the module, and counts them.
+            until they are reset, "reset" starts them anew, in the simulator and in the module, "note" leaves that to whoever
+            looks at `faults` and resets them. All are counted, and the last two warn once.
         nconmax: On a GPU, capacity for contacts per environment, in a pool that all share: see `WarpSimulation`.
         njmax: On a GPU, capacity for rows of constraints in each environment.
 
@@ -94,7 +102,7 @@ def simulate(
             wants.
     """
     given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
-    given |= {"options": options, "watch": watch, "nconmax": nconmax, "njmax": njmax}
+    given |= {"options": options, "watch": watch, "per_env": tuple(per_env), "nconmax": nconmax, "njmax": njmax}
     kind = _simulator_on(device)
     known = keyword_options(kind.simulate)
     if unknown := [name for name, value in given.items() if name not in known and value != _DEFAULTS[name]]:

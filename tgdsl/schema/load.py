@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,6 +29,7 @@ def load(
     overrides: Mapping[str, Any] | None = None,
     kinds: tuple[Kind, ...] = KINDS,
     needs_sensors: bool = True,
+    sensors: Collection[str] | None = None,
 ) -> Loaded:
     """Read a document and its layout.
 
@@ -37,6 +38,7 @@ def load(
         overrides: Values to set first by dotted path, as YAML text or plain, such as `{"resolution": "high"}`.
         kinds: The sensor kinds that the document may use.
         needs_sensors: Whether it is a mistake to have none.
+        sensors: Names of those that are wanted, the others being left out; default: all.
 
     Returns:
         The document with the problems found so far: call `raise_problems` when all stages have added theirs.
@@ -55,6 +57,8 @@ def load(
         raise SpecError(source.problems)
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
+    if sensors is not None:
+        source.keep("sensors", sensors)
     model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
@@ -106,6 +110,15 @@ def parse_spec(content: bytes, name: str, model: type[S], required: tuple[str, .
     if problems or not isinstance(spec, model):
         raise SpecError(problems)
     return spec, source
+
+
+def read_source(path: Path) -> Source:
+    """Read a file's values and where they stand, as YAML; what they mean is not looked at.
+
+    Raises:
+        SpecError: If it cannot be read, or is no YAML.
+    """
+    return _read_file(path, str(path))
 
 
 def _read_file(path: Path, name: str) -> Source:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
 from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
 
-from tgdsl.errors import Problem
+from tgdsl.errors import Problem, did_you_mean
 
 Path = tuple[str | int, ...]
 
@@ -78,6 +78,16 @@ class Source:
             except (KeyError, IndexError, TypeError):
                 return None
         return value
+
+    def keep(self, key: str, names: Collection[str]) -> None:
+        """Leave out all entries of a mapping but some; those that it does not have are a mistake."""
+        own = self.value.get(key) if isinstance(self.value, dict) else None
+        if not isinstance(own, dict):
+            return
+        for name in names:
+            if name not in own:
+                self.problems.append(self.problem((key,), f'there is no "{name}"', did_you_mean(name, own, key)))
+        self.value[key] = {name: value for name, value in own.items() if name in names}
 
     def set(self, dotted: str, value: Any) -> None:
         """Override one value, as the command line's `--set key.key=value` does; a text is YAML, all else a plain value."""

@@ -1,7 +1,7 @@
 """Turn an object that lies on the palm about the vertical, with some of the fingers, one quarter turn after another.
 
-An episode begins with the object upright near the middle of the palm. The goal is a quarter turn further about the vertical n, and
-each time that it is reached, another one. With q the object's orientation, q_0 that at the start, p and p_0 its positions,
+An episode begins with the object upright near the middle of the palm. The goal is a quarter turn further about the vertical n,
+and each time that it is reached, another one. With q the object's orientation, q_0 that at the start, p and p_0 its positions,
 
     ψ_t = ψ_{t−1} + twist_n(q_t q_{t−1}⁻¹)                      angle turned so far [rad]
     θ   = swing_n(q q_0⁻¹)                                      tilt [rad]
@@ -25,9 +25,9 @@ The reward is the sum of these terms times Δt; weights are the paper's.
 
 An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names; formulas,
-Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back counts against `spin` and pays nothing:
-goals that were reached stay reached.
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
+formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back counts against `spin` and
+pays nothing: goals that were reached stay reached.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
     Args:
         spec: The task's document.
         record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
-            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, the joints' limits [rad].
+            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, limits [rad].
         dt: Δt [s].
     """
     weights = spec.rewards

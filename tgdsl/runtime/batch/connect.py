@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from tgdsl.errors import SimulationError
+from collections.abc import Sequence
+
+from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.connection import Connection
 from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_only, set_control_step
 from tgdsl.runtime.simulators.faults import OnFault
+from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
 from tgdsl.scene.options import Options
@@ -22,6 +25,7 @@ def simulate_on_cpu(
     keyframe: str | None = None,
     options: Options | None = None,
     watch: Watch | None = None,
+    per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -31,6 +35,8 @@ def simulate_on_cpu(
     Raises:
         SimulationError: As from `BatchSimulation`, or if an argument is for a GPU.
     """
+    if unknown := [word for word in per_env if word not in PER_ENV]:
+        raise SimulationError(f'per_env: there is no "{unknown[0]}" on "cpu"; {did_you_mean(unknown[0], PER_ENV, "words")}')
     if nconmax is not None or njmax is not None:
         raise SimulationError('nconmax and njmax are for physics on a GPU; on "cpu" there is always room')
     return BatchSimulation(

@@ -16,10 +16,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject
+from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject, refuse_other_fields
 
 Array = np.ndarray
 _OPTION = "opt."
+_OWN = ("body_mass", "body_inertia", "geom_friction")
+"""Fields that are changed in models of their own; the others follow."""
 
 
 class OwnFields(ObjectProperties):
@@ -75,6 +77,27 @@ class OwnFields(ObjectProperties):
                 values[env] = value[: len(values[env])] if values[env].ndim else value
         if self._is_derived and changed:
             self._batch.set_const(np.array(changed))
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return what environments have of their own: see `ObjectProperties.fields`."""
+        names = list(self._fields) if self._own is None else list(_OWN)
+        return {name: torch.from_numpy(np.array(self._values(name))) for name in names}
+
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        """Give environments fields of their own: see `ObjectProperties.set_fields`."""
+        names = [name for name in fields if name in mujoco.batch.MODEL_FIELDS]
+        refuse_other_fields(fields, {name: torch.from_numpy(np.array(self._values(name))) for name in names})
+        changed = set()
+        for name, value in fields.items():
+            now = self._values(name)
+            for env in np.flatnonzero((now != value.numpy()).reshape(len(now), -1).any(axis=1)).tolist():
+                self._row(name, env)[...] = value[env].numpy()
+                changed.add(env)
+        self._is_derived |= "body_mass" in fields
+        if self._own is not None and changed:
+            for env in changed:
+                mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
+            self._batch.set_models(self._own)
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())

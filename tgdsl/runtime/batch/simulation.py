@@ -5,7 +5,7 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import mujoco
@@ -82,8 +82,9 @@ class BatchSimulation(Simulation):
             options: MuJoCo's options that are to differ from the scene's: see `tgdsl.simulate`.
             watch: What `watched` returns.
             on_fault: What becomes of environments that diverge: "raise" has `step` raise until they are reset; "reset" starts
-                them anew, in the simulator and in the module, counts them in `fault_counts` and warns once. So do environments
-                with controls that are not finite, which "raise" refuses.
+                them anew, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
+                whoever looks at `faults` and resets them. So do environments with controls that are not finite, which "raise"
+                refuses.
             prepare: Changes the artefact's scene before it is compiled; bodies and contact sensors must stay.
 
         Raises:
@@ -132,6 +133,11 @@ class BatchSimulation(Simulation):
     def num_envs(self) -> int:
         """Number of environments."""
         return self.batch.nsim
+
+    @property
+    def arrays(self) -> Mapping[str, torch.Tensor]:
+        """Live tensors (env, …) of the arrays that MuJoCo integrates, in float64: they share its memory."""
+        return self._arrays
 
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
@@ -200,8 +206,9 @@ class BatchSimulation(Simulation):
             return
         if self._faults.on_fault == "raise":
             raise SimulationError("; ".join(self._faults.messages(diverged=", and MuJoCo has started them anew")))
-        self._begin_episodes(is_faulty, Rows({}))
-        self._faults.note_restarted(is_faulty)
+        if self._faults.on_fault == "reset":
+            self._begin_episodes(is_faulty, Rows({}))
+            self._faults.note_restarted(is_faulty)
         self._faults.warn_once()
 
     def _physics_steps(self, num: int) -> None:

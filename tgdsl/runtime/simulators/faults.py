@@ -14,8 +14,9 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
 
-OnFault = Literal["raise", "reset"]
-"""What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew."""
+OnFault = Literal["raise", "reset", "note"]
+"""What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew, "note"
+leaves that to whoever looks at `mask`."""
 DIVERGED, BAD_CONTROL, BAD_VALUES = range(3)
 _MESSAGES = (
     "environments {envs} diverged{diverged}",
@@ -42,7 +43,7 @@ class EnvFaults:
         """Begin without faults.
 
         Raises:
-            SimulationError: If `on_fault` is none of the two.
+            SimulationError: If `on_fault` is no choice.
         """
         if on_fault not in get_args(OnFault):
             hint = did_you_mean(on_fault, get_args(OnFault), "choices")
@@ -121,5 +122,5 @@ class EnvFaults:
             return
         self._has_warned = True
         kinds = ", ".join(text.format(num=num) for text, num in zip(_COUNTS, found, strict=True) if num)
-        what = f"environments had faults and were started anew: {kinds}"
-        warnings.warn(f"{what}; this is said once, `fault_counts` counts on", stacklevel=4)
+        what = "had faults" if self.on_fault == "note" else "had faults and were started anew"
+        warnings.warn(f"environments {what}: {kinds}; this is said once, `fault_counts` counts on", stacklevel=4)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, Unpack
+from typing import Any, TypeVar, Unpack
 
 import mujoco
 import numpy as np
@@ -25,11 +25,14 @@ from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
+from tgdsl.runtime.simulators.saving import load_state, saved_state
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
 from tgdsl.runtime.simulators.state_values import Rows, StateTable, StateValues
 from tgdsl.runtime.simulators.substep_states import SubstepStates
 from tgdsl.runtime.simulators.watch import Watched, WatchReader
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
+
+T = TypeVar("T")
 
 
 class Simulation(ABC):
@@ -114,7 +117,7 @@ class Simulation(ABC):
     def faults(self) -> Bool[Tensor, " env"]:
         """Environments that have diverged, or whose controls or given state were not finite.
 
-        With `on_fault="raise"` those that wait for a reset; with `on_fault="reset"` those that the last step has started anew.
+        With `on_fault="reset"` those that the last step has started anew; else those that wait for a reset.
         """
         return self._faults.mask
 
@@ -313,6 +316,27 @@ class Simulation(ABC):
         self._objects.choose(ids, variants or {}, sizes or {})
         self._use_objects()
         self.reset(ids)
+
+    def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
+        """Return work that is done again and again on the same tensors, such as a step, its reading and resets.
+
+        On a GPU its third call captures it as one CUDA graph, which is replayed from then on: what it returns is then in the
+        same tensors each time. It must not ask the GPU for a value, nor branch on one.
+        """
+        return body
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return copies of all that the future of the environments follows from, but for the module's own `state_dict`."""
+        return saved_state(self._arrays, self.properties, self._start_contacts, self._faults)
+
+    def load_state_dict(self, saved: Mapping[str, Tensor]) -> None:
+        """Go on where a simulation of the same scene, objects and number of environments was saved.
+
+        Raises:
+            SimulationError: If it was another one; nothing has changed.
+        """
+        self._refuse_if_closed()
+        load_state(saved, self._arrays, self.properties, self._start_contacts, self._faults, self.forward)
 
     def close(self) -> None:
         """Release the module, so that another simulation can read it; this one can no longer be used."""

@@ -35,6 +35,15 @@ class StartContacts:
         self._is_placed: Bool[Tensor, " env"] | None = None
         self._values: dict[str, Tensor] = {}
 
+    @property
+    def placed(self) -> tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]]:
+        """Environments that were placed, if any were, and what was stored of their contacts by field."""
+        return self._is_placed, self._values
+
+    @placed.setter
+    def placed(self, placed: tuple[Bool[Tensor, " env"] | None, dict[str, Tensor]] | None) -> None:
+        self._is_placed, self._values = placed or (None, {})
+
     def forget(self, chosen: Bool[Tensor, " env"] | None = None) -> None:
         """Forget some environments (default: all), whose contacts the simulator has evaluated."""
         if chosen is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.connection import Connection
@@ -23,6 +25,7 @@ def _simulate(
     keyframe: str | None = None,
     options: Options | None = None,
     watch: Watch | None = None,
+    per_env: Sequence[str] = (),
     on_fault: OnFault = "raise",
     nconmax: int | None = None,
     njmax: int | None = None,
@@ -42,6 +45,7 @@ def _simulate(
         keyframe=keyframe,
         options=options,
         watch=watch,
+        per_env=per_env,
         on_fault=on_fault,
         nconmax=nconmax,
         njmax=njmax,

@@ -13,7 +13,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.simulators.objects.properties import MASS_FIELDS, PER_ENV, ObjectProperties, RigidObject
+from tgdsl.runtime.simulators.objects.properties import (
+    MASS_FIELDS,
+    PER_ENV,
+    ObjectProperties,
+    RigidObject,
+    refuse_other_fields,
+)
 
 
 class WorldProperties(ObjectProperties):
@@ -39,6 +45,16 @@ class WorldProperties(ObjectProperties):
         super().__init__(model, bodies_of, num_envs, device)
         self._fields = parameters
         self._indices: dict[tuple[str, str], Tensor] = {}
+
+    def fields(self) -> dict[str, Tensor]:
+        """Return what environments have of their own: see `ObjectProperties.fields`."""
+        return dict(self._fields)
+
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        """Give environments fields of their own: see `ObjectProperties.set_fields`."""
+        refuse_other_fields(fields, self._fields)
+        for name, value in fields.items():
+            self._fields[name].copy_(value)
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         self._check("mass")

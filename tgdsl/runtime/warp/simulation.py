@@ -5,8 +5,8 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
@@ -31,6 +31,8 @@ from tgdsl.runtime.warp.stream import GraphedCall, WarpStream
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, env_mask
+
+T = TypeVar("T")
 
 
 class WarpSimulation(Simulation):
@@ -96,8 +98,9 @@ class WarpSimulation(Simulation):
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
             on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step`
                 raise until they are reset; "reset" starts them anew, in the simulator and in the module, counts them in
-                `fault_counts` and warns once. On a GPU that is done there, without waiting, and each `state` then evaluates
-                all environments once more. Pools that are too small raise either way.
+                `fault_counts` and warns once; "note" leaves it to whoever looks at `faults` and resets them. On a GPU "reset"
+                is done there, without waiting, and each `state` then evaluates all environments once more. Pools that are too
+                small raise either way.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -196,6 +199,23 @@ class WarpSimulation(Simulation):
         self._touch.hand_out(readings)
         self._finish_step(is_evaluated=True)
         return readings
+
+    def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
+        """Return work that is done again and again, such as a whole step of an environment: see `Simulation.repeated`."""
+        call, placed = GraphedCall(self._stream, body), None
+
+        def done() -> T:
+            nonlocal placed
+            self._refuse_if_closed()
+            was_captured = call.is_captured
+            result = call()
+            if call.is_captured:  # what the work notes on the host is as it was when it was captured
+                placed = placed if was_captured else self._start_contacts.placed
+                self._start_contacts.placed = placed
+                self._finish_step(is_evaluated=True)
+            return result
+
+        return done
 
     def forward(self, env_ids: EnvIds | None = None) -> None:
         """Evaluate poses, velocities and contacts of some environments where they are now: see `Simulation.forward`."""
@@ -298,5 +318,5 @@ class WarpSimulation(Simulation):
         to_raise, totals = self._worlds.faults.polled()
         if to_raise:
             self.check()
-        if self._faults.on_fault == "reset":
+        if self._faults.on_fault != "raise":
             self._faults.warn_once(totals)

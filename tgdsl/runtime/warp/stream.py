@@ -56,6 +56,8 @@ class WarpStream:
             self._warp.init()
         self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self._warp_stream = self._warp.stream_from_torch(self._stream) if self._stream else None
+        self.is_in_own_graph = False
+        """Whether what is done now goes into a graph of `capture`."""
 
     @property
     def is_capturing(self) -> bool:
@@ -115,6 +117,7 @@ class WarpStream:
             gc.collect()
             was_enabled = gc.isenabled()
             gc.disable()
+            self.is_in_own_graph = True
             try:
                 with (
                     torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"),
@@ -124,6 +127,7 @@ class WarpStream:
             except RuntimeError as error:
                 raise SimulationError(f"no CUDA graph can be made of this ({error}); graph=False does without") from error
             finally:
+                self.is_in_own_graph = False
                 if was_enabled:
                     gc.enable()
         return graph, result
@@ -157,8 +161,15 @@ class GraphedCall(Generic[T]):
         self._eager_calls = 0
         self._captured: tuple[torch.cuda.CUDAGraph, T] | None = None
 
+    @property
+    def is_captured(self) -> bool:
+        """Whether the work is replayed."""
+        return self._captured is not None
+
     def __call__(self) -> T:
         """Do the work; tensors that a replay returns are the same each time."""
+        if self._stream.is_in_own_graph:
+            return self._body()
         if self._stream.is_capturing:
             with self._stream.capture_scope():
                 return self._body()

@@ -105,6 +105,18 @@ class ObjectProperties(ABC):
         return self._friction(self._object(name))
 
     @abstractmethod
+    def fields(self) -> dict[str, Tensor]:
+        """Return what environments have of their own: fields of MuJoCo's model by name, (env, …)."""
+
+    @abstractmethod
+    def set_fields(self, fields: Mapping[str, Tensor]) -> None:
+        """Give environments fields of their own that `fields` has returned.
+
+        Raises:
+            SimulationError: If these are of other environments or another model.
+        """
+
+    @abstractmethod
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None: ...
 
     @abstractmethod
@@ -120,6 +132,17 @@ class ObjectProperties(ABC):
         if name not in self._objects:
             self._objects[name] = rigid_object(self._model, name, self._bodies_of)
         return self._objects[name]
+
+
+def refuse_other_fields(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> None:
+    """Refuse fields that environments do not have, or of another shape.
+
+    Raises:
+        SimulationError: If there are any.
+    """
+    for name, value in given.items():
+        if name not in own or tuple(own[name].shape) != tuple(value.shape):
+            raise SimulationError(f'environments cannot have a "{name}" of shape {tuple(value.shape)} of their own')
 
 
 def rigid_object(model: mujoco.MjModel, name: str, bodies_of: Mapping[str, str]) -> RigidObject:

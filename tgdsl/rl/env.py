@@ -1,0 +1,336 @@
+"""Environments in which touch can be learned: a task, its module and a simulation as one step.
+
+One control step, in this order: the action becomes targets; forces that push begin or end; physics steps, each with its drive;
+readings of one instant; is it over; rewards; and then the environments that have ended begin anew: what is random is drawn,
+they are placed, and they alone are read again, without a move of anyone else's delay, noise or history. On a GPU all of it is
+one CUDA graph, and the host never waits.
+
+Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.console.progress import Progress
+from tgdsl.errors import SimulationError
+from tgdsl.rl import groups, saving
+from tgdsl.rl.actuation import Actuation
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.load import LoadedTask, load_task
+from tgdsl.rl.pushes import Pushes
+from tgdsl.rl.sensed import GROUP, compile_sensed
+from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
+from tgdsl.rl.task import Now
+
+Observations = dict[str, Float[Tensor, "env feature"]]
+
+
+class StepInfo(NamedTuple):
+    """What else a step tells. Rows of what is of an episode are of that which has just ended, where one has.
+
+    Attributes:
+        ended: Episodes that have ended, terminated or truncated.
+        final_obs: Observations before the reset; other than those that the step returns where an episode has ended.
+        terms: Terms of the reward of this step by name, weights and Δt included.
+        score: Score of the episode, in `task.score_unit`.
+        episode_return: Sum of its rewards.
+        episode_steps: Its control steps.
+        episode_terms: Sums of its terms by name.
+        faults: Environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0.
+    """
+
+    ended: Bool[Tensor, " env"]
+    final_obs: Observations
+    terms: dict[str, Float[Tensor, " env"]]
+    score: Float[Tensor, " env"]
+    episode_return: Float[Tensor, " env"]
+    episode_steps: Int[Tensor, " env"]
+    episode_terms: dict[str, Float[Tensor, " env"]]
+    faults: Bool[Tensor, " env"]
+
+
+class Step(NamedTuple):
+    """What a step returns.
+
+    Attributes:
+        obs: Observations by group; of episodes that have ended, the first of the next one.
+        reward: Sum of the terms.
+        terminated: Episodes that have ended for good.
+        truncated: Episodes that have merely lasted long enough.
+        info: What else there is to tell.
+    """
+
+    obs: Observations
+    reward: Float[Tensor, " env"]
+    terminated: Bool[Tensor, " env"]
+    truncated: Bool[Tensor, " env"]
+    info: StepInfo
+
+
+class TouchEnv:
+    """Environments of one task: tensors in, tensors out.
+
+    Groups of observations: `proprio` (positions [rad], velocities [rad/s] and last action of the joints that the policy moves),
+    `tactile_sensors` (none with `touch: none`), `priv_proprio` (`proprio` and the force on each link [N]), and the task's own.
+
+    Attributes:
+        spec: The task's document.
+        task: The task.
+        sim: The simulation.
+        touch: The module.
+        actuation: The drives of the joints that the policy moves.
+        pushes: Forces that push the object.
+        groups: Size of each group of observations.
+        steps: Control steps of each environment's present episode; may be written.
+    """
+
+    def __init__(
+        self,
+        task: str | PathLike[str] | Mapping[str, Any] | LoadedTask,
+        num_envs: int,
+        *,
+        device: str = "cpu",
+        seed: int = 0,
+        overrides: Mapping[str, Any] | None = None,
+        simulator: str | None = None,
+        threads: int = 0,
+        compiled: bool | None = None,
+        first_env: int = 0,
+        progress: Progress | None = None,
+    ):
+        """Make the environments and begin an episode in each.
+
+        Args:
+            task: The task's document: a YAML file, or the same as a mapping.
+            num_envs: Number of environments.
+            device: "cpu" (MuJoCo on its threads) or "cuda", "cuda:1" (MuJoCo Warp).
+            seed: What all that is random follows from.
+            overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
+            simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
+            threads: CPU threads of physics; 0: one per CPU.
+            compiled: Whether the module is compiled by torch; default: on a GPU.
+            first_env: Number of the first environment among those of all processes.
+            progress: Is told in a line what is being done.
+
+        Raises:
+            SpecError: All mistakes of the document, at their places.
+            SimulationError: If the scene cannot be simulated as the document says.
+        """
+        chosen = simulator_of(device, simulator)
+        loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
+        self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress)
+        self.touch, self._sensed = sensed.touch, sensed
+        if compiled if compiled is not None else self.touch.device.type == "cuda":
+            self.touch.compile()
+        self._joints = moved_joints(loaded, sensed)
+        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
+        draws = Draws(seed, num_envs, self.sim.qpos.device, first_env)
+        setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
+        self.task = loaded.task(self.spec, setup)
+        self._draws, self._first_env = draws, first_env
+        random = self.spec.randomise
+        arrays = self.sim.arrays
+        self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws)
+        self.sim.drive = None if self.actuation.is_ideal else self.actuation.drive
+        body = int(setup.model.body(setup.object).id)
+        self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
+        self.max_steps = max(1, round(self.spec.episode / setup.control_step))
+        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws)
+        self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
+        self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
+        self._call = self.sim.repeated(self._advance)
+        self._readings: dict[str, Tensor] = {}
+        self._obs = self.reset(seed)
+        self.groups = {name: value.shape[1] for name, value in self._obs.items()}
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        return self.sim.num_envs
+
+    @property
+    def num_actions(self) -> int:
+        """Number of joints that the policy moves."""
+        return len(self._joints)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints that the policy moves, in the order of actions."""
+        return self._joints
+
+    @property
+    def device(self) -> torch.device:
+        """Where observations and rewards are."""
+        return self.touch.device
+
+    @property
+    def control_step(self) -> float:
+        """Duration of a control step [s]."""
+        return self.sim.control_step
+
+    @property
+    def steps(self) -> Int[Tensor, " env"]:
+        """Control steps of each environment's present episode: a live tensor."""
+        return self._episodes.steps
+
+    def reset(self, seed: int | None = None) -> Observations:
+        """Begin a new episode in all environments.
+
+        Args:
+            seed: What all that is random follows from, as if the environments were made with it; default: go on.
+        """
+        everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
+        with torch.no_grad():
+            if seed is not None:
+                self._draws.reseed(seed)
+                self._episodes.count_anew()
+            self._begin(everyone)
+            if seed is not None:
+                self.touch.seed(seed, self._first_env)
+            self._obs = self._observe(self._now(self.sim.read()))
+            return dict(self._obs)
+
+    def step(self, action: Float[Tensor, "env joint"]) -> Step:
+        """Make one control step in all environments; those whose episodes end begin the next one.
+
+        Args:
+            action: What the policy asks for, from −1 to 1: what is beyond is clipped. An environment with actions that are not
+                finite ends its episode, and is named in `info.faults`.
+
+        Raises:
+            SimulationError: If an action does not fit, or a pool of MuJoCo Warp was too small.
+        """
+        if tuple(action.shape) != tuple(self._action.shape):
+            raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
+        with torch.no_grad():
+            self._action.copy_(action)
+            made = self._call()
+            made = _copied(made) if self.device.type == "cuda" else made
+        self._obs = made.obs
+        return made._replace(obs=dict(made.obs))
+
+    def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
+
+        Raises:
+            SimulationError: If it feels nothing.
+        """
+        if self._sensed.felt is None:
+            raise SimulationError("the policy feels nothing: touch is none")
+        return self.touch.images(self._sensed.felt, self._readings)
+
+    def state_dict(self) -> dict[str, dict[str, Tensor]]:
+        """Return copies of all that the future follows from, but for the policy.
+
+        Another `TouchEnv` of the same document and number of environments goes on from it: on a CPU bit for bit.
+        """
+        kept = {part: saving.saved(memory) for part, memory in self._memory().items()}
+        kept |= {"sim": self.sim.state_dict(), "touch": saving.saved(self.touch.state_dict()), "obs": saving.saved(self._obs)}
+        return kept | {"seed": {"seed": torch.tensor(self._draws.seed)}}
+
+    def load_state_dict(self, state: Mapping[str, Mapping[str, Tensor]]) -> Observations:
+        """Go on where environments of the same document and number were saved; return the observations there.
+
+        Raises:
+            SimulationError: If they were others; nothing has changed.
+        """
+        names = [name.partition("/")[2] for name in state.get("episodes", {}) if name.startswith("sums/")]
+        self._episodes.expect(names)
+        for part, memory in self._memory().items():
+            saving.refuse_other(memory, state.get(part, {}), part)
+        self.sim.load_state_dict(state["sim"])
+        for part, memory in self._memory().items():
+            saving.restore(memory, state[part])
+        self.touch.load_state_dict(dict(state["touch"]))
+        self._draws.reseed(int(state["seed"]["seed"]))
+        self._obs = {name: value.to(self.device) for name, value in saving.saved(state["obs"]).items()}
+        return dict(self._obs)
+
+    def close(self) -> None:
+        """Release the module; the environments can no longer be used."""
+        self.sim.close()
+
+    def _memory(self) -> dict[str, dict[str, Tensor]]:
+        """Return what is kept besides simulation and module: live tensors by part and name."""
+        actions = {"used": self._used, "before": self._before}
+        parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
+        return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+
+    def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Begin episodes of some environments."""
+        self._episodes.begin(chosen)
+        for held in (self._used, self._before):
+            held.masked_fill_(chosen[:, None], 0.0)
+
+    def _advance(self) -> Step:
+        """Make one control step with the action that was copied: see the top of this page."""
+        action, sim = self._action.to(self._used), self.sim
+        is_bad = ~action.isfinite().all(dim=1)
+        self.actuation.command(action)
+        self._before.copy_(self._used)
+        self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
+        self.pushes.advance()
+        sim.step(torch.where(is_bad[:, None], torch.nan, sim.ctrl))
+        now, faults = self._now(sim.read()), sim.faults.clone()
+        self.task.advance(now)
+        terminated = self.task.is_over(now) | faults
+        rates = self.task.reward(now, terminated)
+        terms = {name: torch.where(faults, 0.0, rate * self.control_step).float() for name, rate in rates.items()}
+        reward = torch.stack(list(terms.values())).sum(dim=0)
+        self._episodes.add(terms, reward)
+        truncated = (self.steps >= self.max_steps) & ~terminated
+        ended = terminated | truncated
+        obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in self._observe(now).items()}
+        episodes = self._episodes
+        sums = {name: total.clone() for name, total in episodes.sums.items()}
+        score, total = self.task.score().float().clone(), episodes.total.clone()
+        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults)
+        if ended.is_cuda or bool(ended.any()):
+            self._begin(ended)
+            obs = self._observe(self._now(sim.read(ended)))
+        return Step(obs, reward, terminated, truncated, info)
+
+    def _now(self, readings: dict[str, Tensor]) -> Now:
+        """Return the instant that readings are of."""
+        self._readings, sim, num = readings, self.sim, self.num_actions
+        watched = sim.watched()
+        dtype, device = self._used.dtype, self._used.device
+        none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
+        contact, distance = self._sensed.contact, self._sensed.distance
+        return Now(
+            watched=watched,
+            object=watched.body(self._sensed.object),
+            joint_pos=watched.joint_pos[:, :num],
+            joint_vel=watched.joint_vel[:, :num],
+            torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
+            action=self._used,
+            last_action=self._before,
+            link_force=readings[contact][..., -3:].to(device, dtype) if contact else none.view(self.num_envs, 0, 3),
+            distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
+            friction=self._episodes.friction,
+            mass=self._episodes.mass,
+            readings=readings,
+        )
+
+    def _observe(self, now: Now) -> Observations:
+        """Return all groups of observations."""
+        felt = {} if self._sensed.felt is None else {GROUP: self.touch.observe(now.readings)[GROUP]}
+        own = {"proprio": groups.proprio(now)} | felt | {"priv_proprio": groups.priv_proprio(now)} | self.task.observe(now)
+        return {name: value.to(self.device, torch.float32) for name, value in own.items()}
+
+
+def _copied(made: Any) -> Any:
+    """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
+    if isinstance(made, Tensor):
+        return made.clone()
+    if isinstance(made, dict):
+        return {name: _copied(value) for name, value in made.items()}
+    return type(made)(*(_copied(value) for value in made))

@@ -1,0 +1,108 @@
+"""The episodes of all environments: how they begin, how long they have lasted, and what they have brought.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.rl.actuation import ONE, ZERO, Actuation
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.pushes import Pushes
+from tgdsl.rl.spec import RandomSpec
+from tgdsl.rl.start import EnvSimulation
+from tgdsl.rl.task import Task
+
+
+class Episodes:
+    """Begins episodes, and adds up what they bring.
+
+    Attributes:
+        number: How often each environment was reset: the count of its random numbers.
+        steps: Control steps of each present episode.
+        friction: Coefficient of sliding friction of each object.
+        mass: Mass of each object [kg].
+        total: Rewards, summed over each present episode.
+        sums: Terms of the reward, summed over each present episode.
+    """
+
+    number: Int[Tensor, " env"]
+    steps: Int[Tensor, " env"]
+    friction: Float[Tensor, " env"]
+    mass: Float[Tensor, " env"]
+    total: Float[Tensor, " env"]
+    sums: dict[str, Float[Tensor, " env"]]
+
+    def __init__(self, sim: EnvSimulation, random: RandomSpec, task: Task, actuation: Actuation, pushes: Pushes, draws: Draws):
+        """Note what the scene's objects are like before anything is random.
+
+        Args:
+            sim: The simulation.
+            random: What is random.
+            task: The task.
+            actuation: The drives.
+            pushes: What pushes the object.
+            draws: Random numbers.
+        """
+        self._sim, self._random, self._task = sim, random, task
+        self._actuation, self._pushes, self._draws = actuation, pushes, draws
+        self._object = task.setup.object
+        device, dtype = sim.qpos.device, sim.qpos.dtype
+        self.number = torch.zeros(sim.num_envs, dtype=torch.int64, device=device)
+        self.steps = torch.zeros_like(self.number)
+        self._friction = sim.properties.friction(self._object).to(device, dtype).clone()
+        self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
+        self.friction, self.mass = self._friction.clone(), self._mass.clone()
+        self.total = torch.zeros(sim.num_envs, device=device)
+        self.sums = {}
+
+    def begin(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Begin a new episode in some environments, in the simulation and the module too."""
+        self.number += chosen
+        self._draw_properties(chosen)
+        start = self._task.reset(chosen, self.number)
+        self._sim.reset(chosen, contacts=start.contacts, **start.values)
+        self._actuation.reset(chosen, self.number)
+        self._pushes.reset(chosen, self.number)
+        self.steps.masked_fill_(chosen, 0)
+        for total in (self.total, *self.sums.values()):
+            total.masked_fill_(chosen, 0.0)
+
+    def count_anew(self) -> None:
+        """Begin to count episodes from 0, so that random numbers are those of environments just made."""
+        self.number.zero_()
+
+    def add(self, terms: Mapping[str, Float[Tensor, " env"]], reward: Float[Tensor, " env"]) -> None:
+        """Add a control step and what it brought."""
+        self.expect(terms)
+        for name, term in terms.items():
+            self.sums[name] += term
+        self.total += reward
+        self.steps += 1
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Begin to add up terms of the reward, if that was not begun."""
+        if not self.sums:
+            self.sums = {name: torch.zeros_like(self.total) for name in names}
+
+    def memory(self) -> dict[str, Tensor]:
+        """Return what is kept, by name: live tensors."""
+        own = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
+        return own | {f"sums/{name}": total for name, total in self.sums.items()}
+
+    def _draw_properties(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Draw friction and mass, where these are random."""
+        random, draws = self._random, self._draws
+        if random.friction != ONE:
+            factor = draws.uniform("friction", self.number, 1, *random.friction)[:, 0]
+            self.friction.copy_(torch.where(chosen, self._friction * factor.to(self._friction.dtype), self.friction))
+            self._sim.properties.set(chosen, friction={self._object: self.friction})
+        if random.mass != ZERO:
+            added = draws.uniform("mass", self.number, 1, *random.mass)[:, 0]
+            self.mass.copy_(torch.where(chosen, self._mass + added.to(self._mass.dtype), self.mass))
+            self._sim.properties.set(chosen, mass={self._object: self.mass})

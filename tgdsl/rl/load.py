@@ -1,0 +1,119 @@
+"""From a task's document to its spec and class: every mistake is reported at its place, with what would be right."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
+from tgdsl.rl.spec import TaskSpec
+from tgdsl.rl.task import Task
+from tgdsl.rl.tasks import TASKS
+from tgdsl.schema.load import read_source
+from tgdsl.schema.validation import validate
+from tgdsl.schema.yaml import Path as Place
+from tgdsl.schema.yaml import Source, from_mapping
+
+REQUIRED = ("tgdsl", "task", "document", "object", "joints")
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedTask:
+    """A task's document, as found and as read.
+
+    Attributes:
+        spec: The document.
+        task: The task's class.
+        source: Its text's values and places.
+        folder: Folder that file names in it are relative to.
+    """
+
+    spec: TaskSpec
+    task: type[Task[Any]]
+    source: Source
+    folder: Path
+
+    def error(self, place: Place, what: str, hint: str = "") -> SpecError:
+        """Return the error of a mistake at a place of the document."""
+        return SpecError([self.source.problem(place, what, hint)])
+
+
+def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapping[str, Any] | None = None) -> LoadedTask:
+    """Read a task's document.
+
+    Args:
+        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
+        overrides: Values to set first by dotted path, as YAML text or plain, such as `{"rewards.spin": 3}`.
+
+    Raises:
+        SpecError: All its mistakes, with file, line and column.
+        TgdslError: If the document is neither a file's name nor a mapping.
+    """
+    if not isinstance(document, (str, PathLike, Mapping)):
+        raise TgdslError(f"a task is a YAML file's name or a mapping, found {type(document).__name__}")
+    if isinstance(document, Mapping):
+        source, folder = from_mapping(document, "<mapping>"), Path.cwd()
+    else:
+        source, folder = read_source(Path(document)), Path(document).parent
+    for dotted, value in (overrides or {}).items():
+        source.set(dotted, value)
+    if not isinstance(source.value, dict) or not isinstance(source.value.get("task"), str):
+        what = 'missing key "task", one of: ' + ", ".join(TASKS)
+        raise SpecError([*source.problems, source.problem(("task",), what, on_key=True)])
+    task = _task_class(source, folder)
+    problems: list[Problem] = list(source.problems)
+    spec = validate(source, (), task.Spec, problems, REQUIRED)
+    if problems or not isinstance(spec, TaskSpec):
+        raise SpecError(problems)
+    return LoadedTask(spec, task, source, folder)
+
+
+def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
+    """Return the class that a document's `task` names.
+
+    Raises:
+        SpecError: If there is none.
+    """
+    name = source.value["task"]
+    if name in TASKS:
+        place, class_ = TASKS[name]
+        return getattr(importlib.import_module(place), class_)
+    module, colon, class_ = name.partition(":")
+    if not colon:
+        hint = f"{did_you_mean(name, TASKS, 'tasks')}; one of your own is package.module:Class or file.py:Class"
+        raise SpecError([source.problem(("task",), f'there is no task "{name}"', hint)])
+    try:
+        found = getattr(_own_module(module, folder), class_)
+    except (ImportError, OSError, SyntaxError, AttributeError) as error:
+        what = f'cannot import "{name}": {type(error).__name__}: {error}'
+        raise SpecError([source.problem(("task",), what)]) from error
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        raise SpecError([source.problem(("task",), f'"{name}" is no subclass of tgdsl.rl.task.Task')])
+    return found
+
+
+def _own_module(name: str, folder: Path) -> Any:
+    """Import a module by its name, or from a file that stands beside the document."""
+    if not name.endswith(".py"):
+        return importlib.import_module(name)
+    file = (folder / name).resolve()
+    known = f"tgdsl_task_{file.stem}_{abs(hash(str(file)))}"
+    if known in sys.modules:
+        return sys.modules[known]
+    made = importlib.util.spec_from_file_location(known, file)
+    if made is None or made.loader is None or not file.is_file():
+        raise FileNotFoundError(f"there is no file {file}")
+    module = importlib.util.module_from_spec(made)
+    sys.modules[known] = module
+    try:
+        made.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[known]
+        raise
+    return module

@@ -1,0 +1,35 @@
+"""Tensors that are kept by name: copied out, and put back in place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from tgdsl.errors import SimulationError, listed
+
+
+def saved(memory: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies."""
+    return {name: value.clone() for name, value in memory.items()}
+
+
+def refuse_other(own: Mapping[str, Tensor], given: Mapping[str, Tensor], what: str) -> None:
+    """Refuse what was saved of something else.
+
+    Raises:
+        SimulationError: If names or shapes differ.
+    """
+    wrong = [name for name in {**own, **given} if name not in own or name not in given or own[name].shape != given[name].shape]
+    if wrong:
+        raise SimulationError(
+            f"the {what} that was saved is of other environments: {listed(wrong)} missing or of another shape"
+        )
+
+
+def restore(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
+    """Put what was saved into the tensors of the same names."""
+    with torch.no_grad():
+        for name, value in given.items():
+            own[name].copy_(value)

@@ -1,0 +1,161 @@
+"""The simulation of a task's environments, and what the task is told of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import Problem, SimulationError, SpecError, did_you_mean
+from tgdsl.rl.actuation import ONE, ZERO, Actuators
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.sensed import Sensed
+from tgdsl.rl.task import Setup
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.watch import Watch
+from tgdsl.runtime.warp import WarpSimulation
+from tgdsl.scene.scene import SceneModels
+from tgdsl.schema.select import is_plain, matching
+
+SIMULATORS = ("mujoco", "warp")
+"""What steps physics: MuJoCo's threads, or MuJoCo Warp."""
+EnvSimulation = BatchSimulation | WarpSimulation
+
+
+def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
+    """Return the joints that the policy moves, in the order of the actuators.
+
+    Raises:
+        SpecError: If a name or wildcard matches no joint with an actuator, or there is no such keyframe.
+    """
+    model = SceneModels(sensed.touch.plan.scene).model({})
+    of_actuators = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
+    known = list(dict.fromkeys(model.joint(int(i)).name for i in of_actuators))
+    problems: list[Problem] = []
+    for i, pattern in enumerate(loaded.spec.joints):
+        if not matching(pattern, known):
+            what = f'no actuated joint {"is called" if is_plain(pattern) else "matches"} "{pattern}"'
+            problems.append(loaded.source.problem(("joints", i), what, did_you_mean(pattern, known, "joints")))
+    try:
+        keyframe_id(model, loaded.spec.keyframe)
+    except SimulationError as error:
+        problems.append(loaded.source.problem(("keyframe",), str(error)))
+    if problems:
+        raise SpecError(problems)
+    return tuple(name for name in known if any(matching(pattern, [name]) for pattern in loaded.spec.joints))
+
+
+def make_simulation(
+    loaded: LoadedTask, sensed: Sensed, joints: tuple[str, ...], num_envs: int, device: str, simulator: str, threads: int = 0
+) -> EnvSimulation:
+    """Simulate the task's scene; environments with faults wait for a reset.
+
+    Args:
+        loaded: The task's document.
+        sensed: Its module.
+        joints: The joints that the policy moves.
+        num_envs: Number of environments.
+        device: As for `tgdsl.simulate`.
+        simulator: "mujoco" or "warp".
+        threads: CPU threads; 0: one per CPU.
+
+    Raises:
+        SimulationError: If the scene cannot be simulated as the document says.
+    """
+    spec = loaded.spec
+    own = loaded.task.watch(spec)
+    watch = Watch(
+        bodies=tuple(dict.fromkeys((sensed.object, *own.bodies))),
+        sites=own.sites,
+        joints=tuple(dict.fromkeys((*joints, *own.joints))),
+        actuators=own.actuators,
+        pairs=own.pairs,
+    )
+    random = spec.randomise
+    per_env = [name for name, value, rest in (("mass", random.mass, ZERO), ("friction", random.friction, ONE)) if value != rest]
+    given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
+    given |= {"watch": watch, "on_fault": "note"}
+    if simulator == "warp":
+        capacities = spec.physics.capacities
+        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **given, **capacities)
+    return BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
+
+
+def simulator_of(device: str, simulator: str | None) -> str:
+    """Return the simulator that is taken: on a GPU MuJoCo Warp, else MuJoCo unless another is asked for.
+
+    Raises:
+        SimulationError: If there is no such simulator, or it is not for this device.
+    """
+    is_cpu = device.partition(":")[0] == "cpu"
+    chosen = simulator or ("mujoco" if is_cpu else "warp")
+    if chosen not in SIMULATORS:
+        raise SimulationError(f'simulator is "{chosen}"; {did_you_mean(chosen, SIMULATORS, "simulators")}')
+    if chosen == "mujoco" and not is_cpu:
+        raise SimulationError(f'MuJoCo steps on the CPU, and the device is "{device}"; leave `simulator` out')
+    return chosen
+
+
+def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: tuple[str, ...], draws: Draws) -> Setup:
+    """Return what the task is told of its simulation.
+
+    Raises:
+        SpecError: If a joint that the policy moves has no position actuator of its own, or no limits.
+    """
+    try:
+        actuators = Actuators.of(sim.model, joints)
+    except SimulationError as error:
+        raise loaded.error(("joints",), str(error)) from error
+    rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
+    return Setup(
+        num_envs=sim.num_envs,
+        device=sim.qpos.device,
+        dtype=sim.qpos.dtype,
+        control_step=sim.control_step,
+        model=sim.model,
+        joints=sim.joints,
+        actuators=actuators,
+        object=sensed.object,
+        links=tuple(rows),
+        qpos=sim.qpos[0].clone(),
+        half_height=_half_heights(sim, sensed, loaded.spec.object),
+        draws=draws,
+    )
+
+
+def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
+    """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
+    inputs = sensed.touch.inputs
+    num = inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
+    qpos = sim.qpos[0].double().cpu().numpy()
+    each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
+    variants = torch.arange(sim.num_envs) % num
+    return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
+
+
+def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:
+    """Return how far a body's colliding geoms reach below its origin in the world [m]; meshes by their bounding boxes.
+
+    Args:
+        model: The scene.
+        body: The body.
+        qpos: Positions of all joints.
+    """
+    state = mujoco.MjData(model)
+    state.qpos[:] = qpos
+    mujoco.mj_kinematics(model, state)
+    own = model.body(body)
+    lowest = state.xpos[own.id, 2]
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    for geom in range(int(own.geomadr[0]), int(own.geomadr[0]) + int(own.geomnum[0])):
+        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+            center, half = np.split(model.geom_aabb[geom], 2)
+            corners = state.geom_xpos[geom] + (center + signs * half) @ state.geom_xmat[geom].reshape(3, 3).T
+            lowest = min(lowest, corners[:, 2].min())
+    return float(state.xpos[own.id, 2] - lowest)
