@@ -305,6 +305,9 @@ class TouchEnv:
         dtype, device = self._used.dtype, self._used.device
         none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
         contact, distance = self._sensed.contact, self._sensed.distance
+        forces = {f"force_{axis}": none for axis in "xyz"}
+        if contact:
+            forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
         return Now(
             watched=watched,
             object=watched.body(self._sensed.object),
@@ -314,7 +317,8 @@ class TouchEnv:
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
-            link_force=readings[contact][..., -3:].to(device, dtype) if contact else none.view(self.num_envs, 0, 3),
+            link_force=torch.stack([forces[f"force_{axis}"] for axis in "xyz"], dim=2),
+            normal_force=forces.get("normal_force", none),
             distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
             friction=self._episodes.friction,
             mass=self._episodes.mass,

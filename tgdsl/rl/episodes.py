@@ -57,7 +57,7 @@ class Episodes:
         self.steps = torch.zeros_like(self.number)
         self._friction = sim.properties.friction(self._object).to(device, dtype).clone()
         self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
-        self.friction, self.mass = self._friction.clone(), self._mass.clone()
+        self.friction, self.mass = task.setup.friction, task.setup.mass
         self.total = torch.zeros(sim.num_envs, device=device)
         self.sums = {}
 
@@ -67,7 +67,7 @@ class Episodes:
         self._draw_properties(chosen)
         start = self._task.reset(chosen, self.number)
         self._sim.reset(chosen, contacts=start.contacts, **start.values)
-        self._actuation.reset(chosen, self.number)
+        self._actuation.reset(chosen, self.number, at_controls="ctrl" in start.values)
         self._pushes.reset(chosen, self.number)
         self.steps.masked_fill_(chosen, 0)
         for total in (self.total, *self.sums.values()):
