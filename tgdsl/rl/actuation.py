@@ -232,12 +232,13 @@ class Actuation:
         self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
-    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> None:
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
         """Draw the drives of some environments anew, which hold the positions that their joints now have.
 
         Args:
             chosen: The environments.
             episode: How often each was reset.
+            at_controls: Whether targets are the present controls instead, as those of a hand that presses.
         """
         for name, (low, high) in self._ranges.items():
             own = self.drawn[name]
@@ -247,11 +248,12 @@ class Actuation:
                 new = self._draws.uniform(name, episode, own.shape[1], low, high)
             own.copy_(torch.where(chosen[:, None], new.to(own.dtype), own))
         self._count.copy_(torch.where(chosen, episode << 32, self._count))
-        self.place(chosen)
+        self.place(chosen, at_controls)
 
-    def place(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Have the drives of some environments hold the positions that their joints now have."""
-        now = self._arrays["qpos"][:, self._index["qpos"]]
+    def place(self, chosen: Bool[Tensor, " env"], at_controls: bool = False) -> None:
+        """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
+        name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
+        now = self._arrays[name][:, self._index[which]]
         for held in (self.target, self._play, *self._past):
             held.copy_(torch.where(chosen[:, None], now, held))
         self._play.copy_(torch.where(chosen[:, None], now + self.drawn["bias"], self._play))

@@ -192,7 +192,7 @@ class TouchEnv:
             seed: What all that is random follows from, as if the environments were made with it; default: go on.
         """
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
                 self._episodes.count_anew()
@@ -214,7 +214,7 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             self._action.copy_(action)
             made = self._call()
             made = _copied(made) if self.device.type == "cuda" else made
@@ -320,15 +320,20 @@ class TouchEnv:
         dtype, device = self._used.dtype, self._used.device
         none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
         contact, distance = self._sensed.contact, self._sensed.distance
+        forces = {f"force_{axis}": none for axis in "xyz"}
+        if contact:
+            forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
         return Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
+            target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
-            link_force=readings[contact][..., -3:].to(device, dtype) if contact else none.view(self.num_envs, 0, 3),
+            link_force=torch.stack([forces[f"force_{axis}"] for axis in "xyz"], dim=2),
+            normal_force=forces.get("normal_force", none),
             distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
             friction=self._episodes.friction,
             mass=self._episodes.mass,

@@ -68,7 +68,7 @@ class Episodes:
         self.steps = torch.zeros_like(self.number)
         self._friction = sim.properties.friction(self._object).to(device, dtype).clone()
         self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
-        self.friction, self.mass = self._friction.clone(), self._mass.clone()
+        self.friction, self.mass = task.setup.friction, task.setup.mass
         self.total = torch.zeros(sim.num_envs, device=device)
         self.sums = {}
         self._restarted = FusedCall(self._restart, is_compiled)
@@ -78,7 +78,7 @@ class Episodes:
         start = self._draw(chosen)
         self._set_properties(chosen)
         self._sim.reset(chosen, contacts=start.contacts, **start.values)
-        self._restarted(chosen)
+        self._restarted(chosen, "ctrl" in start.values)
 
     def count_anew(self) -> None:
         """Begin to count episodes from 0, so that random numbers are those of environments just made."""
@@ -122,9 +122,9 @@ class Episodes:
         if self._random.mass != ZERO:
             properties.set(chosen, mass={name: self.mass})
 
-    def _restart(self, chosen: Bool[Tensor, " env"]) -> None:
+    def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
         """Draw drives and pushes anew, and begin to add up."""
-        self._actuation.reset(chosen, self.number)
+        self._actuation.reset(chosen, self.number, at_controls)
         self._pushes.reset(chosen, self.number)
         self.steps.masked_fill_(chosen, 0)
         for total in (self.total, *self.sums.values()):

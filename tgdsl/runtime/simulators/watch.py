@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.geometry.rotations import product, rotated
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.model_ids import site_id
@@ -160,20 +161,6 @@ class WatchReader:
             last_action=last_action,
             pair_force=force,
         )
-
-
-def rotated(quat: Float[Tensor, "*n 4"], vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return vectors turned by unit quaternions w, x, y, z."""
-    w, axis = quat[..., :1], quat[..., 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + w * twice + torch.linalg.cross(axis, twice)
-
-
-def product(left: Float[Tensor, "*n 4"], right: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Return products of quaternions w, x, y, z: first the right one turns, then the left one."""
-    w, v, other, u = left[..., :1], left[..., 1:], right[..., :1], right[..., 1:]
-    scalar = w * other - (v * u).sum(dim=-1, keepdim=True)
-    return torch.cat([scalar, w * u + other * v + torch.linalg.cross(v, u)], dim=-1)
 
 
 def _inputs(watch: Watch, bodies: Sequence[str]) -> Inputs:
