@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.console.progress import Progress
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
@@ -31,6 +31,8 @@ from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_
 from tgdsl.rl.task import Now
 from tgdsl.tensors.fused import FusedCall
 
+PREPARING_STEPS = 3
+"""The third step is captured on a GPU, and the second one compiled."""
 Observations = dict[str, Float[Tensor, "env feature"]]
 
 
@@ -153,6 +155,7 @@ class TouchEnv:
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
+        self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
 
@@ -273,6 +276,16 @@ class TouchEnv:
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+
+    def _prepare(self, tell: Progress, is_compiled: bool) -> None:
+        """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
+        is_cuda = self.sim.qpos.is_cuda
+        if not (is_cuda or is_compiled):
+            return
+        tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+        self.reset()
+        for _ in range(PREPARING_STEPS):
+            self.step(torch.zeros_like(self._action))
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""
