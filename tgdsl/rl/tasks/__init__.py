@@ -1,6 +1,7 @@
 """Tasks, one file each."""
 
 TASKS: dict[str, tuple[str, str]] = {
+    "in_hand_repose": ("tgdsl.rl.tasks.in_hand_repose", "InHandRepose"),
     "in_palm_rotate": ("tgdsl.rl.tasks.in_palm_rotate", "InPalmRotate"),
 }
 """The tasks of tgdsl by name: module and class."""
