@@ -188,7 +188,7 @@ class TouchEnv:
             seed: What all that is random follows from, as if the environments were made with it; default: go on.
         """
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
                 self._episodes.count_anew()
@@ -210,7 +210,7 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             self._action.copy_(action)
             made = self._call()
             made = _copied(made) if self.device.type == "cuda" else made
@@ -313,6 +313,7 @@ class TouchEnv:
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
+            target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,

@@ -30,6 +30,7 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
+from tgdsl.tensors.env_ids import broadcast_over
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -84,6 +85,7 @@ class Now:
         object: Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s].
         joint_pos: Positions of the joints that the policy moves [rad].
         joint_vel: Their velocities [rad/s].
+        target: What their drives are to reach, after the last action [rad].
         torque: What their drives exert [N·m].
         action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
         last_action: What it had asked for one control step before.
@@ -101,6 +103,7 @@ class Now:
     object: BodyMotion
     joint_pos: Float[Tensor, "env joint"]
     joint_vel: Float[Tensor, "env joint"]
+    target: Float[Tensor, "env joint"]
     torque: Float[Tensor, "env joint"]
     action: Float[Tensor, "env joint"]
     last_action: Float[Tensor, "env joint"]
@@ -165,8 +168,8 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            mask = chosen.view(-1, *[1] * (own.ndim - 1))
-            own.copy_(torch.where(mask, torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
+            new = value.to(own.dtype) if isinstance(value, Tensor) else value
+            own.copy_(torch.where(broadcast_over(chosen, own), new, own))
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject, refuse_other_fields
 
 Array = np.ndarray
-_OPTION = "opt."
 _OWN = ("body_mass", "body_inertia", "geom_friction")
 """Fields that are changed in models of their own; the others follow."""
 
@@ -73,7 +71,7 @@ class OwnFields(ObjectProperties):
                 self._field(name)
         for env in changed:
             for name, values in self._fields.items():
-                value = _value(models[env], name)
+                value = getattr(models[env], name)
                 values[env] = value[: len(values[env])] if values[env].ndim else value
         if self._is_derived and changed:
             self._batch.set_const(np.array(changed))
@@ -93,22 +91,26 @@ class OwnFields(ObjectProperties):
             for env in np.flatnonzero((now != value.numpy()).reshape(len(now), -1).any(axis=1)).tolist():
                 self._row(name, env)[...] = value[env].numpy()
                 changed.add(env)
-        self._is_derived |= "body_mass" in fields
-        if self._own is not None and changed:
-            for env in changed:
-                mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
+        if "body_mass" in fields:
+            self._derive(np.array(sorted(changed), dtype=np.int64))
+        elif self._own is not None:
             self._batch.set_models(self._own)
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
         for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
-            own, inertia = self._row("body_mass", env), self._row("body_inertia", env)
-            factor = wanted / own[target.bodies].sum()
-            own[target.bodies] *= factor
-            inertia[target.bodies] *= factor
+            model, own = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
+            factor = wanted / model.body_mass[own].sum()
+            self._row("body_mass", env)[own] = factor * model.body_mass[own]
+            self._row("body_inertia", env)[own] = factor * model.body_inertia[own]
+        self._derive(ids)
+
+    def _derive(self, ids: Int[Array, " n"]) -> None:
+        """Have what follows from masses follow in some environments."""
+        self._is_derived = True
         if self._own is None:
-            self._batch.set_const(ids)
-            self._is_derived = True
+            if len(ids):
+                self._batch.set_const(ids)
             return
         for env in ids:
             mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
@@ -146,10 +148,6 @@ class OwnFields(ObjectProperties):
         if name not in self._fields:
             self._fields[name] = self._batch.expand(name)
         return self._fields[name]
-
-
-def _value(model: mujoco.MjModel, name: str) -> Any:
-    return getattr(model.opt, name.removeprefix(_OPTION)) if name.startswith(_OPTION) else getattr(model, name)
 
 
 def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:
