@@ -219,9 +219,10 @@ class Actuation:
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
         values = [f.name for f in fields(actuators) if f.name not in ("names", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
-        self.drawn = {
-            name: torch.full((num_envs, num), getattr(DriveSpec(), name)[0], device=device, dtype=dtype) for name in _DRAWN
-        }
+        ideal = DriveSpec()
+        shape = (num_envs, num)
+        self.drawn = {name: torch.full(shape, getattr(ideal, name)[0], device=device, dtype=dtype) for name in _DRAWN}
+        self._ranges = {name: getattr(drive, name) for name in _DRAWN if getattr(drive, name) != getattr(ideal, name)}
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
         self._play = torch.zeros_like(self.target)
@@ -239,10 +240,8 @@ class Actuation:
             episode: How often each was reset.
             at_controls: Whether targets are the present controls instead, as those of a hand that presses.
         """
-        for name, own in self.drawn.items():
-            low, high = getattr(self.spec, name)
-            if low == high == getattr(DriveSpec(), name)[0]:
-                continue
+        for name, (low, high) in self._ranges.items():
+            own = self.drawn[name]
             if name == "delay":
                 new = self._draws.integers(name, episode, own.shape[1], int(low), int(high))
             else:

@@ -108,7 +108,7 @@ class Now:
     action: Float[Tensor, "env joint"]
     last_action: Float[Tensor, "env joint"]
     link_force: Float[Tensor, "env link 3"]
-    normal_force: Float[Tensor, "env link"]
+    normal_force: Float[Tensor, "env loaded"]
     distance: Float[Tensor, "env probe"]
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
