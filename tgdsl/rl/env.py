@@ -151,8 +151,9 @@ class TouchEnv:
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
-        parts = (self._command, self._judge, self._observe)
-        self._commanded, self._judged, self._observed = (FusedCall(part, is_compiled) for part in parts)
+        self._commanded = FusedCall(self._command, is_compiled)
+        self._judged = FusedCall(self._judge, is_compiled)
+        self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
         self._obs = self.reset(seed)
@@ -187,6 +188,11 @@ class TouchEnv:
     def steps(self) -> Int[Tensor, " env"]:
         """Control steps of each environment's present episode: a live tensor."""
         return self._episodes.steps
+
+    @property
+    def now(self) -> Now:
+        """The instant that the last observations are of; its tensors hold until the next step."""
+        return self._instant
 
     def reset(self, seed: int | None = None) -> Observations:
         """Begin a new episode in all environments.
@@ -326,7 +332,7 @@ class TouchEnv:
         forces = {f"force_{axis}": none for axis in "xyz"}
         if contact:
             forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
-        return Now(
+        self._instant = Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
@@ -342,6 +348,7 @@ class TouchEnv:
             mass=self._episodes.mass,
             readings=readings,
         )
+        return self._instant
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""
