@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import SimulationError
+from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
@@ -138,7 +138,10 @@ class TouchEnv:
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
-        self.task = loaded.task(self.spec, setup)
+        try:
+            self.task = loaded.task(self.spec, setup)
+        except LowerError as error:
+            raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
         random = self.spec.randomise
         arrays = self.sim.arrays

@@ -3,5 +3,6 @@
 TASKS: dict[str, tuple[str, str]] = {
     "in_hand_repose": ("tgdsl.rl.tasks.in_hand_repose", "InHandRepose"),
     "in_palm_rotate": ("tgdsl.rl.tasks.in_palm_rotate", "InPalmRotate"),
+    "grip_force": ("tgdsl.rl.tasks.grip_force", "GripForce"),
 }
 """The tasks of tgdsl by name: module and class."""
