@@ -231,12 +231,13 @@ class Actuation:
         self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
-    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> None:
-        """Draw the drives of some environments anew, which hold the positions that their joints now have.
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], presses: bool = False) -> None:
+        """Draw the drives of some environments anew: see `place`.
 
         Args:
             chosen: The environments.
             episode: How often each was reset.
+            presses: As for `place`.
         """
         for name, own in self.drawn.items():
             low, high = getattr(self.spec, name)
@@ -248,11 +249,16 @@ class Actuation:
                 new = self._draws.uniform(name, episode, own.shape[1], low, high)
             own.copy_(torch.where(chosen[:, None], new.to(own.dtype), own))
         self._count.copy_(torch.where(chosen, episode << 32, self._count))
-        self.place(chosen)
+        self.place(chosen, presses)
 
-    def place(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Have the drives of some environments hold the positions that their joints now have."""
-        now = self._arrays["qpos"][:, self._index["qpos"]]
+    def place(self, chosen: Bool[Tensor, " env"], presses: bool = False) -> None:
+        """Have the drives of some environments hold the positions that their joints now have.
+
+        Args:
+            chosen: The environments.
+            presses: Whether they hold the present controls instead, which may be beyond those positions: a hand that grips.
+        """
+        now = self._arrays["ctrl"][:, self._index["actuator"]] if presses else self._arrays["qpos"][:, self._index["qpos"]]
         for held in (self.target, self._play, *self._past):
             held.copy_(torch.where(chosen[:, None], now, held))
         self._play.copy_(torch.where(chosen[:, None], now + self.drawn["bias"], self._play))

@@ -24,6 +24,7 @@ from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
@@ -134,6 +135,7 @@ class TouchEnv:
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
+        setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         self.task = loaded.task(self.spec, setup)
         self._draws, self._first_env = draws, first_env
         random = self.spec.randomise

@@ -67,7 +67,7 @@ class Episodes:
         self._draw_properties(chosen)
         start = self._task.reset(chosen, self.number)
         self._sim.reset(chosen, contacts=start.contacts, **start.values)
-        self._actuation.reset(chosen, self.number)
+        self._actuation.reset(chosen, self.number, presses="ctrl" in start.values)
         self._pushes.reset(chosen, self.number)
         self.steps.masked_fill_(chosen, 0)
         for total in (self.total, *self.sums.values()):

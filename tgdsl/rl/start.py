@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import Problem, SimulationError, SpecError, did_you_mean
@@ -112,6 +112,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
+    variant = _variants(sim, sensed, loaded.spec.object)
     rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
     return Setup(
         num_envs=sim.num_envs,
@@ -124,19 +125,24 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         object=sensed.object,
         links=tuple(rows),
         qpos=sim.qpos[0].clone(),
-        half_height=_half_heights(sim, sensed, loaded.spec.object),
+        variant=variant,
+        half_height=_half_heights(sim, sensed.object, variant),
         draws=draws,
     )
 
 
-def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
-    """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
+def _variants(sim: EnvSimulation, sensed: Sensed, name: str) -> Int[Tensor, " env"]:
+    """Return which of its variants an object has in each environment: see `Simulation.set_objects`."""
     inputs = sensed.touch.inputs
     num = inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
+    return torch.arange(sim.num_envs, device=sim.qpos.device) % num
+
+
+def _half_heights(sim: EnvSimulation, body: str, variant: Int[Tensor, " env"]) -> Float[Tensor, " env"]:
+    """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
     qpos = sim.qpos[0].double().cpu().numpy()
-    each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
-    variants = torch.arange(sim.num_envs) % num
-    return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
+    each = [half_height(sim.env_model(env), body, qpos) for env in range(int(variant.max()) + 1)]
+    return torch.tensor(each, dtype=sim.qpos.dtype).to(sim.qpos.device)[variant]
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
@@ -50,8 +51,10 @@ class Setup:
         object: Body of the task's object.
         links: Bodies of the rows of `Now.link_force`.
         qpos: Where episodes start, before anything is random: the keyframe.
+        variant: Which of its variants the object has in each environment; 0 if it has none.
         half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
         draws: Random numbers.
+        grasps: Grasps that episodes begin from; None if the task's document has none.
     """
 
     num_envs: int
@@ -64,8 +67,10 @@ class Setup:
     object: str
     links: tuple[str, ...]
     qpos: Float[Tensor, " nq"]
+    variant: Int[Tensor, " env"]
     half_height: Float[Tensor, " env"]
     draws: Draws
+    grasps: GraspTable | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +111,8 @@ class Start(NamedTuple):
     """How episodes begin.
 
     Attributes:
-        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing.
+        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing. With `ctrl`
+            among them drives hold these targets, else the positions that their joints start with.
         contacts: As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp.
     """
 
