@@ -20,6 +20,7 @@ from tgdsl.commands.hand.hand import Hand
 from tgdsl.commands.import_ import Import
 from tgdsl.commands.layout.layout import Layout
 from tgdsl.commands.links import Links
+from tgdsl.commands.play import Play
 from tgdsl.commands.render import Render
 from tgdsl.commands.run import Run
 from tgdsl.commands.schema import Schema
@@ -30,6 +31,7 @@ Command = (
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Links, tyro.conf.subcommand("links")]
     | Annotated[Layout, tyro.conf.subcommand("layout")]

@@ -30,6 +30,7 @@ from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
+from tgdsl.tensors.fused import FusedCall
 
 Observations = dict[str, Float[Tensor, "env feature"]]
 
@@ -117,7 +118,7 @@ class TouchEnv:
             overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
             simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
-            compiled: Whether the module is compiled by torch; default: on a GPU.
+            compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
             first_env: Number of the first environment among those of all processes.
             progress: Is told in a line what is being done.
 
@@ -129,11 +130,12 @@ class TouchEnv:
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress)
         self.touch, self._sensed = sensed.touch, sensed
-        if compiled if compiled is not None else self.touch.device.type == "cuda":
+        is_compiled = compiled if compiled is not None else self.touch.device.type == "cuda"
+        if is_compiled:
             self.touch.compile()
         self._joints = moved_joints(loaded, sensed)
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
-        draws = Draws(seed, num_envs, self.sim.qpos.device, first_env)
+        draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         self.task = loaded.task(self.spec, setup)
@@ -141,13 +143,15 @@ class TouchEnv:
         random = self.spec.randomise
         arrays = self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws)
-        self.sim.drive = None if self.actuation.is_ideal else self.actuation.drive
+        self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         body = int(setup.model.body(setup.object).id)
         self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
-        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws)
+        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
+        parts = (self._command, self._judge, self._observe)
+        self._commanded, self._judged, self._observed = (FusedCall(part, is_compiled) for part in parts)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
         self._obs = self.reset(seed)
@@ -190,7 +194,7 @@ class TouchEnv:
             seed: What all that is random follows from, as if the environments were made with it; default: go on.
         """
         everyone = torch.ones(self.num_envs, dtype=torch.bool, device=self.sim.qpos.device)
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             if seed is not None:
                 self._draws.reseed(seed)
                 self._episodes.count_anew()
@@ -212,7 +216,7 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
             self._action.copy_(action)
             made = self._call()
             made = _copied(made) if self.device.type == "cuda" else made
@@ -274,30 +278,41 @@ class TouchEnv:
 
     def _advance(self) -> Step:
         """Make one control step with the action that was copied: see the top of this page."""
-        action, sim = self._action.to(self._used), self.sim
+        sim = self.sim
+        self._before.copy_(self._used)
+        sim.step(self._commanded(self._action, sim.ctrl))
+        now = self._now(sim.read())
+        self.task.advance(now)
+        made = self._judged(now, sim.faults)
+        if made.info.ended.is_cuda or bool(made.info.ended.any()):
+            self._begin(made.info.ended)
+            now = self._now(sim.read(made.info.ended))
+            made = made._replace(obs=self._observed(now))
+        return made
+
+    def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
+        """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
+        action = action.to(self._used)
         is_bad = ~action.isfinite().all(dim=1)
         self.actuation.command(action)
-        self._before.copy_(self._used)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         self.pushes.advance()
-        sim.step(torch.where(is_bad[:, None], torch.nan, sim.ctrl))
-        now, faults = self._now(sim.read()), sim.faults.clone()
-        self.task.advance(now)
+        return torch.where(is_bad[:, None], torch.nan, ctrl)
+
+    def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
+        """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.reward(now, terminated)
         terms = {name: torch.where(faults, 0.0, rate * self.control_step).float() for name, rate in rates.items()}
         reward = torch.stack(list(terms.values())).sum(dim=0)
         self._episodes.add(terms, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
-        ended = terminated | truncated
         obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in self._observe(now).items()}
         episodes = self._episodes
         sums = {name: total.clone() for name, total in episodes.sums.items()}
         score, total = self.task.score().float().clone(), episodes.total.clone()
-        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults)
-        if ended.is_cuda or bool(ended.any()):
-            self._begin(ended)
-            obs = self._observe(self._now(sim.read(ended)))
+        ended = terminated | truncated
+        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
@@ -307,15 +322,20 @@ class TouchEnv:
         dtype, device = self._used.dtype, self._used.device
         none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
         contact, distance = self._sensed.contact, self._sensed.distance
+        forces = {f"force_{axis}": none for axis in "xyz"}
+        if contact:
+            forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
         return Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
+            target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
-            link_force=readings[contact][..., -3:].to(device, dtype) if contact else none.view(self.num_envs, 0, 3),
+            link_force=torch.stack([forces[f"force_{axis}"] for axis in "xyz"], dim=2),
+            normal_force=forces.get("normal_force", none),
             distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
             friction=self._episodes.friction,
             mass=self._episodes.mass,

@@ -29,6 +29,7 @@ class Sensed:
         touch: The module.
         felt: Name of the sensor that the policy feels; None if it feels nothing.
         contact: Name of the `link_contact` sensor; None if the task takes none.
+        channels: Names of its channels: those of the force, and of the normal force if the task wants it, among them.
         distance: Name of the `surface_distance` sensor; None if the task takes none.
         object: Body of the task's object in the scene.
     """
@@ -36,6 +37,7 @@ class Sensed:
     touch: TactileModule
     felt: str | None
     contact: str | None
+    channels: tuple[str, ...]
     distance: str | None
     object: str
 
@@ -77,10 +79,16 @@ def compile_sensed(
         felt = _sensor_of(loaded, kinds, kind, ("touch",))
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
+    contact = by_kind.get("link_contact")
+    if contact:
+        own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
+        wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
+        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
     kept = list(dict.fromkeys([*by_kind.values(), *([felt] if felt else [])]))
     touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
     body = document.spec.objects[spec.object].body_of(spec.object)
-    return Sensed(touch, felt, by_kind.get("link_contact"), by_kind.get("surface_distance"), body)
+    channels = next((own.channels for own in touch.outputs if own.name == contact), ())
+    return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body)
 
 
 def _sensor_of(loaded: LoadedTask, kinds: dict[str, str], kind: str, place: tuple[str, ...]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import Problem, SimulationError, SpecError, did_you_mean
@@ -112,7 +112,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
-    variant = _variants(sim, sensed, loaded.spec.object)
+    num_variants = _num_variants(sensed, loaded.spec.object)
     rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
     return Setup(
         num_envs=sim.num_envs,
@@ -125,24 +125,28 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         object=sensed.object,
         links=tuple(rows),
         qpos=sim.qpos[0].clone(),
-        variant=variant,
-        half_height=_half_heights(sim, sensed.object, variant),
+        half_height=_half_heights(sim, sensed, loaded.spec.object),
+        variant=(torch.arange(sim.num_envs) % num_variants).to(sim.qpos.device),
+        num_variants=num_variants,
+        friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
+        mass=sim.properties.mass(sensed.object).to(sim.qpos).clone(),
         draws=draws,
     )
 
 
-def _variants(sim: EnvSimulation, sensed: Sensed, name: str) -> Int[Tensor, " env"]:
-    """Return which of its variants an object has in each environment: see `Simulation.set_objects`."""
+def _num_variants(sensed: Sensed, name: str) -> int:
+    """Return how many variants an object has; environment i has variant i modulo their number."""
     inputs = sensed.touch.inputs
-    num = inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
-    return torch.arange(sim.num_envs, device=sim.qpos.device) % num
+    return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 
 
-def _half_heights(sim: EnvSimulation, body: str, variant: Int[Tensor, " env"]) -> Float[Tensor, " env"]:
+def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
     """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
+    num = _num_variants(sensed, name)
     qpos = sim.qpos[0].double().cpu().numpy()
-    each = [half_height(sim.env_model(env), body, qpos) for env in range(int(variant.max()) + 1)]
-    return torch.tensor(each, dtype=sim.qpos.dtype).to(sim.qpos.device)[variant]
+    each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
+    variants = torch.arange(sim.num_envs) % num
+    return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

@@ -207,7 +207,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
             "alignment": weights.alignment * 2.0 * (0.5 * self.tilt).sin().square(),
             "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
             "hand_pose": weights.hand_pose * (now.joint_pos - self.start_joints).square().sum(dim=1),
-            "drop": weights.drop * self.is_over(now),
+            "drop": weights.drop * is_over,
             "action_rate": weights.action_rate * terms.action_rate(now),
             "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
             "work": weights.work * terms.work(now),

@@ -1,0 +1,125 @@
+"""`tgdsl play`: a task's environments, played and shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from tgdsl.commands.arguments import OptionalFile, Overrides, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.rl.env import TouchEnv
+    from tgdsl.rl.playing.actions import Actor
+    from tgdsl.rl.playing.record import Record
+
+_FILES = {"record": "played.npz", "video": "played.mp4"}
+Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TASK", help="The task's YAML document.")]
+
+
+@dataclass(frozen=True)
+class Play:
+    """Step a task's environments, show returns, score and reward terms, and write what happened and a video."""
+
+    task: Task
+    policy: OptionalFile = None
+    """A learned policy that acts: a TorchScript file, as rsl_rl's export_policy_to_jit writes it."""
+    groups: tuple[str, ...] = ()
+    """Groups of observations that the policy takes, in its order; default: those of proprio, tactile_sensors and goal that the
+    task has."""
+    actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
+    """Who acts where there is no policy: zero, random, script (the task's own, if it has one), or FILE.py:FUNCTION, which takes
+    the environment and its observations by group and returns actions (env, joint) from −1 to 1."""
+    envs: int = 16
+    """Environments; the video shows the first."""
+    seconds: float | None = None
+    """Duration [s]; default: that of an episode."""
+    seed: int = 0
+    """What all that is random follows from."""
+    device: str = "cpu"
+    """Where physics and touch are computed: cpu, or cuda."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
+    """Folder for played.npz and played.mp4."""
+    video: bool = True
+    """Whether to draw the video."""
+    camera: str | None = None
+    """Camera of the scene that the video is seen from; default: the first, or MuJoCo's free camera where there is none."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Step, show, and write the files."""
+        from tgdsl.files.write import check_writable, with_folder
+        from tgdsl.rl.playing.actions import check_actions
+        from tgdsl.rl.playing.play import steps_of
+        from tgdsl.rl.playing.record import Record
+
+        files = {name: check_writable(self.out / file) for name, file in _FILES.items()}
+        if self.policy is not None and self.actions != "zero":
+            raise TgdslError(f"--policy {self.policy} and --actions {self.actions}: expected one of them")
+        if self.groups and self.policy is None:
+            raise TgdslError("--groups are those of a policy; give one with --policy")
+        check_actions(self.actions)
+        with StatusLine() as progress:
+            env = self._env(progress)
+        try:
+            steps = steps_of(env, self.seconds)
+            record = Record(env, steps)
+            self._steps(env, self._actor(env), record, steps)
+            record.write(with_folder(files["record"]))
+            print(f"record: {files['record']}")
+            if self.video:
+                self._draw(env, record, files["video"])
+        finally:
+            env.close()
+
+    def _env(self, progress: StatusLine) -> TouchEnv:
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.playing.video import check_camera
+
+        overrides = parsed_overrides(self.set)
+        env = TouchEnv(self.task, self.envs, device=self.device, seed=self.seed, overrides=overrides, progress=progress)
+        check_camera(env.sim.model, self.camera)
+        return env
+
+    def _actor(self, env: TouchEnv) -> Actor:
+        from tgdsl.rl.playing.actions import actor_of
+        from tgdsl.rl.playing.policy import Policy, actor_groups
+
+        if self.policy is None:
+            return actor_of(env, self.actions, self.seed)
+        groups = {name: env.groups[name] for name in actor_groups(env.groups, self.groups)}
+        return Policy(self.policy, groups, env.num_envs, env.num_actions, env.device)
+
+    def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> None:
+        """Make all steps."""
+        from tqdm import tqdm
+
+        from tgdsl.console.live import LiveTable
+        from tgdsl.rl.playing.play import play
+        from tgdsl.rl.playing.tally import Tally
+
+        live, tally = LiveTable(), Tally(env)
+        with tqdm(total=steps, desc="playing", unit="step", disable=None, leave=False) as bar:
+            for played in play(env, actor, steps, self.seed):
+                record.add(played)
+                tally.add(played.step.info)
+                bar.update()
+                with bar.external_write_mode():
+                    time = (played.index + 1) * env.control_step
+                    live.show(tally.lines(time), is_last=played.index == steps - 1)
+
+    def _draw(self, env: TouchEnv, record: Record, file: Path) -> None:
+        """Draw the video, or say why there is none."""
+        from tgdsl.rl.playing.video import VideoError, video
+
+        try:
+            with StatusLine() as progress:
+                video(env.sim.env_model(0), record.qpos[:, 0], env.control_step, file, self.camera, progress)
+        except VideoError as error:
+            print(f"no video: {error}")
+        else:
+            print(f"video:  {file}")

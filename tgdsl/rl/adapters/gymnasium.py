@@ -1,0 +1,157 @@
+"""A `TouchEnv` as a `gymnasium.vector.VectorEnv`.
+
+Observations are a dictionary of groups, actions from −1 to 1 for each joint. An environment whose episode ends begins the next
+one in the same step (`AutoresetMode.SAME_STEP`): `info["final_obs"]` has the last observations of the old one,
+`info["final_info"]` what is told of its last step. Entries of `info` are those of `StepInfo`, each with its mask under `_` and
+its name.
+
+gymnasium's wrappers of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of this mode;
+the argument `groups` leaves out what a policy shall not see. All its other wrappers take this environment.
+
+Shapes: `env` environments, `joint` joints that the policy moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.rl.env import StepInfo, TouchEnv
+
+try:
+    from gymnasium.spaces import Box, Dict
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise TgdslError(f'an environment of gymnasium needs gymnasium: pip install "tgdsl[rl]" ({error})') from error
+
+Output = Literal["numpy", "torch"]
+TOLD = ("terms", "score", "episode_return", "episode_steps", "episode_terms", "faults")
+"""What `info` has of each step: see `StepInfo`."""
+
+
+class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
+    """Environments of gymnasium: a translation of a `TouchEnv`, to which it adds nothing.
+
+    With `output="numpy"`, `info` is what gymnasium's `SyncVectorEnv` gives: masks that are nowhere true are left out, as is
+    what they mask; `final_obs` is an array of dictionaries. With `output="torch"` nothing is copied to the host: masks are
+    always there, rows that they leave out mean nothing, and `final_obs` is a dictionary of tensors.
+
+    Attributes:
+        touch_env: The `TouchEnv`.
+        device: Where tensors are.
+    """
+
+    def __init__(self, touch_env: TouchEnv, output: Output = "numpy", groups: Sequence[str] | None = None):
+        """Translate an environment.
+
+        Args:
+            touch_env: The environment; `close` closes it.
+            output: Whether observations, rewards and ends are NumPy arrays or tensors on the environment's device; actions may
+                always be either.
+            groups: Groups of observations to hand out, in this order; default: all.
+
+        Raises:
+            TgdslError: If there is no such output or group.
+        """
+        if output not in ("numpy", "torch"):
+            raise TgdslError(f'output is "{output}", expected "numpy" or "torch"')
+        self._groups = tuple(touch_env.groups if groups is None else groups)
+        for group in self._groups:
+            if group not in touch_env.groups:
+                hint = did_you_mean(group, touch_env.groups, "groups")
+                raise TgdslError(f'there is no group of observations "{group}"; {hint}')
+        self.touch_env, self.device, self.num_envs = touch_env, touch_env.device, touch_env.num_envs
+        self._is_numpy = output == "numpy"
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        boxes = [(group, Box(-np.inf, np.inf, (touch_env.groups[group],), np.float32)) for group in self._groups]
+        self.single_observation_space = Dict(boxes)
+        self.single_action_space = Box(-1.0, 1.0, (touch_env.num_actions,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin a new episode in all environments.
+
+        Args:
+            seed: What all that is random follows from; default: go on.
+            options: None or empty: there are none.
+
+        Returns:
+            Observations by group, (env, feature) each, and nothing else to tell.
+
+        Raises:
+            TgdslError: If there is a seed per environment, or an option.
+        """
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which makes those of each")
+        if options:
+            raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin anew")
+        super().reset(seed=seed)
+        return self._obs(self.touch_env.reset(None if seed is None else int(seed))), {}
+
+    def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
+        """Make one control step.
+
+        Args:
+            actions: What the policy asks for, (env, joint), from −1 to 1: an array or a tensor.
+
+        Returns:
+            Observations by group, rewards, terminations, truncations, and what else there is to tell: see the class.
+        """
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.device)
+        obs, reward, terminated, truncated, info = self.touch_env.step(action)
+        told = self._told_in_numpy(info) if self._is_numpy else self._told_in_torch(info)
+        return self._obs(obs), self._given(reward), self._given(terminated), self._given(truncated), told
+
+    def close_extras(self, **_: Any) -> None:
+        """Close the environments."""
+        self.touch_env.close()
+
+    def _given(self, tensor: Tensor) -> Any:
+        return tensor.cpu().numpy() if self._is_numpy else tensor
+
+    def _obs(self, obs: Mapping[str, Tensor]) -> dict[str, Any]:
+        return {group: self._given(obs[group]) for group in self._groups}
+
+    def _told_in_torch(self, info: StepInfo) -> dict[str, Any]:
+        told = {name: getattr(info, name) for name in TOLD}
+        final = {"final_obs": {group: info.final_obs[group] for group in self._groups}, "final_info": _masked(told, info.ended)}
+        return _masked(told, ~info.ended) | final | {f"_{name}": info.ended for name in final}
+
+    def _told_in_numpy(self, info: StepInfo) -> dict[str, Any]:
+        ended = info.ended.cpu().numpy()
+        told = {name: _in_numpy(getattr(info, name)) for name in TOLD}
+        given = {} if ended.all() else _masked(told, ~ended)
+        if not ended.any():
+            return given
+        rows = np.flatnonzero(ended)
+        last = {group: info.final_obs[group].cpu().numpy()[rows] for group in self._groups}
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i, row in enumerate(rows):
+            final_obs[row] = {group: values[i] for group, values in last.items()}
+        final = {"final_obs": final_obs, "final_info": _masked(told, ended)}
+        return given | final | {f"_{name}": ended.copy() for name in final}
+
+
+def _in_numpy(value: Tensor | Mapping[str, Tensor]) -> Any:
+    if isinstance(value, Mapping):
+        return {name: part.cpu().numpy() for name, part in value.items()}
+    return value.cpu().numpy()
+
+
+def _masked(values: Mapping[str, Any], mask: Any) -> dict[str, Any]:
+    """Return values and their mask as `VectorEnv._add_info` does: arrays are zero where it is false, tensors as they are."""
+    given: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            given[name] = _masked(value, mask)
+        else:
+            given[name] = np.where(mask, value, value.dtype.type(0)) if isinstance(value, np.ndarray) else value
+        given[f"_{name}"] = mask
+    return given

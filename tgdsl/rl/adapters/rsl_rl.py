@@ -1,0 +1,107 @@
+"""A `TouchEnv` as a `VecEnv` of rsl_rl 5.4 or later.
+
+Groups of observations are a TensorDict, of which the runner's `obs_groups` takes what actor and critic see.
+`extras["time_outs"]` are episodes that have merely lasted long enough. `extras["log"]` is there when an episode has ended, and
+of those that have: return, steps, score, whether a fault has ended it, and the sum of each term of the reward.
+
+Shapes: `env` environments, `joint` joints that the policy moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.errors import TgdslError
+from tgdsl.rl.env import StepInfo, TouchEnv
+
+try:
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise TgdslError(f'an environment of rsl_rl needs rsl-rl-lib and tensordict: pip install "tgdsl[rl]" ({error})') from error
+
+
+class TouchVecEnv(VecEnv):
+    """Environments of rsl_rl: a translation of a `TouchEnv`, to which it adds nothing.
+
+    Attributes:
+        touch_env: The `TouchEnv`.
+        num_envs: Number of environments.
+        num_actions: Number of joints that the policy moves.
+        max_episode_length: Control steps of an episode that nothing ends before.
+        device: Where tensors are.
+        cfg: The task's document, as plain values.
+    """
+
+    def __init__(self, touch_env: TouchEnv):
+        """Translate an environment, and begin a new episode in all of it."""
+        self.touch_env, self.device = touch_env, touch_env.device
+        self.num_envs, self.num_actions = touch_env.num_envs, touch_env.num_actions
+        self.max_episode_length = touch_env.max_steps
+        self.cfg = touch_env.spec.model_dump(mode="json")
+        self._obs = self._given(touch_env.reset())
+
+    @property
+    def episode_length_buf(self) -> Int[Tensor, " env"]:
+        """Control steps of each environment's present episode; may be written, whole or in part."""
+        return self.touch_env.steps
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: Int[Tensor, " env"]) -> None:
+        self.touch_env.steps.copy_(steps)
+
+    def get_observations(self) -> TensorDict:
+        """Return the last observations: groups of (env, feature)."""
+        return self._obs
+
+    def reset(self, seed: int | None = None) -> tuple[TensorDict, dict[str, Any]]:
+        """Begin a new episode in all environments; return the observations, and nothing else to tell.
+
+        Args:
+            seed: What all that is random follows from; default: go on.
+        """
+        self._obs = self._given(self.touch_env.reset(seed))
+        return self._obs, {}
+
+    def step(
+        self, actions: Float[Tensor, "env joint"]
+    ) -> tuple[TensorDict, Float[Tensor, " env"], Int[Tensor, " env"], dict[str, Any]]:
+        """Make one control step.
+
+        Args:
+            actions: What the policy asks for, from −1 to 1: what is beyond is clipped.
+
+        Returns:
+            Observations by group, of episodes that have ended the first of the next one; rewards; 1 where an episode has ended,
+            else 0; and extras, see the top of this page.
+        """
+        obs, reward, _, truncated, info = self.touch_env.step(actions)
+        self._obs = self._given(obs)
+        extras: dict[str, Any] = {"time_outs": truncated}
+        if len(ids := info.ended.nonzero()[:, 0]):
+            extras["log"] = _log(info, ids)
+        return self._obs, reward, info.ended.long(), extras
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.touch_env.close()
+
+    def _given(self, obs: Mapping[str, Tensor]) -> TensorDict:
+        return TensorDict(dict(obs), batch_size=[self.num_envs], device=self.device)
+
+
+def _log(info: StepInfo, ids: Int[Tensor, " ended"]) -> dict[str, Tensor]:
+    """Return what is told of episodes that have ended, one number each: rsl_rl takes the mean over an iteration's."""
+    told = {
+        "Episode/return": info.episode_return,
+        "Episode/steps": info.episode_steps.float(),
+        "Episode/score": info.score,
+        "Episode/fault": info.faults.float(),
+        **{f"Reward/{name}": total for name, total in info.episode_terms.items()},
+    }
+    return {name: value[ids].to(torch.float32) for name, value in told.items()}

@@ -1,0 +1,66 @@
+"""Environments stepped by whoever acts, and what each step was.
+
+Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group, `nq` as in MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.rl.env import Step, TouchEnv
+from tgdsl.rl.playing.actions import Actor
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """One control step.
+
+    Attributes:
+        index: Its number, from 0.
+        obs: Observations that the action was chosen from, by group.
+        qpos: MuJoCo's `qpos` at the same instant.
+        action: The action.
+        step: What came of it.
+    """
+
+    index: int
+    obs: dict[str, Float[Tensor, "env feature"]]
+    qpos: Float[Tensor, "env nq"]
+    action: Float[Tensor, "env joint"]
+    step: Step
+
+
+def steps_of(env: TouchEnv, seconds: float | None) -> int:
+    """Return how many control steps a duration has, at least one; default: an episode's.
+
+    Raises:
+        SimulationError: If it is not positive.
+    """
+    if seconds is None:
+        return env.max_steps
+    if not 0 < seconds < float("inf"):
+        raise SimulationError(f"played for {seconds:g} s: expected more than 0 s")
+    return max(1, round(seconds / env.control_step))
+
+
+def play(env: TouchEnv, actor: Actor, num_steps: int, seed: int = 0) -> Iterator[Played]:
+    """Begin a new episode in all environments, and yield each control step.
+
+    Args:
+        env: The environments.
+        actor: Who acts.
+        num_steps: Number of control steps.
+        seed: What all that is random in the environments follows from.
+    """
+    obs = env.reset(seed)
+    for index in range(num_steps):
+        qpos, action = env.sim.qpos.clone(), actor(obs)
+        step = env.step(action)
+        yield Played(index, obs, qpos, action, step)
+        actor.begin(step.info.ended)
+        obs = step.obs

@@ -1,0 +1,156 @@
+"""A video of one environment, drawn by MuJoCo with OpenGL from a record of `qpos`, and encoded by ffmpeg.
+
+Shapes: `step` control steps, `nq` as in MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import subprocess
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import FileError, TgdslError, did_you_mean
+from tgdsl.files.write import atomic_path
+
+WIDTH, HEIGHT = 960, 720
+"""Pixels of a frame."""
+MAX_RATE = 60.0
+"""Frames per second that a video has at most."""
+Frame = UInt8[np.ndarray, "row column 3"]
+
+
+class VideoError(TgdslError):
+    """A video that cannot be made here."""
+
+
+def check_camera(model: mujoco.MjModel, camera: str | None) -> None:
+    """See that a scene has a camera.
+
+    Raises:
+        VideoError: If it has not.
+    """
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if camera is not None and camera not in names:
+        raise VideoError(f'the scene has no camera "{camera}"; {did_you_mean(camera, names, "cameras")}')
+
+
+def video(
+    model: mujoco.MjModel,
+    qpos: Float[np.ndarray, "step nq"],
+    control_step: float,
+    path: Path,
+    camera: str | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """Draw an environment in real time; return the file.
+
+    Args:
+        model: The environment's model.
+        qpos: Its poses, one per control step.
+        control_step: Duration of a control step [s].
+        path: The file to write, `.mp4`.
+        camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
+        progress: Is told in a line what is being done.
+
+    Raises:
+        VideoError: If the scene has no such camera, OpenGL cannot be started, or imageio-ffmpeg is missing.
+        FileError: If the file cannot be written.
+    """
+    check_camera(model, camera)
+    every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
+    shown, encoder = qpos[::every], _encoder()
+    with closing(_renderer(model)) as renderer, atomic_path(path) as temporary:
+        frames = _told(_frames(model, shown, renderer, camera), len(shown), progress)
+        _encode(encoder, frames, 1.0 / (every * control_step), temporary, path)
+    return path
+
+
+def _frames(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, "step nq"], renderer: mujoco.Renderer, camera: str | None
+) -> Iterator[Frame]:
+    data = mujoco.MjData(model)
+    seen_from = camera if camera is not None else (0 if model.ncam else -1)
+    for pose in qpos:
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, seen_from)
+        yield renderer.render()
+
+
+def _told(frames: Iterable[Frame], count: int, progress: Progress) -> Iterator[Frame]:
+    for i, frame in enumerate(frames):
+        progress(f"drawing the video: frame {i + 1} of {count}")
+        yield frame
+
+
+def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
+    """Return what draws.
+
+    Raises:
+        VideoError: If OpenGL cannot be started.
+    """
+    drawn = copy.copy(model)
+    drawn.vis.global_.offwidth, drawn.vis.global_.offheight = WIDTH, HEIGHT
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of GLFW, which then raises as well
+            return mujoco.Renderer(drawn, height=HEIGHT, width=WIDTH)
+    except Exception as error:  # each of MuJoCo's ways to OpenGL raises errors of its own
+        what = f"OpenGL cannot be started ({type(error).__name__}: {error})"
+        raise VideoError(f"{what}; without a display set the environment variable MUJOCO_GL to egl or osmesa") from error
+
+
+def _encoder() -> str:
+    """Return the path of ffmpeg's program.
+
+    Raises:
+        VideoError: If there is none.
+    """
+    try:
+        import imageio_ffmpeg
+
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise VideoError(f'a video needs imageio-ffmpeg: pip install "tgdsl[rl]" ({error})') from error
+
+
+def _encode(encoder: str, frames: Iterable[Frame], rate: float, file: Path, target: Path) -> None:
+    """Write frames as H.264.
+
+    Args:
+        encoder: Path of ffmpeg's program.
+        frames: The frames.
+        rate: Frames per second.
+        file: The file to write.
+        target: What errors call it.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", f"{rate:.9g}", "-i", "-"]
+    wanted = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
+    command = [encoder, "-y", "-v", "error", *given, *wanted]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it has ended: its own words follow
+                for frame in frames:
+                    process.stdin.write(np.ascontiguousarray(frame).data)
+                process.stdin.close()
+        except BaseException:
+            process.kill()
+            raise
+        said = process.stderr.read().decode(errors="replace").strip().splitlines()
+    if process.returncode:
+        raise FileError(target, said[-1] if said else f"ffmpeg ended with code {process.returncode}")
