@@ -2,6 +2,7 @@
 
 import math
 
+import jaxtyping
 import pytest
 import torch
 from tiny_tasks import RADIUS, taxel_world, tiny_env
@@ -202,6 +203,20 @@ def test_the_same_seed_gives_the_same_bytes(make):
     assert not same(envs[2]._obs, envs[0].found[0])
     again = [envs[2].reset(4), *(envs[2].step(action).obs for action in actions(envs[2], STEPS))]
     assert all(same(a, b) for a, b in zip(envs[0].found, again, strict=True))
+
+
+@pytest.mark.slow
+def test_compiled_equals_eager(make, monkeypatch):
+    """Drives with a delay, noise, pushes, resets: all that is compiled besides the module."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    more = NOISY + RANDOM + "episode: 0.2 s\n"
+    eager, compiled = make(more=more, seed=1), make(more=more, seed=1, compiled=True)
+    for i, action in enumerate(actions(eager, STEPS)):
+        for env in (eager, compiled):
+            env.steps[i % 4] += 1
+        found, expected = compiled.step(action), eager.step(action)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(compiled.actuation.memory(), eager.actuation.memory(), rtol=1e-6, atol=1e-9)
 
 
 def test_as_many_environments_in_two_processes(make):

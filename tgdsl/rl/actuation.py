@@ -271,9 +271,7 @@ class Actuation:
             wanted = torch.minimum(torch.maximum(self.target + self.action.scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
         self.target.copy_(torch.where(action.isfinite(), wanted, self.target))
-        for i in range(len(self._past) - 1, 0, -1):
-            self._past[i].copy_(self._past[i - 1])
-        self._past[0].copy_(self.target)
+        self._past.copy_(torch.cat([self.target[None], self._past[:-1]]))
         if self.is_ideal:
             self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()
 
