@@ -24,6 +24,7 @@ from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
@@ -138,6 +139,7 @@ class TouchEnv:
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
+        setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         try:
             self.task = loaded.task(self.spec, setup)
         except LowerError as error:
