@@ -30,6 +30,14 @@ def new_stage(folder: Path, name: str = "robot.usda", metres: float = 1.0, up: s
     return stage
 
 
+def stage_with_base(folder: Path, name: str = "robot.usda") -> Usd.Stage:
+    """Return a stage with a body `/base` that is fixed to the world."""
+    stage = new_stage(folder, name)
+    add_body(stage, "/base")
+    add_joint(stage, "/fixed", "fixed", (None, "/base"))
+    return stage
+
+
 def placed(prim: Usd.Prim, pos: Sequence[float] = (0, 0, 0), quat: Sequence[float] = ONE, scale: Sequence[float] = (1, 1, 1)):
     """Give a prim a transform: translate, orient (w, x, y, z), scale."""
     xform = UsdGeom.Xformable(prim)

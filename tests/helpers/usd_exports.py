@@ -7,7 +7,7 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdPhysics
 from scipy.spatial.transform import Rotation
 
-from tgdsl.formats.robot import export_model
+from tgdsl.formats.robot import export_model, load_model
 
 XHAND1 = Path(__file__).parents[2] / "robots" / "xhand1" / "xhand1_right.xml"
 TOLERANCE = 1e-6
@@ -61,6 +61,13 @@ def exported(folder: Path, text: str, ending: str = ".usda") -> tuple[Usd.Stage,
     (folder / "robot.xml").write_text(text)
     export_model(folder / "robot.xml", folder / f"robot{ending}")
     return Usd.Stage.Open(str(folder / f"robot{ending}")), mujoco.MjModel.from_xml_string(text)
+
+
+def twins_of(folder: Path, text: str) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """Return an MJCF model, and what it comes back as after an export; no warning comes, as warnings are errors."""
+    (folder / "hand.xml").write_text(text)
+    export_model(folder / "hand.xml", folder / "hand.usda")
+    return load_model(folder / "hand.xml").compiled, load_model(folder / "hand.usda").compiled
 
 
 def world_of(bodies: str, rest: str = "", asset: str = "") -> str:

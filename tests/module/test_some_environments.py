@@ -54,8 +54,15 @@ def schedule(seed: int, calls: int):
         yield reset.tolist(), read.tolist(), bool(rng.random() < 0.5)
 
 
+@pytest.fixture(params=[True, False], ids=["all_rows", "few_rows"])
+def with_grad(request):
+    """With derivatives the rows of all environments are computed; without them, of few environments theirs alone."""
+    with torch.set_grad_enabled(request.param):
+        yield request.param
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_each_environment_is_as_if_it_were_alone(touch, seed):
+def test_each_environment_is_as_if_it_were_alone(touch, seed, with_grad):
     """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""
     alone = [copy.deepcopy(touch).seed(7, first_env=env) for env in range(NUM_ENVS)]
     touch.seed(7)
@@ -78,7 +85,7 @@ def test_each_environment_is_as_if_it_were_alone(touch, seed):
         handed = clones(readings)
 
 
-def test_what_is_returned_is_a_copy(touch):
+def test_what_is_returned_is_a_copy(touch, with_grad):
     """Neither a later call nor who writes into readings changes what others hold."""
     state = felt_state(touch, NUM_ENVS)
     touch(state)
@@ -116,7 +123,7 @@ def test_a_look_before_the_first_call_fixes_nothing(touch):
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(folder, monkeypatch):
+def test_compiled_equals_eager(folder, monkeypatch, with_grad):
     """Rings, filters, walks, windows, held samples, bits: three graphs, of calls, of masked ones and of looks."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     noise = {"read_delay": 0.013, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "drift": 1e-5}
@@ -139,7 +146,7 @@ def test_compiled_equals_eager(folder, monkeypatch):
                 torch.testing.assert_close(b[name], a[name], rtol=1e-4, atol=1e-5 * float(a[name].abs().max()) + 1e-12)
 
 
-def test_a_sensor_without_memory_takes_a_mask_too(folder):
+def test_a_sensor_without_memory_takes_a_mask_too(folder, with_grad):
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
     states = [felt_state(touch, 4, seed) for seed in range(3)]
     first, new = clones(touch(states[0])), touch.peek(states[1])["d"]

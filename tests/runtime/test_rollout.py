@@ -198,3 +198,31 @@ def test_an_object_is_touched_where_it_is_less_than_its_size_away(document, clea
     sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))  # the scene has it a millimetre deep
     sim.set_state([1], qpos=np.array([0.001 - clearance, 0.0]))
     assert is_touched(touch, sim) == (clearance < 0)
+
+
+@pytest.mark.parametrize(("clearance", "is_contact"), [(-1e-3, True), (1e-3, True), (3e-3, False), (6e-3, False)])
+def test_within_a_gap_nothing_is_touched(document, tmp_path, clearance, is_contact):
+    """Nearer than the margin of 2 mm MuJoCo makes constraints; in the gap of 3 mm beyond it only finds the contact."""
+    (tmp_path / "gap.xml").write_text(SCENE.replace('size=".03 .03 .01"', 'size=".03 .03 .01" margin=".002" gap=".003"'))
+    touch = tgdsl.compile({**document, "robot": {**document["robot"], "model": str(tmp_path / "gap.xml")}})
+    sim = simulate(touch, 1)
+    sim.set_state([0], qpos=np.array([0.001 + clearance, 0.0]))
+    data = mujoco.MjData(sim.model)
+    data.qpos[:] = 0.001 + clearance, 0.0
+    mujoco.mj_forward(sim.model, data)
+    assert (data.ncon > 0) == (clearance < 5e-3)
+    assert is_touched(touch, sim) == is_contact == (data.nefc > 0)
+
+
+@pytest.mark.parametrize(("cube", "is_contact"), [(0.03, True), (0.1, False)])
+def test_what_is_flexible_may_touch_too(document, tmp_path, cube, is_contact):
+    """A cloth lies in a floor; MuJoCo names no geom of it, and the cube has the scene's last."""
+    cloth = """<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".02 .02 .02" radius=".002" mass=".1" pos=".5 0 0">
+      <contact selfcollide="none"/><edge equality="true"/></flexcomp>
+    <geom name="floor" type="box" size=".1 .1 .01" pos=".5 0 -.01"/>"""
+    text = SCENE.replace("<worldbody>", f"<worldbody>{cloth}").replace('pos="0 0 .029"', f'pos=".5 0 {cube - 0.01}"')
+    (tmp_path / "cloth.xml").write_text(text)
+    touch = tgdsl.compile({**document, "robot": {**document["robot"], "model": str(tmp_path / "cloth.xml")}})
+    sim = simulate(touch, 1)
+    assert sim.model.nflex == 1 and sim.model.geom(sim.model.ngeom - 1).bodyid == sim.model.body("cube").id
+    assert is_touched(touch, sim) == is_contact

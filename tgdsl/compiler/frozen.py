@@ -27,6 +27,9 @@ def all_layouts(
     known = known_kinds(())
     loaded = load(document, overrides, known, needs_sensors=False)
     if loaded.layout is None:
+        if loaded.is_without_layout:
+            hint = "only a layout has taxels to write down"
+            loaded.problems.append(loaded.problem(("robot",), 'missing key "layout"', hint, on_key=True))
         raise SpecError(loaded.problems)
     spec = loaded.layout.spec
     for name in resolutions:

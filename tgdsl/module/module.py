@@ -22,8 +22,8 @@ from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.history import reduced
-from tgdsl.module.memory.memory import KEPT, WINDOW, Memory, chosen_only, kept, store
+from tgdsl.module.memory.memory import WINDOW, Memory, kept, store
+from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
 from tgdsl.module.sensing import Sensing, sense
@@ -212,6 +212,9 @@ class TactileModule(HookedModule):
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
+        rows = few_rows(tensors["mask"]) if name == "advance_some" else None
+        if rows is not None:
+            return read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
         found = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: found[name] for name in self.plan.readings()}
 
@@ -223,18 +226,15 @@ class TactileModule(HookedModule):
 
     def advance_some(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Do what `advance` does for the environments of `tensors["mask"]`; of the others return what was handed out before."""
-        mask = tensors["mask"]
-        readings, updated = self.core(tensors, memory)
-        updated = chosen_only(memory, updated, mask)
-        for name, reading in readings.items():
-            if f"{KEPT}{name}" in memory:
-                chosen = mask.view(-1, *[1] * (reading.ndim - 1))
-                made = torch.where(chosen, reading.transpose(-2, -1), memory[f"{KEPT}{name}"])
-                readings[name] = made.transpose(-2, -1)
-            elif f"{WINDOW}{name}" in memory:
-                readings[name] = reduced(updated[f"{WINDOW}{name}"], "stack")
+        readings, updated = chosen_rows(tensors["mask"], *self.core(tensors, memory), memory)
         store(memory, updated | kept(readings, memory))
         return readings
+
+    def flat_core(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return the readings of `core` as `reading/<name>`, and the new state as `state/<name>`."""
+        readings, updated = self.core(tensors, memory)
+        made = {f"reading/{name}": readings[name] for name in self.plan.readings()}
+        return made | {f"state/{name}": value for name, value in updated.items()}
 
     def look(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings of `core`, and leave the state as it is."""

@@ -30,6 +30,7 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
+from tgdsl.tensors.env_ids import broadcast_over
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -151,8 +152,7 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            mask = chosen.view(-1, *[1] * (own.ndim - 1))
-            own.copy_(torch.where(mask, torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
+            own.copy_(torch.where(broadcast_over(chosen, own), torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:

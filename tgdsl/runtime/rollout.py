@@ -148,20 +148,25 @@ def rollout(touch: TactileModule, sim: Simulator, controls: Controls) -> Iterato
 
 
 def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
-    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now."""
+    """Return whether any of a module's objects is in contact with another body, in the first environment, where it is now.
+
+    A contact is one that MuJoCo makes constraints for: what is nearer than the geoms' margin, and not within their gap alone.
+    """
     model = sim.env_model(0)
     data = mujoco.MjData(model)
     data.qpos[:] = sim.qpos[0].cpu().numpy()
     mujoco.mj_kinematics(model, data)
     mujoco.mj_collision(model, data)
-    objects = {
-        int(model.body_weldid[model.body(target.body).id]) or int(model.body(target.body).id) for target in touch.plan.objects
-    }
-    rigid = [
-        {int(model.body_weldid[model.geom_bodyid[geom]]) or int(model.geom_bodyid[geom]) for geom in c.geom}
-        for c in data.contact
+
+    def rigid(body: int) -> int:
+        return int(model.body_weldid[body]) or body
+
+    objects = {rigid(model.body(target.body).id) for target in touch.plan.objects}
+    # A geom of -1 is a flex, which is none of the objects.
+    ends = [
+        {rigid(int(model.geom_bodyid[geom])) if geom >= 0 else -1 for geom in c.geom} for c in data.contact if not c.exclude
     ]
-    return any(len(bodies) == 2 and bodies & objects for bodies in rigid)
+    return any(len(bodies) == 2 and bodies & objects for bodies in ends)
 
 
 class Recorder:

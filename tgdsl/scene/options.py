@@ -20,7 +20,7 @@ KEYWORDS: Mapping[str, Any] = {
 }
 """Fields whose values have names, and the enumeration of these."""
 _POSITIVE = ("timestep", "impratio")
-_WHOLE = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations", "sdf_initpoints")
+_MOST = 2**31 - 1  # MuJoCo's integers have 32 bits
 
 
 def option_names() -> tuple[str, ...]:
@@ -50,26 +50,32 @@ def _value(option: Any, name: str, given: Any) -> Any:
     """Return the value of an option as MuJoCo has it."""
     if name not in option_names():
         raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, option_names(), "options")}')
-    if name in KEYWORDS and isinstance(given, str):
+    if name in KEYWORDS:
         return _keyword(name, given)
     now = getattr(option, name)
     try:
         value = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         value = np.array(np.nan)
-    is_whole = isinstance(now, int) or name in _WHOLE
+    is_whole = isinstance(now, int)
     bound = "more than 0" if name in _POSITIVE else "at least 0" if is_whole or name.endswith("tolerance") else ""
     expected = " ".join(filter(None, ["a whole number" if is_whole else "a number", bound]))
     if np.shape(now):
         expected = f"{np.size(now)} numbers"
     is_fit = value.shape == np.shape(now) and bool(np.isfinite(value).all()) and (not is_whole or value == np.round(value))
+    if is_fit and is_whole and value > _MOST:
+        is_fit, expected = False, f"{expected} and at most {_MOST}"
     if not is_fit or (bound == "more than 0" and value <= 0) or (bound == "at least 0" and value < 0):
         raise SimulationError(f"option {name} is {given!r}, expected {expected}")
     return value if value.shape else int(value) if is_whole else float(value)
 
 
-def _keyword(name: str, given: str) -> int:
+def _keyword(name: str, given: Any) -> int:
+    """Return the number of a keyword, which may be given as that number."""
     known = {member.name.partition("_")[2].lower(): int(member) for member in KEYWORDS[name].__members__.values()}
-    if given.lower() not in known:
-        raise SimulationError(f'option {name} is "{given}"; {did_you_mean(given.lower(), known, "values")}')
-    return known[given.lower()]
+    if isinstance(given, str) and given.lower() in known:
+        return known[given.lower()]
+    if not isinstance(given, str) and np.ndim(given) == 0 and given in known.values():
+        return int(given)
+    shown = f'"{given}"' if isinstance(given, str) else repr(given)
+    raise SimulationError(f"option {name} is {shown}; {did_you_mean(str(given).lower(), known, 'values')}")

@@ -1,4 +1,4 @@
-"""Environments as users name them: by index, or by a mask over all of them."""
+"""Environments as users name them: by index, or by a mask over all of them; and masks beside what environments have."""
 
 from __future__ import annotations
 
@@ -83,3 +83,11 @@ def env_mask(
     found = np.zeros(num_envs, dtype=bool)
     found[env_indices(env_ids, num_envs, error)] = True
     return torch.from_numpy(found).to(device)
+
+
+def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:
+    """Return a mask over environments with as many axes as some values (env, …), of length 1 but for the first.
+
+    With `torch.where` or `masked_fill_` it then chooses whole environments.
+    """
+    return mask.view(-1, *[1] * (values.ndim - 1))

@@ -130,3 +130,16 @@ def test_mistakes_of_the_command(tmp_path, here):
     (tmp_path / "layout.yaml").write_text(LAYOUT.replace("pad:", "pat:"))
     code, _, error = here(tmp_path, "layout", "freeze", "hand.xml")
     assert 'layout.yaml:7:5: resolutions.low/1.pat: no body, geom or mesh matches "pat"; did you mean "pad"?' in error
+
+
+def test_a_document_without_a_layout_has_nothing_to_write_down(tmp_path, here):
+    (tmp_path / "hand.xml").write_text(HAND)
+    (tmp_path / "doc.yaml").write_text("""
+tgdsl: 1
+robot: {model: hand.xml}
+objects: {cube: {body: cube}}
+sensors: {solver: {kind: link_contact, links: "*", feels: [cube]}}
+""")
+    code, _, error = here(tmp_path, "layout", "freeze", "doc.yaml")
+    assert code == 2
+    assert 'doc.yaml:3:1: robot: missing key "layout"; only a layout has taxels to write down' in error

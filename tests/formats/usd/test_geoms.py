@@ -38,6 +38,10 @@ from stages import (
 from tgdsl.formats.robot import load_model
 from tgdsl.formats.usd.reader import usd_to_mjcf
 
+ELL = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2))]
+ELL_FACES = [(5, 4, 3, 2, 1, 0), (6, 7, 8, 9, 10, 11), *((i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6) for i in range(6))]
+"""A prism over an L."""
+
 
 def test_centimetres_and_y_up_are_metres_and_z_up(tmp_path):
     """The same robot in both, the one turned by the up-axis and 100 times as large in its own units."""
@@ -177,10 +181,7 @@ def test_polygons_convex_or_not_are_cut_into_triangles(tmp_path):
     """A prism over an L: its volume and area only come out if no triangle lies outside the polygon."""
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
-    ell = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
-    points = [(x, y, z) for z in (0, 1) for x, y in ell]
-    sides = [(i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6) for i in range(6)]
-    add_mesh(stage, "/b/ell", points, [tuple(range(5, -1, -1)), tuple(range(6, 12)), *sides], collides=False, quat=ODD)
+    add_mesh(stage, "/b/ell", ELL, ELL_FACES, collides=False, quat=ODD)
     model = load_model(path_of(stage))
     surface = model.surface(model.touchable("b"))
     mesh = trimesh.Trimesh(surface.vertices, surface.faces)
@@ -211,12 +212,9 @@ def test_polygons_with_many_reflex_corners(tmp_path, first):
 def test_approximations(tmp_path):
     stage = new_stage(tmp_path)
     add_body(stage, "/b")
-    ell = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
-    points = [(x, y, z) for z in (0, 1) for x, y in ell]
-    faces = [(5, 4, 3, 2, 1, 0), (6, 7, 8, 9, 10, 11), *((i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6) for i in range(6))]
     kinds = ("none", "convexHull", "boundingCube", "boundingSphere", "convexDecomposition", "meshSimplification", "sdf")
     for i, kind in enumerate(kinds):
-        add_mesh(stage, f"/b/{kind}", points, faces, kind, pos=(0, 0, 10 * i), scale=(1, 1, 2))
+        add_mesh(stage, f"/b/{kind}", ELL, ELL_FACES, kind, pos=(0, 0, 10 * i), scale=(1, 1, 2))
     add_mesh(stage, "/b/wedge", WEDGE, WEDGE_FACES, "none")  # convex: nothing is lost
     model, messages = warned(stage)
     hulls = ("none", "convexDecomposition", "meshSimplification", "sdf")

@@ -1,5 +1,6 @@
 """MuJoCo's options by name: the physics is that of a scene with these in its XML, on both simulators and in every variant."""
 
+import mujoco
 import numpy as np
 import pytest
 from warp_cases import SCENE, module, warp
@@ -7,6 +8,7 @@ from warp_cases import SCENE, module, warp
 import tgdsl
 from tgdsl.errors import SimulationError
 from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.scene.options import set_options
 
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 OPTIONS = {"timestep": 0.004, "cone": "pyramidal", "iterations": 7, "gravity": [0.5, 0, -3], "impratio": 2}
@@ -29,6 +31,13 @@ def test_options_act_as_those_of_the_scene(tmp_path, simulator, target):
     assert given.env_model(1).opt.iterations == 7
 
 
+@pytest.mark.parametrize("given", ["elliptic", "Elliptic", int(mujoco.mjtCone.mjCONE_ELLIPTIC)])
+def test_a_keyword_may_be_its_number(given):
+    option = mujoco.MjModel.from_xml_string("<mujoco/>").opt
+    set_options(option, {"cone": given})
+    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
 def test_an_artefact_keeps_its_own_options(tmp_path):
     touch = module(tmp_path)
     tgdsl.simulate(touch, 1, options={"timestep": 0.01}).close()
@@ -41,6 +50,8 @@ def test_an_artefact_keeps_its_own_options(tmp_path):
     [
         ({"timestp": 1}, 'MuJoCo has no option "timestp"; did you mean "timestep"?'),
         ({"cone": "eliptic"}, 'option cone is "eliptic"; did you mean "elliptic"?'),
+        ({"solver": 7}, "option solver is 7; known values: cg, newton, pgs"),
+        ({"iterations": 2**31}, "option iterations is 2147483648, expected a whole number at least 0 and at most 2147483647"),
         ({"timestep": 0}, "option timestep is 0, expected a number more than 0"),
         ({"timestep": float("nan")}, "option timestep is nan, expected a number more than 0"),
         ({"iterations": 1.5}, "option iterations is 1.5, expected a whole number at least 0"),

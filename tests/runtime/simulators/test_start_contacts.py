@@ -100,6 +100,10 @@ def test_what_contacts_cannot_be_is_named(tmp_path, simulator):
         sim.reset([0], contacts={"contact_netfroce": torch.zeros(3)})
     with pytest.raises(SimulationError, match=r"contacts: contact_found has shape \(7,\), expected \(4, \d+\) or \(\d+,\)"):
         sim.reset([0], contacts={"contact_found": torch.zeros(7)})
+    with pytest.raises(SimulationError, match='contacts is "evalute"; did you mean "evaluate"'):
+        sim.reset([0], contacts="evalute")
+    with pytest.raises(SimulationError, match='contacts is "all"; known choices: evaluate, none'):
+        sim.reset([0], contacts="all")
     for name, value in tensors(sim.state()).items():
         assert torch.equal(value, before[name]), name
 

@@ -13,7 +13,7 @@ from tgdsl.runtime.simulators.watch import Watch, product, rotated
 BOTH = pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 SITES = SCENE.replace(
     'pos=".008 -.01 .02" euler="10 20 30"/>',
-    'pos=".008 -.01 .02" euler="10 20 30"/><site name="tip" pos=".01 .02 .03" euler="40 10 0"/>',
+    'pos=".008 -.01 .02" euler="10 20 30"/><site name="tip" pos=".01 .02 .03" euler="40 10 0"/><body><site name="bare"/></body>',
 )
 WATCH = Watch(bodies=("cube", "arm"), sites=("tip",), joints=("two", "one"), actuators=("two",), pairs=(("table", "cube"),))
 
@@ -101,6 +101,7 @@ def test_after_a_reset_it_is_where_the_environment_is_and_efforts_are_zero(tmp_p
     [
         (Watch(bodies=("cub",)), 'the scene has no body "cub"; did you mean "cube"?'),
         (Watch(sites=("tipp",)), 'the scene has no site "tipp"; did you mean "tip"?'),
+        (Watch(sites=("bare",)), 'the site "bare" is on a body without a name; name it in the scene'),
         (Watch(joints=("thre",)), 'the scene has no joint "thre"'),
         (Watch(actuators=("tow",)), 'the scene has no actuator "tow"'),
         (Watch(pairs=(("arm", "cube"),)), "no sensor of this module reads the whole force of cube on arm; add one of kind"),

@@ -19,6 +19,10 @@ from tgdsl.sensors.noise.instant import Now
 from tgdsl.sensors.noise.random import Stream, sensor_key, streams
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers
 
+ENV = "clock/env"
+"""Numbers of the environments that are read, counted from this module's first; only given where these are some of them."""
+SHARED = ("clock/seed", "clock/first_env", "clock/periods", "clock/keys")
+"""What all environments have in common."""
 _INT64 = 2**63
 """First number beyond an int64."""
 
@@ -123,7 +127,8 @@ class Clock(HookedModule):
         ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
         drawn: dict[str, Mapping[int, Stream]] = {}
         if self._drawing:
-            env = torch.arange(len(age), device=age.device) + memory["clock/first_env"]
+            env = memory[ENV] if ENV in memory else torch.arange(len(age), device=age.device)
+            env = env + memory["clock/first_env"]
             found = streams(memory["clock/keys"], env, step[:, 0], memory["clock/episode"])
             drawn = dict(zip(self._drawing, found, strict=True))
         nows = {}

@@ -16,6 +16,7 @@ from torch import Tensor
 from tgdsl.errors import StateError, listed
 from tgdsl.module.memory.clock import Clock
 from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
+from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
 
@@ -141,7 +142,7 @@ class Memory(HookedModule):
         for path, planned in self._planned.items():
             if "/" not in path.partition(":")[2] and not path.startswith(WINDOW):
                 buffer = self.get_buffer(path)
-                buffer.masked_fill_(chosen.view(-1, *[1] * (buffer.ndim - 1)), planned.rest)
+                buffer.masked_fill_(broadcast_over(chosen, buffer), planned.rest)
         self.clock.reset(chosen)
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
@@ -204,7 +205,7 @@ def chosen_only(memory: Mapping[str, Tensor], updated: Mapping[str, Tensor], mas
     chosen = {}
     for name, value in updated.items():
         old = memory[name] if value.ndim == memory[name].ndim else memory[name][_entry_of(memory, name)]
-        chosen[name] = torch.where(mask.view(-1, *[1] * (value.ndim - 1)), value, old)
+        chosen[name] = torch.where(broadcast_over(mask, value), value, old)
     return chosen
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -19,7 +18,6 @@ from torch import Tensor
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject, refuse_other_fields
 
 Array = np.ndarray
-_OPTION = "opt."
 _OWN = ("body_mass", "body_inertia", "geom_friction")
 """Fields that are changed in models of their own; the others follow."""
 
@@ -73,7 +71,7 @@ class OwnFields(ObjectProperties):
                 self._field(name)
         for env in changed:
             for name, values in self._fields.items():
-                value = _value(models[env], name)
+                value = getattr(models[env], name)
                 values[env] = value[: len(values[env])] if values[env].ndim else value
         if self._is_derived and changed:
             self._batch.set_const(np.array(changed))
@@ -146,10 +144,6 @@ class OwnFields(ObjectProperties):
         if name not in self._fields:
             self._fields[name] = self._batch.expand(name)
         return self._fields[name]
-
-
-def _value(model: mujoco.MjModel, name: str) -> Any:
-    return getattr(model.opt, name.removeprefix(_OPTION)) if name.startswith(_OPTION) else getattr(model, name)
 
 
 def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[str]:

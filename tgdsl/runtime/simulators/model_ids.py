@@ -1,4 +1,4 @@
-"""Where in a model stands what a module wants: bodies, geoms, keyframes."""
+"""Where in a model stands what a module wants: bodies, sites, geoms, keyframes."""
 
 from __future__ import annotations
 
@@ -21,6 +21,19 @@ def body_id(model: mujoco.MjModel, name: str) -> int:
     except KeyError as error:
         known = [model.body(i).name for i in range(model.nbody)]
         raise SimulationError(f'the scene has no body "{name}"; {did_you_mean(name, known, "bodies")}') from error
+
+
+def site_id(model: mujoco.MjModel, name: str) -> int:
+    """Return the index of a site.
+
+    Raises:
+        SimulationError: If there is none of that name.
+    """
+    try:
+        return int(model.site(name).id)
+    except KeyError as error:
+        known = [model.site(i).name for i in range(model.nsite)]
+        raise SimulationError(f'the scene has no site "{name}"; {did_you_mean(name, known, "sites")}') from error
 
 
 def part_geoms(model: mujoco.MjModel, part: ContactPart) -> Int[np.ndarray, " geom"]:

@@ -242,8 +242,8 @@ class Simulation(ABC):
             **values: MuJoCo's `qpos`, `qvel`, `ctrl` or another array of the state, as for `set_state`.
 
         Raises:
-            SimulationError: If there are no such environments, a value does not fit, numbers on the host are not finite, or
-                MuJoCo reports an environment as failed.
+            SimulationError: If there are no such environments, a value or `contacts` does not fit, numbers on the host are not
+                finite, or MuJoCo reports an environment as failed.
         """
         self._refuse_if_closed()
         rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._faults.mask.device)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -16,14 +16,15 @@ from torch import Tensor
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.module.state import SceneState, shape_of
 from tgdsl.plan.inputs import Inputs
+from tgdsl.tensors.env_ids import broadcast_over
 
 FIELDS = (
     *("contact_found", "contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce"),
     "joint_effort",
 )
 """Fields of a state that follow from forces."""
-Contacts = Literal["evaluate", "none"] | Mapping[str, Tensor]
-"""How the contacts of a start are found: see `Simulation.reset`."""
+Contacts = str | Mapping[str, Tensor]
+"""How the contacts of a start are found, "evaluate" or "none", or what they are: see `Simulation.reset`."""
 
 
 class StartContacts:
@@ -60,15 +61,15 @@ class StartContacts:
                 zero.
 
         Raises:
-            SimulationError: If there is no such field, or a shape does not fit.
+            SimulationError: If there is no such word or field, or a shape does not fit.
         """
-        given = {} if isinstance(contacts, str) else {name: self._fitting(name, contacts[name], chosen) for name in contacts}
+        given = self._given(contacts, chosen)
         for name in {**self._values, **given}:
             old, new = self._values.get(name), given.get(name)
             like = old if new is None else new
             assert like is not None
             old, new = (torch.zeros_like(like) if value is None else value for value in (old, new))
-            self._values[name] = torch.where(_over(chosen, like), new, old.to(new.dtype))
+            self._values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
         self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
 
     def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
@@ -86,8 +87,16 @@ class StartContacts:
             if now is not None:
                 start = self._values.get(name) if is_stored else None
                 value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
-                values[name] = torch.where(_over(self._is_placed.to(now.device), now), value, now)
+                values[name] = torch.where(broadcast_over(self._is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
+
+    def _given(self, contacts: Contacts, chosen: Bool[Tensor, " env"]) -> dict[str, Tensor]:
+        """Return the fields that are given for the environments, (env, …)."""
+        if not isinstance(contacts, str):
+            return {name: self._fitting(name, contacts[name], chosen) for name in contacts}
+        if contacts != "none":
+            raise SimulationError(f'contacts is "{contacts}"; {did_you_mean(contacts, ("evaluate", "none"), "choices")}')
+        return {}
 
     def _fitting(self, name: str, value: Tensor, chosen: Bool[Tensor, " env"]) -> Tensor:
         known = [field for field in FIELDS if field in self._inputs.fields]
@@ -97,8 +106,3 @@ class StartContacts:
         if tuple(value.shape) not in (shape, shape[1:]):
             raise SimulationError(f"contacts: {name} has shape {tuple(value.shape)}, expected {shape} or {shape[1:]}")
         return value.to(chosen.device).expand(shape)
-
-
-def _over(chosen: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "env ..."]:
-    """Return a mask over environments that broadcasts over their values."""
-    return chosen.view(-1, *[1] * (values.ndim - 1))

@@ -15,6 +15,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
+from tgdsl.tensors.env_ids import broadcast_over
 
 
 class SubstepStates:
@@ -80,6 +81,6 @@ def _mixed(chosen: Bool[Tensor, " env"], now: SceneState, then: SceneState) -> S
     for field in dataclasses.fields(SceneState):
         new, old = getattr(now, field.name), getattr(then, field.name)
         if isinstance(new, Tensor):
-            old = torch.where(chosen.to(new.device).view(-1, *[1] * (new.ndim - 1)), new, old)
+            old = torch.where(broadcast_over(chosen.to(new.device), new), new, old)
         mixed[field.name] = old
     return SceneState(**mixed)

@@ -16,8 +16,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.geometry.rotations import product, rotated
 from tgdsl.module.state import SceneState
 from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.simulators.model_ids import site_id
 
 _BODY_FIELDS = ("body_pos", "body_quat", "body_linvel", "body_angvel")
 _JOINT_FIELDS = ("joint_pos", "joint_vel", "joint_effort", "last_action")
@@ -110,11 +112,11 @@ class WatchReader:
             device: Where the tensors are.
 
         Raises:
-            SimulationError: If the model has no such site, or the module does not read a pair.
+            SimulationError: If the model has no such site, or its body no name, or the module does not read a pair.
         """
-        self._watch, self._device = watch, device
-        sites = np.array([_site(model, name) for name in watch.sites], dtype=np.int64)
-        of_sites = [model.body(int(model.site_bodyid[site])).name for site in sites]
+        self._watch = watch
+        sites = np.array([site_id(model, name) for name in watch.sites], dtype=np.int64)
+        of_sites = [_carrier(model, int(site)) for site in sites]
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         self.inputs = _inputs(watch, bodies)
         """What a simulator has to read for it."""
@@ -138,7 +140,7 @@ class WatchReader:
         pos, quat, linvel, angvel = (_present(getattr(values, name)) for name in _BODY_FIELDS)
         joint_pos, joint_vel, joint_effort, last_action = (_present(getattr(values, name)) for name in _JOINT_FIELDS)
         num, carried = len(self._watch.bodies), quat[:, self._carriers]
-        site_pos, site_quat = self._site_pos.to(pos.dtype), self._site_quat.to(pos.dtype).expand(len(pos), -1, -1)
+        site_pos, site_quat = (own.to(pos.dtype).expand(len(pos), -1, -1) for own in (self._site_pos, self._site_quat))
         force = pos.new_zeros((len(pos), 0, 3))
         if self._pairs:
             assert state is not None and state.contact_netforce is not None
@@ -149,7 +151,7 @@ class WatchReader:
             body_quat=quat[:, :num],
             body_linvel=linvel[:, :num],
             body_angvel=angvel[:, :num],
-            site_pos=pos[:, self._carriers] + rotated(carried, site_pos.expand(len(pos), -1, -1)),
+            site_pos=pos[:, self._carriers] + rotated(carried, site_pos),
             site_quat=product(carried, site_quat),
             joint_pos=joint_pos,
             joint_vel=joint_vel,
@@ -157,20 +159,6 @@ class WatchReader:
             last_action=last_action,
             pair_force=force,
         )
-
-
-def rotated(quat: Float[Tensor, "*n 4"], vector: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return vectors turned by unit quaternions w, x, y, z."""
-    w, axis = quat[..., :1], quat[..., 1:]
-    twice = 2.0 * torch.linalg.cross(axis, vector)
-    return vector + w * twice + torch.linalg.cross(axis, twice)
-
-
-def product(left: Float[Tensor, "*n 4"], right: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
-    """Return products of quaternions w, x, y, z: first the right one turns, then the left one."""
-    w, v, other, u = left[..., :1], left[..., 1:], right[..., :1], right[..., 1:]
-    scalar = w * other - (v * u).sum(dim=-1, keepdim=True)
-    return torch.cat([scalar, w * u + other * v + torch.linalg.cross(v, u)], dim=-1)
 
 
 def _inputs(watch: Watch, bodies: Sequence[str]) -> Inputs:
@@ -190,12 +178,12 @@ def _present(value: Tensor | None) -> Tensor:
     return value
 
 
-def _site(model: mujoco.MjModel, name: str) -> int:
-    try:
-        return int(model.site(name).id)
-    except KeyError as error:
-        known = [model.site(i).name for i in range(model.nsite)]
-        raise SimulationError(f'the scene has no site "{name}"; {did_you_mean(name, known, "sites")}') from error
+def _carrier(model: mujoco.MjModel, site: int) -> str:
+    """Return the name of the body that a site is on."""
+    name = model.body(int(model.site_bodyid[site])).name
+    if not name:
+        raise SimulationError(f'the site "{model.site(site).name}" is on a body without a name; name it in the scene')
+    return name
 
 
 def _pair(inputs: Inputs, wanted: tuple[str, str]) -> int:

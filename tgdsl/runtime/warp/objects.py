@@ -21,6 +21,7 @@ from tgdsl.runtime.simulators.objects.choices import EnvObjects, Values
 from tgdsl.runtime.warp.stream import libraries
 from tgdsl.runtime.warp.worlds import Worlds
 from tgdsl.scene.scene import Choice, SceneModels, is_absent
+from tgdsl.tensors.env_ids import broadcast_over
 
 Array = np.ndarray
 Row = dict[str, Array]
@@ -94,7 +95,7 @@ class WorldObjects:
             target = worlds.parameters[name] if name in OWN_FIELDS else worlds.arrays[name]
             rows = torch.from_numpy(np.stack([self._rows[key][name] for key in distinct]))
             new = rows.to(target.device, target.dtype)[index].reshape(target.shape)
-            target.copy_(torch.where(changed.view(-1, *[1] * (new.ndim - 1)), new, target))
+            target.copy_(torch.where(broadcast_over(changed, new), new, target))
         self.variant.copy_(torch.from_numpy(self._chosen.variant))
         self.object_size.copy_(torch.from_numpy(self._chosen.object_size))
 

@@ -24,6 +24,7 @@ from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
+from tgdsl.tensors.env_ids import broadcast_over
 
 _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
@@ -188,7 +189,7 @@ class Worlds:
             for name, values in rows.values.items():
                 array = self.arrays[name]
                 if array.numel():
-                    array.copy_(torch.where(_like(is_put, array), values, array))
+                    array.copy_(torch.where(broadcast_over(is_put, array), values, array))
 
     def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
         """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
@@ -248,9 +249,9 @@ class Worlds:
         for name, before in earlier.items():
             array = arrays[name]
             if array.numel():
-                array.copy_(torch.where(_like(is_new, array), array, before))
+                array.copy_(torch.where(broadcast_over(is_new, array), array, before))
         for name, kept in self.kept.items():
-            kept.copy_(torch.where(_like(is_new, kept), self.arrays[name], kept))
+            kept.copy_(torch.where(broadcast_over(is_new, kept), self.arrays[name], kept))
 
     def forget_graphs(self) -> None:
         """Capture anew at the next calls."""
@@ -283,11 +284,11 @@ class Worlds:
         for name, start in self._start.items():
             array = self.arrays[name]
             if array.numel():
-                array.copy_(torch.where(_like(self._is_reset, array), start, array))
+                array.copy_(torch.where(broadcast_over(self._is_reset, array), start, array))
         for name in _VELOCITIES:
             array = self.arrays[name]
             if array.numel():  # what is not a number there would come back in the next evaluation
-                array.masked_fill_(_like(self._is_reset, array), 0.0)
+                array.masked_fill_(broadcast_over(self._is_reset, array), 0.0)
         self.faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
 
@@ -305,7 +306,3 @@ def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
 def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:
     """Return torch's view of one of Warp's arrays; one without elements has no memory to view."""
     return wp.to_torch(array) if array.size else torch.empty(array.shape, device=stream.device)
-
-
-def _like(mask: Bool[Tensor, " env"], array: Tensor) -> Tensor:
-    return mask.reshape(-1, *[1] * (array.ndim - 1))

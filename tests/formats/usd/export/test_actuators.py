@@ -3,8 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-
-from tgdsl.formats.robot import export_model, load_model
+from usd_exports import twins_of
 
 HAND = """
 <mujoco model="every kind">
@@ -78,11 +77,7 @@ STEPS = 500
 
 @pytest.fixture(scope="module")
 def twins(tmp_path_factory):
-    """Return the model, and what it comes back as; no warning comes, as warnings are errors."""
-    folder = tmp_path_factory.mktemp("twins")
-    (folder / "hand.xml").write_text(HAND)
-    export_model(folder / "hand.xml", folder / "hand.usda")
-    return load_model(folder / "hand.xml").compiled, load_model(folder / "hand.usda").compiled
+    return twins_of(tmp_path_factory.mktemp("twins"), HAND)
 
 
 def names(model, kind, count):

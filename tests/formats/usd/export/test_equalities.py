@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 from pxr import Usd, UsdPhysics
-from usd_exports import world_of
+from usd_exports import twins_of, world_of
 
 from tgdsl.formats.robot import export_model, load_model
 from tgdsl.formats.usd.export.equalities import shifted
@@ -69,11 +69,7 @@ ANGLES = slice(6, 10)
 
 @pytest.fixture(scope="module")
 def twins(tmp_path_factory):
-    """Return the model, and what it comes back as; no warning comes, as warnings are errors."""
-    folder = tmp_path_factory.mktemp("equalities")
-    (folder / "hand.xml").write_text(HAND)
-    export_model(folder / "hand.xml", folder / "hand.usda")
-    return load_model(folder / "hand.xml").compiled, load_model(folder / "hand.usda").compiled
+    return twins_of(tmp_path_factory.mktemp("equalities"), HAND)
 
 
 def test_the_same_constraints(twins):

@@ -83,6 +83,15 @@ def test_actuators_without_a_target_are_named(tmp_path):
     assert [model.actuator(i).name for i in range(model.nu)] == ["servo"]
 
 
+@pytest.mark.parametrize(("path", "name"), [("/motor", "mjc:target"), ("/servo", "newton:targets")])
+def test_an_actuator_acts_on_its_first_target_alone(tmp_path, path, name):
+    stage = schema_stage(tmp_path)
+    relate(stage.GetPrimAtPath(path), name, ["/turn" if path == "/motor" else "/rail", "/socket"])
+    model, messages = warned(stage)
+    assert messages == [f"targets of actuators after the first one were dropped: {path}"]
+    assert [model.joint(int(i)).name for i in model.actuator_trnid[:, 0]] == ["turn", "rail"]
+
+
 def test_two_names_of_one_kind(tmp_path):
     stage = schema_stage(tmp_path)
     for path in ("/left/grip", "/right/grip"):
@@ -147,6 +156,16 @@ def test_a_spatial_tendon_over_a_pulley_and_around_a_ball(tmp_path):
     site, hook, ball = model.site("site").id, model.site("hook").id, model.geom("ball").id
     assert model.wrap_objid[start : start + 6].tolist() == [site, ball, hook, -1, site, hook]
     assert model.wrap_prm[start : start + 6].tolist() == [0, site, 0, 2, 0, 0]
+
+
+def test_a_tendon_on_no_side_of_a_ball_is_named(tmp_path):
+    """Without its side site it would take the other way around."""
+    stage = schema_stage(tmp_path)
+    relate(stage.GetPrimAtPath("/cable"), "mjc:sideSites", ["/link/seen"])
+    author(stage.GetPrimAtPath("/cable"), "mjc:sideSites:indices", (-1, 0, -1))
+    model, messages = warned(stage)
+    assert messages == ["tendons were dropped that pass over what is no joint, site or geom of the model: /cable"]
+    assert [model.tendon(i).name for i in range(model.ntendon)] == ["tendon"]
 
 
 def test_a_tendon_over_nothing_is_named_and_so_is_its_actuator(tmp_path):

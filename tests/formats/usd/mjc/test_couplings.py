@@ -16,16 +16,15 @@ from stages import (
     compiled,
     inertia,
     new_stage,
+    stage_with_base,
     warned,
     world_pose,
 )
 
 
-def chain(folder, kind="hinge", name="chain.usda"):
+def lead_and_follow(folder, kind="hinge"):
     """Return a stage with two joints of a kind, each on a base that does not move."""
-    stage = new_stage(folder, name)
-    add_body(stage, "/base")
-    add_joint(stage, "/fixed", "fixed", (None, "/base"))
+    stage = stage_with_base(folder)
     for end in ("lead", "follow"):
         add_body(stage, f"/{end}er")
         add_joint(stage, f"/{end}", kind, ("/base", f"/{end}er"))
@@ -35,7 +34,7 @@ def chain(folder, kind="hinge", name="chain.usda"):
 @pytest.mark.parametrize(("kind", "offset"), [("hinge", np.radians(10.0)), ("slide", 10.0)])
 def test_followers(tmp_path, kind, offset):
     """Follower = coef0 + coef1 leader, with coef0 in degrees where it turns; the rest of the polynomial is MuJoCo's."""
-    stage = chain(tmp_path, kind)
+    stage = lead_and_follow(tmp_path, kind)
     follower = stage.GetPrimAtPath("/follow")
     apply(follower, "NewtonMimicAPI", "MjcEqualityJointAPI")
     relate(follower, "newton:mimicJoint", ["/lead"])
@@ -55,7 +54,7 @@ def test_followers(tmp_path, kind, offset):
 
 
 def test_followers_by_mujocos_old_names(tmp_path):
-    stage = chain(tmp_path)
+    stage = lead_and_follow(tmp_path)
     follower = stage.GetPrimAtPath("/follow")
     apply(follower, "MjcEqualityJointAPI")
     relate(follower, "mjc:target", ["/lead"])
@@ -65,7 +64,7 @@ def test_followers_by_mujocos_old_names(tmp_path):
 
 
 def test_a_leader_that_is_no_joint_of_the_tree_is_named(tmp_path):
-    stage = chain(tmp_path)
+    stage = lead_and_follow(tmp_path)
     apply(stage.GetPrimAtPath("/follow"), "NewtonMimicAPI")
     relate(stage.GetPrimAtPath("/follow"), "newton:mimicJoint", ["/fixed"])
     model, messages = warned(stage)
@@ -76,9 +75,7 @@ def test_a_leader_that_is_no_joint_of_the_tree_is_named(tmp_path):
 @pytest.mark.parametrize("by", ["joint", "articulation"])
 def test_joints_between_the_same_bodies_stack(tmp_path, by):
     """Two slides and a hinge, in stage order: MuJoCo's kinematics is their product."""
-    stage = new_stage(tmp_path)
-    add_body(stage, "/base")
-    add_joint(stage, "/fixed", "fixed", (None, "/base"))
+    stage = stage_with_base(tmp_path)
     add_body(stage, "/puck")
     for name, kind, axis in (("x", "slide", "X"), ("turn", "hinge", "Z"), ("y", "slide", "Y")):
         joint = add_joint(stage, f"/{name}", kind, ("/base", "/puck"), axis=axis)
@@ -98,9 +95,7 @@ def test_joints_between_the_same_bodies_stack(tmp_path, by):
 
 
 def test_the_range_of_a_ball_joint_is_its_cone(tmp_path):
-    stage = new_stage(tmp_path)
-    add_body(stage, "/base")
-    add_joint(stage, "/fixed", "fixed", (None, "/base"))
+    stage = stage_with_base(tmp_path)
     add_body(stage, "/knob")
     joint = add_joint(stage, "/socket", "ball", ("/base", "/knob"), coneAngle0Limit=40.0, coneAngle1Limit=40.0)
     apply(joint, "MjcJointAPI")

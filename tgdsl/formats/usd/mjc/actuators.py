@@ -13,6 +13,7 @@ from tgdsl.formats.usd.stage import Prim, Stage, unique_names
 MJC_ACTUATOR, NEWTON_ACTUATOR = "MjcActuator", "NewtonActuator"
 """Types of the prims."""
 LIMITS = ("act", "ctrl", "force")
+TOO_MANY = "targets of actuators after the first one were dropped"
 OWN = ("delay", "nsample", "armature", "damping")
 """Attributes that MjcPhysics does not have."""
 ACTUATOR: SourceTable = {
@@ -102,6 +103,8 @@ def _mjc_actuator(stage: Stage, prim: Prim, named: Named, name: str) -> Actuator
         return None
     ends |= {"slidersite": named.sites[slider[0]]} if slider else {}
     ends |= {"refsite": named.sites[reference[0]]} if reference else {}
+    if max(map(len, (targets, slider, reference))) > 1:
+        stage.drop(TOO_MANY, prim)
     if not slider and float(attributes.pop("cranklength", 0.0)):
         stage.drop("mjc:crankLength was dropped of actuators without mjc:sliderSite", prim)
     joint = target if target in named.joints else ""
@@ -114,6 +117,8 @@ def _newton_actuator(stage: Stage, prim: Prim, named: Named, name: str) -> Actua
     if not targets or targets[0] not in named.joints:
         stage.drop("actuators were dropped whose target is no joint, site, tendon or body of the model", prim)
         return None
+    if len(targets) > 1:
+        stage.drop(TOO_MANY, prim)
     is_angular = stage.usd.GetPrimAtPath(targets[0]).GetTypeName() != "PhysicsPrismaticJoint"
     values = {key: float(value) for key, value in read_attributes(stage, prim, SERVO, is_angular).items()}
     kp, kd, constant = (values.get(key, 0.0) for key in ("kp", "kd", "constant"))

@@ -71,7 +71,7 @@ def _add_joints(stage: Stage, prim: Prim, named: Named, element: ET.Element, pat
 
 
 def _add_points(stage: Stage, prim: Prim, named: Named, element: ET.Element, path: list[str]) -> bool:
-    """Add the sites, geoms and pulleys of a spatial tendon; return whether all are there."""
+    """Add the sites, geoms and pulleys of a spatial tendon; return whether all are there, side sites included."""
     segments, divisors = _array(stage, prim, "path:segments") or [0] * len(path), _array(stage, prim, "path:divisors")
     beside = _array(stage, prim, "sideSites:indices") or [-1] * len(path)
     sides = [str(side) for side in stage.targets(prim, "mjc:sideSites")]
@@ -89,7 +89,9 @@ def _add_points(stage: Stage, prim: Prim, named: Named, element: ET.Element, pat
             ET.SubElement(element, "site", site=named.sites[target])
         elif target in named.geoms:
             wrapped = ET.SubElement(element, "geom", geom=named.geoms[target])
-            if side >= 0 and sides[side] in named.sites:
+            if side >= 0 and sides[side] not in named.sites:
+                return False
+            if side >= 0:
                 wrapped.set("sidesite", named.sites[sides[side]])
         else:
             return False
