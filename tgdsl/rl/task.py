@@ -25,6 +25,7 @@ from torch import Tensor
 
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
@@ -56,6 +57,7 @@ class Setup:
         friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
         mass: Mass of each object [kg], likewise.
         draws: Random numbers.
+        grasps: Grasps that episodes begin from; None if the task's document has none.
     """
 
     num_envs: int
@@ -74,6 +76,7 @@ class Setup:
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
     draws: Draws
+    grasps: GraspTable | None = None
 
 
 @dataclass(frozen=True, eq=False)
