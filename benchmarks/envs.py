@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -240,10 +241,18 @@ def split(env: TouchEnv, num_steps: int = 30) -> dict[str, float]:
 
 
 def used_memory(device: torch.device) -> float:
-    """Return the memory in use [MB]: the GPU's, or this process's."""
+    """Return the memory that this process uses [MB]: the GPU's, of all processes if it cannot tell them apart, or the host's."""
     if device.type == "cuda":
-        free, total = torch.cuda.mem_get_info()
-        return (total - free) / 1e6
+        try:
+            import pynvml
+
+            pynvml.nvmlInit()
+            gpu = pynvml.nvmlDeviceGetHandleByIndex(torch.cuda.current_device())
+            own = [p for p in pynvml.nvmlDeviceGetComputeRunningProcesses(gpu) if p.pid == os.getpid() and p.usedGpuMemory]
+            return own[0].usedGpuMemory / 1e6
+        except Exception:
+            free, total = torch.cuda.mem_get_info()
+            return (total - free) / 1e6
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
@@ -282,6 +291,20 @@ def go_on(env: TouchEnv, seconds: float) -> dict[str, float]:
     }
 
 
+def times_of(options: argparse.Namespace, env: TouchEnv, task: Path, cone: str) -> dict[str, Any]:
+    """Return the medians of what a step takes, with and without what is not physics and module."""
+    plain = [make(options, task, cone) for _ in range(2 if options.alone else 0)]
+    others = [Alone(own, is_ideal) for own, is_ideal in zip(plain, (False, True), strict=False)]
+    blocks = compare(options, env, others)
+    for own in plain:
+        own.close()
+    whole, *alone = (statistics.median(times) for times in blocks)
+    found: dict[str, Any] = {"step_ms": 1e3 * whole, "steps_per_s": env.num_envs / whole, "blocks": blocks}
+    for name, took in zip(("", "_ideal"), alone, strict=False):
+        found |= {f"alone{name}_ms": 1e3 * took, f"ratio{name}": whole / took}
+    return found
+
+
 def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any]:
     """Return all that is measured of a task with a friction cone."""
     start = time.perf_counter()
@@ -293,33 +316,28 @@ def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any
     row: dict[str, Any] = {"task": task.stem, "cone": cone, "envs": env.num_envs, "first_s": time.perf_counter() - start}
     for _ in range(options.warm):
         env.step(next(given))
-    plain = [make(options, task, cone) for _ in range(2)]
-    blocks = compare(options, env, [Alone(own, is_ideal) for own, is_ideal in zip(plain, (False, True), strict=True)])
-    for own in plain:
-        own.close()
-    del plain
-    whole, bare, ideal = (statistics.median(times) for times in blocks)
-    row |= {"step_ms": 1e3 * whole, "alone_ms": 1e3 * bare, "ideal_ms": 1e3 * ideal}
-    row |= {"ratio": whole / bare, "ratio_ideal": whole / ideal, "steps_per_s": env.num_envs / whole, "blocks": blocks}
-    parts = split(env)
-    total = sum(parts.values())
-    row["parts_ms"] = {label: 1e3 * took for label, took in parts.items()}
-    row |= {f"{part}_%": 100.0 * sum(t for label, t in parts.items() if share_of(label) == part) / total for part in PARTS}
+    if options.blocks:
+        row |= times_of(options, env, task, cone)
+        parts = split(env)
+        total = sum(parts.values())
+        row["parts_ms"] = {label: 1e3 * took for label, took in parts.items()}
+        row |= {f"{part}_%": 100.0 * sum(t for name, t in parts.items() if share_of(name) == part) / total for part in PARTS}
     if options.seconds:
         row["long"] = go_on(env, options.seconds)
     env.close()
     return row
 
 
-TIMES = ("first_s", "step_ms", "alone_ms", "ideal_ms", "ratio", "ratio_ideal", "steps_per_s")
+TIMES = ("first_s", "step_ms", "alone_ms", "alone_ideal_ms", "ratio", "ratio_ideal", "steps_per_s")
 COLUMNS = ("task", "cone", "envs", *TIMES, *(f"{part}_%" for part in PARTS))
 
 
 def told(row: dict[str, Any]) -> str:
     """Return a row as text."""
-    cells = [f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name]) for name in COLUMNS]
-    lines = ["  ".join(f"{name} {cell}" for name, cell in zip(COLUMNS, cells, strict=True))]
-    lines += ["  parts [ms]: " + ", ".join(f"{label} {took:.3f}" for label, took in row["parts_ms"].items())]
+    known = {name: row[name] for name in COLUMNS if name in row}
+    lines = ["  ".join(f"{name} {cell:.4g}" if isinstance(cell, float) else f"{name} {cell}" for name, cell in known.items())]
+    if "parts_ms" in row:
+        lines += ["  parts [ms]: " + ", ".join(f"{label} {took:.3f}" for label, took in row["parts_ms"].items())]
     if "long" in row:
         lines += ["  long: " + ", ".join(f"{name} {value:.6g}" for name, value in row["long"].items())]
     return "\n".join(lines)
@@ -334,7 +352,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2, help="of physics and torch, on the CPU")
     parser.add_argument("--cones", nargs="+", default=["elliptic", "pyramidal"])
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the documents")
-    parser.add_argument("--blocks", type=int, default=20)
+    parser.add_argument("--blocks", type=int, default=20, help="0: time nothing")
+    parser.add_argument("--alone", action=argparse.BooleanOptionalAction, default=True, help="time physics and module alone")
     parser.add_argument("--steps", type=int, default=20, help="control steps of a block")
     parser.add_argument("--warm", type=int, default=WARM_STEPS, help="control steps before anything is timed")
     parser.add_argument("--seconds", type=float, default=0.0, help="how long to go on afterwards")
