@@ -7,7 +7,8 @@
 Actions are random, episodes begin anew as they end. Of each task and friction cone:
 
 - `ratio`: `TouchEnv.step` over the same physics and the same module alone (on a GPU `sim.step_and_read`, else `sim.step` and
-  the module), from the same states, with the same controls. Blocks of both alternate; medians of all blocks.
+  the module), from the same states and with the same targets of the same drives; `ratio_ideal`: without drives, with the
+  robot's own actuators. Blocks alternate; medians of all blocks.
 - shares of a step, in percent: physics with the `drive`s, `touch` with what is watched, `logic` (actions, pushes, rewards,
   observations), `reset` (what begins episodes and reads them). On a GPU from events within its CUDA graph.
 - `--seconds`: goes on that long; counts what is no number, faults, ended episodes, and the memory after a fifth and at the end.
@@ -127,43 +128,51 @@ def make(options: argparse.Namespace, task: Path, cone: str, **overrides: Any) -
     return made
 
 
-def alone(env: TouchEnv) -> Callable[[Tensor], object]:
-    """Return a control step of environments' physics and module, with nothing else of them; it takes controls."""
-    sim, touch = env.sim, env.touch
-    sim.drive = None
-    if env.device.type == "cuda":
-        return sim.step_and_read  # type: ignore[union-attr]
+class Alone:
+    """The physics and the module of environments, with nothing else of them."""
 
-    def step(control: Tensor) -> object:
+    def __init__(self, env: TouchEnv, is_ideal: bool):
+        """Take environments; `is_ideal`: the robot's own actuators are to do all."""
+        self._env, self._is_ideal = env, is_ideal or env.actuation.is_ideal
+        if self._is_ideal:
+            env.sim.drive = None
+
+    def begin(self, state: dict[str, dict[str, Tensor]]) -> None:
+        """Go on from the state of other environments of the same task."""
+        self._env.load_state_dict(state)
+        if self._is_ideal:
+            self._env.sim.arrays["qfrc_applied"].zero_()
+
+    def step(self, targets: tuple[Tensor, Tensor]) -> object:
+        """Make a control step with controls or, where there are drives, their targets."""
+        env, (controls, past) = self._env, targets
+        if not self._is_ideal:
+            env.actuation.memory()["past"].copy_(past)
+        if env.device.type == "cuda":
+            return env.sim.step_and_read(controls if self._is_ideal else None)  # type: ignore[union-attr]
         with torch.no_grad():
-            sim.step(control)
-            return touch(sim.state())
-
-    return step
+            env.sim.step(controls if self._is_ideal else None)
+            return env.touch(env.sim.state())
 
 
-def compare(options: argparse.Namespace, env: TouchEnv, plain: TouchEnv) -> tuple[list[float], list[float]]:
-    """Return what a step takes in each block, of the environments and of physics and module alone [s]."""
-    clock, given, step, length = Clock(env.device), actions(env), alone(plain), options.steps
-    for _ in range(3):
-        step(plain.sim.ctrl.clone())
-    taken: tuple[list[float], list[float]] = ([], [])
-    for _ in range(options.blocks):
-        plain.sim.load_state_dict(env.sim.state_dict())
-        controls: list[Tensor] = []
-        chosen = [next(given) for _ in range(length)]
+def compare(options: argparse.Namespace, env: TouchEnv, others: list[Alone]) -> list[list[float]]:
+    """Return what a step takes in each block, of the environments, and of physics and module alone [s]."""
+    clock, given, length = Clock(env.device), actions(env), options.steps
+    taken: list[list[float]] = [[] for _ in range(1 + len(others))]
+    for block in range(1 + options.blocks):  # in the first of them all is captured
+        state, targets, chosen = env.state_dict(), [], [next(given) for _ in range(max(length, 3))]
 
-        def with_env(chosen: list[Tensor] = chosen, controls: list[Tensor] = controls) -> None:
+        def whole(chosen: list[Tensor] = chosen, targets: list[Any] = targets) -> None:
             for action in chosen:
                 env.step(action)
-                controls.append(env.sim.ctrl.clone())
+                targets.append((env.sim.ctrl.clone(), env.actuation.memory()["past"].clone()))
 
-        def without(controls: list[Tensor] = controls) -> None:
-            for control in controls:
-                step(control)
-
-        for times, work in zip(taken, (with_env, without), strict=True):
-            times.append(clock.seconds(work) / length)
+        times = [clock.seconds(whole)]
+        for other in others:
+            other.begin(state)
+            times.append(clock.seconds(lambda other=other, targets=targets: [other.step(target) for target in targets]))
+        for own, took in zip(taken, times, strict=True):
+            own.extend([took / len(chosen)] if block else [])
     return taken
 
 
@@ -284,13 +293,14 @@ def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any
     row: dict[str, Any] = {"task": task.stem, "cone": cone, "envs": env.num_envs, "first_s": time.perf_counter() - start}
     for _ in range(options.warm):
         env.step(next(given))
-    plain = make(options, task, cone)
-    blocks, blocks_alone = compare(options, env, plain)
-    plain.close()
+    plain = [make(options, task, cone) for _ in range(2)]
+    blocks = compare(options, env, [Alone(own, is_ideal) for own, is_ideal in zip(plain, (False, True), strict=True)])
+    for own in plain:
+        own.close()
     del plain
-    whole, bare = statistics.median(blocks), statistics.median(blocks_alone)
-    row |= {"step_ms": 1e3 * whole, "alone_ms": 1e3 * bare, "ratio": whole / bare, "steps_per_s": env.num_envs / whole}
-    row["blocks"] = [blocks, blocks_alone]
+    whole, bare, ideal = (statistics.median(times) for times in blocks)
+    row |= {"step_ms": 1e3 * whole, "alone_ms": 1e3 * bare, "ideal_ms": 1e3 * ideal}
+    row |= {"ratio": whole / bare, "ratio_ideal": whole / ideal, "steps_per_s": env.num_envs / whole, "blocks": blocks}
     parts = split(env)
     total = sum(parts.values())
     row["parts_ms"] = {label: 1e3 * took for label, took in parts.items()}
@@ -301,7 +311,8 @@ def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any
     return row
 
 
-COLUMNS = ("task", "cone", "envs", "first_s", "step_ms", "alone_ms", "ratio", "steps_per_s", *(f"{part}_%" for part in PARTS))
+TIMES = ("first_s", "step_ms", "alone_ms", "ideal_ms", "ratio", "ratio_ideal", "steps_per_s")
+COLUMNS = ("task", "cone", "envs", *TIMES, *(f"{part}_%" for part in PARTS))
 
 
 def told(row: dict[str, Any]) -> str:
