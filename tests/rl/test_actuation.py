@@ -286,3 +286,19 @@ def test_joints_that_cannot_be_driven_are_named(text, message):
     with pytest.raises(SimulationError) as caught:
         Actuators.of(mujoco.MjModel.from_xml_string(text), ["b", "a", "d"] if "d" in message.split(";")[0][-3:] else ["a"])
     assert str(caught.value).startswith(message)
+
+
+@BOTH
+def test_drives_that_begin_at_controls_press(tmp_path, simulator):
+    """A hand that holds something begins with targets inside it: torque k (w − q) from the first step on, also with play."""
+    for drive in (None, DriveSpec(backlash=(0.02, 0.02))):
+        sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(), drive=drive)
+        sim.reset(ctrl=[0.1])
+        chosen = torch.tensor([True, False])
+        actuation.reset(chosen, torch.ones(2, dtype=torch.int64), at_controls=True)
+        torch.testing.assert_close(actuation.target[:, 0], torch.tensor([0.1, 0.0]).to(actuation.target))
+        actuation.command(torch.zeros(2, 1))
+        sim.step()
+        torch.testing.assert_close(acceleration(sim), STIFFNESS * 0.1 / INERTIA, rtol=1e-3, atol=0)
+        assert float(sim.qvel[1, 0]) == 0
+        sim.close()

@@ -1,4 +1,4 @@
-"""What the solver says of each body: the bit, the force, their frame and their order."""
+"""What the solver says of each body: the bit, the force, how hard it is pressed, their frame and their order."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import tgdsl
+from tgdsl.errors import SpecError
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.warp import WarpSimulation
 from tgdsl.sensors.link_contact import LINK_CONTACT
 from tgdsl.testing import KindConformance
 
@@ -41,6 +44,21 @@ class TestLinkContactBit(TestLinkContact):
         plan = self.build(self.document(scene), torch.float32)[0].plan
         assert set(plan.quantities) == {"contacts"} and not any("/geoms/" in name for name in plan.arrays)
         assert plan.inputs.fields == ("body_pos", "body_quat", "contact_netforce")
+
+
+class TestLinkContactNormalForce(TestLinkContact):
+    parameters = {"outputs": ["contact", "force", "normal_force"], "slots": 5}
+
+
+class TestLinkContactNormalForceAlone(KindConformance):
+    """Where all contacts press, as in the suite's states, it is smooth in forces and normals."""
+
+    kind = LINK_CONTACT
+    gates = ()
+    parameters = {"outputs": ["normal_force"]}
+
+    test_something_is_felt = TestLinkContact.test_something_is_felt
+    test_a_broken_pose_is_seen = TestLinkContact.test_a_broken_pose_is_seen
 
 
 SCENE = """
@@ -119,3 +137,119 @@ def test_a_force_in_the_world_is_read_in_the_links_frame(scene):
         state.contact_netforce[0, pairs.index(pair)] = torch.tensor(force, dtype=torch.float64)
     expected = turn.inv().apply([0.5, 2, 4])
     np.testing.assert_allclose(touch(state)["s"][0], [[0, 0, 0, 0], [1, *expected]], atol=1e-14)
+
+
+def world_state(touch, forces, normals):
+    """Return a state in which the right body touches the cube: a force and a normal for each slot, the net force their sum."""
+    state = touch.example_state(1)
+    pair = [(pair.link, pair.object) for pair in touch.inputs.pairs].index(("right", "cube"))
+    for name in ("contact_force", "contact_torque", "contact_normal", "contact_netforce"):
+        getattr(state, name).zero_()
+    for slot, (force, normal) in enumerate(zip(forces, normals, strict=True)):
+        state.contact_force[0, pair, slot] = torch.tensor(force, dtype=torch.float64)
+        state.contact_normal[0, pair, slot] = torch.tensor(normal, dtype=torch.float64)
+    state.contact_netforce[0, pair] = state.contact_force[0, pair].sum(dim=0)
+    return state, pair
+
+
+SQUEEZE = ([[3.0, 0.4, 0], [-3.0, 0.4, 0]], [[1.0, 0, 0], [-1.0, 0, 0]])
+"""Two walls that press with 3 N each, and friction that carries 0.8 N."""
+
+
+def test_normal_forces_that_oppose_one_another_add_up(scene):
+    """The net force of the walls is their friction's; a contact that pulls presses with nothing."""
+    touch = scene(outputs=["force", "normal_force"])
+    assert touch.outputs[0].channels == ("force_x", "force_y", "force_z", "normal_force")
+    assert touch.outputs[0].units == ("N",) * 4
+    state, _ = world_state(touch, *SQUEEZE)
+    reading = touch(state)["s"][0]
+    np.testing.assert_allclose(reading[:, 3], [0, 6], atol=1e-14)
+    np.testing.assert_allclose(reading[:, :3].norm(dim=1), [0, 0.8], atol=1e-14)
+    pulled, _ = world_state(touch, [[3.0, 0, 0], [0, 1.0, 0]], [[1.0, 0, 0], [0, -1.0, 0]])
+    np.testing.assert_allclose(touch(pulled)["s"][0, :, 3], [0, 3], atol=1e-14)
+
+
+def test_a_force_without_a_normal_is_no_number(scene):
+    """As `quantities.contacts` has it: what needs a normal that is not there is not-a-number, the net force is read."""
+    touch = scene(outputs=["force", "normal_force"])
+    state, pair = world_state(touch, *SQUEEZE)
+    state.contact_normal[0, pair, 0] = 0
+    reading = touch(state)["s"][0]
+    assert reading[1, 3].isnan() and not reading[0].isnan().any() and not reading[1, :3].isnan().any()
+
+
+def test_what_slots_lack_is_shared_out(scene):
+    """A flat face of 5 N of which one slot shows 2 N: all normals are the same, and so 5 N are read."""
+    touch = scene(outputs=["normal_force"], slots=1)
+    assert touch.inputs.slots == 1
+    state, pair = world_state(touch, [[0, 0, 2.0]], [[0, 0, 1.0]])
+    state.contact_netforce[0, pair, 2] = 5
+    with pytest.warns(UserWarning, match="more than `slots: 1`"):
+        np.testing.assert_allclose(touch(state)["s"][0, :, 0], [0, 5], atol=1e-14)
+
+
+def test_slots_are_of_the_normal_force_alone(scene):
+    with pytest.raises(SpecError, match="`slots` is used by the output `normal_force` alone, expected it to be left out"):
+        scene(slots=4)
+
+
+def test_noise_acts_on_the_normal_force(scene):
+    """A quantiser of 3.5 N rounds 6.1 N to 7 N and the net force of 0.9 N to none: each channel is a signal by itself."""
+    touch = scene(outputs=["force", "normal_force"], noise={"quantization": 3.5})
+    state, _ = world_state(touch, [[3.0, 0.4, 0], [-3.0, 0.4, 0], [0, 0.1, 0]], [[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
+    np.testing.assert_allclose(touch(state)["s"][0], [[0, 0, 0, 0], [0, 0, 0, 7]], atol=1e-13)
+
+
+GROOVE = """
+<mujoco>
+  <option timestep="0.002" cone="elliptic" impratio="10" integrator="implicitfast"/>
+  <worldbody>
+    <body name="left" pos="-.2 0 0" euler="0 10 0"><geom type="box" size=".05 .05 .01" friction="1"/></body>
+    <body name="right" pos=".2 0 0">
+      <geom type="box" size=".05 .05 .01" pos="-.05 0 0" euler="0 45 0" condim="1" solref=".01 1"/>
+      <geom type="box" size=".05 .05 .01" pos=".05 0 0" euler="0 -45 0" condim="1" solref=".01 1"/>
+    </body>
+    <body name="cube" pos="-.1947 0 .0295" euler="0 10 0">
+      <freejoint/><geom type="box" size=".02 .02 .02" mass=".25" friction="1"/>
+    </body>
+    <body name="ball" pos=".2 0 .0025"><freejoint/><geom type="sphere" size=".03" mass=".1" condim="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+"""A cube held by friction on a slope of 10°, and a ball that slides in a groove of 90°."""
+
+
+def on_warp(touch):
+    return WarpSimulation(touch, 2, device="cpu", substeps=500)
+
+
+def on_mujoco(touch):
+    return BatchSimulation(touch, 2, substeps=500)
+
+
+@pytest.mark.parametrize("simulator", [on_mujoco, on_warp])
+def test_the_normal_force_of_a_slope_and_of_a_groove(tmp_path, simulator):
+    """The slope takes m g cos θ of a cube's weight, and the groove's walls m g / (2 cos 45°) each of a ball's."""
+    (tmp_path / "scene.xml").write_text(GROOVE)
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml")},
+        "objects": {"cube": {"body": "cube"}, "ball": {"body": "ball"}},
+        "sensors": {
+            "s": {
+                "kind": "link_contact",
+                "links": ["left", "right"],
+                "feels": ["cube", "ball"],
+                "outputs": ["force", "normal_force"],
+            }
+        },
+    }
+    touch = tgdsl.compile(document, dtype=torch.float64)
+    sim = simulator(touch)
+    for _ in range(3):
+        sim.step()
+    reading = touch(sim.state())["s"].numpy()
+    weight, slope = np.array([0.25, 0.1]) * 9.81, np.radians(10)
+    expected = [weight[0] * np.cos(slope), weight[1] * np.sqrt(2)]
+    np.testing.assert_allclose(reading[:, :, 3], [expected] * 2, rtol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(reading[:, :, :3], axis=2), [weight] * 2, rtol=2e-3)

@@ -12,15 +12,20 @@ from tgdsl.commands.arguments import OUT
 
 @dataclass(frozen=True)
 class Schema:
-    """Write the JSON Schema of documents and layouts, with which editors complete and check them."""
+    """Write the JSON Schema of documents and layouts, or of tasks, with which editors complete and check them."""
 
-    out: Annotated[Path, OUT] = Path("tgdsl.schema.json")
-    """The file to write."""
+    tasks: bool = False
+    """Of tasks."""
+    out: Annotated[Path | None, OUT] = None
+    """The file to write; default: tgdsl.schema.json, or tgdsl.task.schema.json."""
 
     def run(self) -> None:
         """Write it."""
         from tgdsl.files.write import atomic_write
+        from tgdsl.rl.schema import task_schema
         from tgdsl.schema.document import json_schema
 
-        atomic_write(self.out, (json.dumps(json_schema(), indent=2, ensure_ascii=False) + "\n").encode())
-        print(self.out)
+        out = self.out or Path("tgdsl.task.schema.json" if self.tasks else "tgdsl.schema.json")
+        schema = task_schema() if self.tasks else json_schema()
+        atomic_write(out, (json.dumps(schema, indent=2, ensure_ascii=False) + "\n").encode())
+        print(out)

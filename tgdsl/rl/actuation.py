@@ -219,9 +219,10 @@ class Actuation:
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
         values = [f.name for f in fields(actuators) if f.name not in ("names", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
-        self.drawn = {
-            name: torch.full((num_envs, num), getattr(DriveSpec(), name)[0], device=device, dtype=dtype) for name in _DRAWN
-        }
+        ideal = DriveSpec()
+        shape = (num_envs, num)
+        self.drawn = {name: torch.full(shape, getattr(ideal, name)[0], device=device, dtype=dtype) for name in _DRAWN}
+        self._ranges = {name: getattr(drive, name) for name in _DRAWN if getattr(drive, name) != getattr(ideal, name)}
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
         self._play = torch.zeros_like(self.target)
@@ -231,28 +232,28 @@ class Actuation:
         self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
-    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> None:
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
         """Draw the drives of some environments anew, which hold the positions that their joints now have.
 
         Args:
             chosen: The environments.
             episode: How often each was reset.
+            at_controls: Whether targets are the present controls instead, as those of a hand that presses.
         """
-        for name, own in self.drawn.items():
-            low, high = getattr(self.spec, name)
-            if low == high == getattr(DriveSpec(), name)[0]:
-                continue
+        for name, (low, high) in self._ranges.items():
+            own = self.drawn[name]
             if name == "delay":
                 new = self._draws.integers(name, episode, own.shape[1], int(low), int(high))
             else:
                 new = self._draws.uniform(name, episode, own.shape[1], low, high)
             own.copy_(torch.where(chosen[:, None], new.to(own.dtype), own))
         self._count.copy_(torch.where(chosen, episode << 32, self._count))
-        self.place(chosen)
+        self.place(chosen, at_controls)
 
-    def place(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Have the drives of some environments hold the positions that their joints now have."""
-        now = self._arrays["qpos"][:, self._index["qpos"]]
+    def place(self, chosen: Bool[Tensor, " env"], at_controls: bool = False) -> None:
+        """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
+        name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
+        now = self._arrays[name][:, self._index[which]]
         for held in (self.target, self._play, *self._past):
             held.copy_(torch.where(chosen[:, None], now, held))
         self._play.copy_(torch.where(chosen[:, None], now + self.drawn["bias"], self._play))
@@ -270,9 +271,7 @@ class Actuation:
             wanted = torch.minimum(torch.maximum(self.target + self.action.scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
         self.target.copy_(torch.where(action.isfinite(), wanted, self.target))
-        for i in range(len(self._past) - 1, 0, -1):
-            self._past[i].copy_(self._past[i - 1])
-        self._past[0].copy_(self.target)
+        self._past.copy_(torch.cat([self.target[None], self._past[:-1]]))
         if self.is_ideal:
             self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()
 

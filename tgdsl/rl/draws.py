@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.sensors.noise.random import Stream, mix, normal_pair, sensor_key, uniform, words
+from tgdsl.tensors.fused import FusedCall
 
 
 class Draws:
@@ -24,7 +25,15 @@ class Draws:
         seed: What they follow from.
     """
 
-    def __init__(self, seed: int, num_envs: int, device: torch.device | str = "cpu", first_env: int = 0):
+    def __init__(
+        self,
+        seed: int,
+        num_envs: int,
+        device: torch.device | str = "cpu",
+        first_env: int = 0,
+        *,
+        is_compiled: bool = False,
+    ):
         """Begin.
 
         Args:
@@ -32,11 +41,13 @@ class Draws:
             num_envs: Number of environments.
             device: Where the numbers are wanted.
             first_env: Number of the first environment, counted over all processes.
+            is_compiled: Whether the hash, some fifty small operations, is compiled by torch.
         """
         self.seed, self._device = seed, torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._keys: dict[str, Int[Tensor, " half"]] = {}
         self._index: dict[int, Int[Tensor, " num"]] = {}
+        self._hashed = FusedCall(self._hash, is_compiled, has_fixed_shapes=False)
 
     def reseed(self, seed: int) -> None:
         """Choose another seed, in place: graphs that were captured draw its numbers."""
@@ -73,6 +84,11 @@ class Draws:
             self._keys[what] = torch.tensor(sensor_key(self.seed, what), dtype=torch.int32, device=self._device)
         if num not in self._index:
             self._index[num] = torch.arange(num, dtype=torch.int32, device=self._device)
+        return self._hashed(self._keys[what], counter, self._index[num])
+
+    def _hash(
+        self, key: Int[Tensor, " half"], counter: Int[Tensor, " env"], index: Int[Tensor, " num"]
+    ) -> Int[Tensor, "env num"]:
         low, high = counter.to(torch.int32)[:, None], mix((counter >> 32).to(torch.int32))[:, None]
-        begun = mix(mix(mix(self._envs.to(torch.int32)[:, None] ^ self._keys[what]) ^ low) ^ high)
-        return words(Stream(begun[:, :1], begun[:, 1:]), self._index[num])
+        begun = mix(mix(mix(self._envs.to(torch.int32)[:, None] ^ key) ^ low) ^ high)
+        return words(Stream(begun[:, :1], begun[:, 1:]), index)

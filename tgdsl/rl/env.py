@@ -18,18 +18,22 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.console.progress import Progress
-from tgdsl.errors import SimulationError
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
+from tgdsl.tensors.fused import FusedCall
 
+PREPARING_STEPS = 3
+"""The third step is captured on a GPU, and the second one compiled."""
 Observations = dict[str, Float[Tensor, "env feature"]]
 
 
@@ -116,7 +120,7 @@ class TouchEnv:
             overrides: Values of the document to set first by dotted path, such as `{"rewards.spin": 3}`.
             simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
-            compiled: Whether the module is compiled by torch; default: on a GPU.
+            compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
             first_env: Number of the first environment among those of all processes.
             progress: Is told in a line what is being done.
 
@@ -128,26 +132,35 @@ class TouchEnv:
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress)
         self.touch, self._sensed = sensed.touch, sensed
-        if compiled if compiled is not None else self.touch.device.type == "cuda":
+        is_compiled = compiled if compiled is not None else self.touch.device.type == "cuda"
+        if is_compiled:
             self.touch.compile()
         self._joints = moved_joints(loaded, sensed)
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
-        draws = Draws(seed, num_envs, self.sim.qpos.device, first_env)
+        draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
-        self.task = loaded.task(self.spec, setup)
+        setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
+        try:
+            self.task = loaded.task(self.spec, setup)
+        except LowerError as error:
+            raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
         random = self.spec.randomise
         arrays = self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws)
-        self.sim.drive = None if self.actuation.is_ideal else self.actuation.drive
+        self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         body = int(setup.model.body(setup.object).id)
         self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
-        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws)
+        self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
+        self._commanded = FusedCall(self._command, is_compiled)
+        self._judged = FusedCall(self._judge, is_compiled)
+        self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
+        self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
 
@@ -180,6 +193,11 @@ class TouchEnv:
     def steps(self) -> Int[Tensor, " env"]:
         """Control steps of each environment's present episode: a live tensor."""
         return self._episodes.steps
+
+    @property
+    def now(self) -> Now:
+        """The instant that the last observations are of; its tensors hold until the next step."""
+        return self._instant
 
     def reset(self, seed: int | None = None) -> Observations:
         """Begin a new episode in all environments.
@@ -264,6 +282,16 @@ class TouchEnv:
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
 
+    def _prepare(self, tell: Progress, is_compiled: bool) -> None:
+        """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
+        is_cuda = self.sim.qpos.is_cuda
+        if not (is_cuda or is_compiled):
+            return
+        tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+        self.reset()
+        for _ in range(PREPARING_STEPS):
+            self.step(torch.zeros_like(self._action))
+
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""
         self._episodes.begin(chosen)
@@ -272,30 +300,41 @@ class TouchEnv:
 
     def _advance(self) -> Step:
         """Make one control step with the action that was copied: see the top of this page."""
-        action, sim = self._action.to(self._used), self.sim
+        sim = self.sim
+        self._before.copy_(self._used)
+        sim.step(self._commanded(self._action, sim.ctrl))
+        now = self._now(sim.read())
+        self.task.advance(now)
+        made = self._judged(now, sim.faults)
+        if made.info.ended.is_cuda or bool(made.info.ended.any()):
+            self._begin(made.info.ended)
+            now = self._now(sim.read(made.info.ended))
+            made = made._replace(obs=self._observed(now))
+        return made
+
+    def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
+        """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
+        action = action.to(self._used)
         is_bad = ~action.isfinite().all(dim=1)
         self.actuation.command(action)
-        self._before.copy_(self._used)
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         self.pushes.advance()
-        sim.step(torch.where(is_bad[:, None], torch.nan, sim.ctrl))
-        now, faults = self._now(sim.read()), sim.faults.clone()
-        self.task.advance(now)
+        return torch.where(is_bad[:, None], torch.nan, ctrl)
+
+    def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
+        """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.reward(now, terminated)
         terms = {name: torch.where(faults, 0.0, rate * self.control_step).float() for name, rate in rates.items()}
         reward = torch.stack(list(terms.values())).sum(dim=0)
         self._episodes.add(terms, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
-        ended = terminated | truncated
         obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in self._observe(now).items()}
         episodes = self._episodes
         sums = {name: total.clone() for name, total in episodes.sums.items()}
         score, total = self.task.score().float().clone(), episodes.total.clone()
-        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults)
-        if ended.is_cuda or bool(ended.any()):
-            self._begin(ended)
-            obs = self._observe(self._now(sim.read(ended)))
+        ended = terminated | truncated
+        info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
         return Step(obs, reward, terminated, truncated, info)
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
@@ -305,20 +344,26 @@ class TouchEnv:
         dtype, device = self._used.dtype, self._used.device
         none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
         contact, distance = self._sensed.contact, self._sensed.distance
-        return Now(
+        forces = {f"force_{axis}": none for axis in "xyz"}
+        if contact:
+            forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
+        self._instant = Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
             joint_vel=watched.joint_vel[:, :num],
+            target=self.actuation.target,
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
-            link_force=readings[contact][..., -3:].to(device, dtype) if contact else none.view(self.num_envs, 0, 3),
+            link_force=torch.stack([forces[f"force_{axis}"] for axis in "xyz"], dim=2),
+            normal_force=forces.get("normal_force", none),
             distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
             friction=self._episodes.friction,
             mass=self._episodes.mass,
             readings=readings,
         )
+        return self._instant
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""

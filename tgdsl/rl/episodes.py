@@ -16,7 +16,8 @@ from tgdsl.rl.draws import Draws
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.spec import RandomSpec
 from tgdsl.rl.start import EnvSimulation
-from tgdsl.rl.task import Task
+from tgdsl.rl.task import Start, Task
+from tgdsl.tensors.fused import FusedCall
 
 
 class Episodes:
@@ -38,7 +39,16 @@ class Episodes:
     total: Float[Tensor, " env"]
     sums: dict[str, Float[Tensor, " env"]]
 
-    def __init__(self, sim: EnvSimulation, random: RandomSpec, task: Task, actuation: Actuation, pushes: Pushes, draws: Draws):
+    def __init__(
+        self,
+        sim: EnvSimulation,
+        random: RandomSpec,
+        task: Task,
+        actuation: Actuation,
+        pushes: Pushes,
+        draws: Draws,
+        is_compiled: bool = False,
+    ):
         """Note what the scene's objects are like before anything is random.
 
         Args:
@@ -48,6 +58,7 @@ class Episodes:
             actuation: The drives.
             pushes: What pushes the object.
             draws: Random numbers.
+            is_compiled: Whether what is done to tensors is compiled by torch.
         """
         self._sim, self._random, self._task = sim, random, task
         self._actuation, self._pushes, self._draws = actuation, pushes, draws
@@ -57,21 +68,17 @@ class Episodes:
         self.steps = torch.zeros_like(self.number)
         self._friction = sim.properties.friction(self._object).to(device, dtype).clone()
         self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
-        self.friction, self.mass = self._friction.clone(), self._mass.clone()
+        self.friction, self.mass = task.setup.friction, task.setup.mass
         self.total = torch.zeros(sim.num_envs, device=device)
         self.sums = {}
+        self._restarted = FusedCall(self._restart, is_compiled)
 
     def begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin a new episode in some environments, in the simulation and the module too."""
-        self.number += chosen
-        self._draw_properties(chosen)
-        start = self._task.reset(chosen, self.number)
+        start = self._draw(chosen)
+        self._set_properties(chosen)
         self._sim.reset(chosen, contacts=start.contacts, **start.values)
-        self._actuation.reset(chosen, self.number)
-        self._pushes.reset(chosen, self.number)
-        self.steps.masked_fill_(chosen, 0)
-        for total in (self.total, *self.sums.values()):
-            total.masked_fill_(chosen, 0.0)
+        self._restarted(chosen, "ctrl" in start.values)
 
     def count_anew(self) -> None:
         """Begin to count episodes from 0, so that random numbers are those of environments just made."""
@@ -95,14 +102,30 @@ class Episodes:
         own = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
         return own | {f"sums/{name}": total for name, total in self.sums.items()}
 
-    def _draw_properties(self, chosen: Bool[Tensor, " env"]) -> None:
-        """Draw friction and mass, where these are random."""
-        random, draws = self._random, self._draws
-        if random.friction != ONE:
-            factor = draws.uniform("friction", self.number, 1, *random.friction)[:, 0]
-            self.friction.copy_(torch.where(chosen, self._friction * factor.to(self._friction.dtype), self.friction))
-            self._sim.properties.set(chosen, friction={self._object: self.friction})
-        if random.mass != ZERO:
-            added = draws.uniform("mass", self.number, 1, *random.mass)[:, 0]
-            self.mass.copy_(torch.where(chosen, self._mass + added.to(self._mass.dtype), self.mass))
-            self._sim.properties.set(chosen, mass={self._object: self.mass})
+    def _draw(self, chosen: Bool[Tensor, " env"]) -> Start:
+        """Draw friction, mass and how the task begins."""
+        self.number += chosen
+        random = self._random
+        for name, rest, own in (("friction", ONE, self.friction), ("mass", ZERO, self.mass)):
+            low, high = getattr(random, name)
+            if (low, high) != rest:
+                drawn = self._draws.uniform(name, self.number, 1, low, high)[:, 0].to(own.dtype)
+                new = self._friction * drawn if name == "friction" else self._mass + drawn
+                own.copy_(torch.where(chosen, new, own))
+        return self._task.reset(chosen, self.number)
+
+    def _set_properties(self, chosen: Bool[Tensor, " env"]) -> None:
+        """Give objects the friction and mass that were drawn, where these are random."""
+        properties, name = self._sim.properties, self._object
+        if self._random.friction != ONE:
+            properties.set(chosen, friction={name: self.friction})
+        if self._random.mass != ZERO:
+            properties.set(chosen, mass={name: self.mass})
+
+    def _restart(self, chosen: Bool[Tensor, " env"], at_controls: bool) -> None:
+        """Draw drives and pushes anew, and begin to add up."""
+        self._actuation.reset(chosen, self.number, at_controls)
+        self._pushes.reset(chosen, self.number)
+        self.steps.masked_fill_(chosen, 0)
+        for total in (self.total, *self.sums.values()):
+            total.masked_fill_(chosen, 0.0)

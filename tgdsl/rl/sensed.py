@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +29,7 @@ class Sensed:
         touch: The module.
         felt: Name of the sensor that the policy feels; None if it feels nothing.
         contact: Name of the `link_contact` sensor; None if the task takes none.
+        channels: Names of its channels: those of the force, and of the normal force if the task wants it, among them.
         distance: Name of the `surface_distance` sensor; None if the task takes none.
         object: Body of the task's object in the scene.
     """
@@ -35,17 +37,21 @@ class Sensed:
     touch: TactileModule
     felt: str | None
     contact: str | None
+    channels: tuple[str, ...]
     distance: str | None
     object: str
 
 
-def compile_sensed(loaded: LoadedTask, device: torch.device | str, progress: Progress | None = None) -> Sensed:
+def compile_sensed(
+    loaded: LoadedTask, device: torch.device | str, progress: Progress | None = None, only: Sequence[str] | None = None
+) -> Sensed:
     """Compile what a task's environments feel.
 
     Args:
         loaded: The task's document.
         device: Where the module lives.
         progress: Is told in a line what is being done.
+        only: Kinds of sensors that are taken instead of those that the policy feels and the task looks at.
 
     Raises:
         SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
@@ -63,20 +69,26 @@ def compile_sensed(loaded: LoadedTask, device: torch.device | str, progress: Pro
         what = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
         raise loaded.error(("object",), what)
     kinds = {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
-    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in loaded.task.senses}
+    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
     felt = None
-    if spec.touch != "none":
+    if spec.touch != "none" and only is None:
         kind, observed = SENSED[spec.touch]
         felt = _sensor_of(loaded, kinds, kind, ("touch",))
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
-    kept = list(dict.fromkeys([*by_kind.values(), *([felt] if felt else [])]))
+    contact = by_kind.get("link_contact")
+    if contact:
+        own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
+        wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
+        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
+    kept = {*by_kind.values(), *([felt] if felt else [])}
     touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
     body = document.spec.objects[spec.object].body_of(spec.object)
-    return Sensed(touch, felt, by_kind.get("link_contact"), by_kind.get("surface_distance"), body)
+    channels = next((own.channels for own in touch.outputs if own.name == contact), ())
+    return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body)
 
 
 def _sensor_of(loaded: LoadedTask, kinds: dict[str, str], kind: str, place: tuple[str, ...]) -> str:

@@ -82,8 +82,8 @@ def make_simulation(
     given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
     given |= {"watch": watch, "on_fault": "note"}
     if simulator == "warp":
-        capacities = spec.physics.capacities
-        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **given, **capacities)
+        capacities: dict[str, Any] = dict(spec.physics.capacities)
+        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **(given | capacities))
     return BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
 
 
@@ -112,6 +112,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         actuators = Actuators.of(sim.model, joints)
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
+    num_variants = _num_variants(sensed, loaded.spec.object)
     rows = sensed.touch.rows[sensed.contact]["body"].tolist() if sensed.contact else ()
     return Setup(
         num_envs=sim.num_envs,
@@ -125,14 +126,23 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         links=tuple(rows),
         qpos=sim.qpos[0].clone(),
         half_height=_half_heights(sim, sensed, loaded.spec.object),
+        variant=(torch.arange(sim.num_envs) % num_variants).to(sim.qpos.device),
+        num_variants=num_variants,
+        friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
+        mass=sim.properties.mass(sensed.object).to(sim.qpos).clone(),
         draws=draws,
     )
 
 
+def _num_variants(sensed: Sensed, name: str) -> int:
+    """Return how many variants an object has; environment i has variant i modulo their number."""
+    inputs = sensed.touch.inputs
+    return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
+
+
 def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor, " env"]:
     """Return how far each environment's object reaches below its body's origin as the keyframe has it [m]."""
-    inputs = sensed.touch.inputs
-    num = inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
+    num = _num_variants(sensed, name)
     qpos = sim.qpos[0].double().cpu().numpy()
     each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
     variants = torch.arange(sim.num_envs) % num

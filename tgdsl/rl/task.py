@@ -25,6 +25,7 @@ from torch import Tensor
 
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
@@ -51,7 +52,12 @@ class Setup:
         links: Bodies of the rows of `Now.link_force`.
         qpos: Where episodes start, before anything is random: the keyframe.
         half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
+        variant: Which of its variants each environment's object is, from 0.
+        num_variants: How many there are; 1 if the object has none.
+        friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
+        mass: Mass of each object [kg], likewise.
         draws: Random numbers.
+        grasps: Grasps that episodes begin from; None if the task's document has none.
     """
 
     num_envs: int
@@ -65,7 +71,12 @@ class Setup:
     links: tuple[str, ...]
     qpos: Float[Tensor, " nq"]
     half_height: Float[Tensor, " env"]
+    variant: Int[Tensor, " env"]
+    num_variants: int
+    friction: Float[Tensor, " env"]
+    mass: Float[Tensor, " env"]
     draws: Draws
+    grasps: GraspTable | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +88,13 @@ class Now:
         object: Motion of the object's body: position [m], quaternion w, x, y, z, velocity [m/s], angular velocity [rad/s].
         joint_pos: Positions of the joints that the policy moves [rad].
         joint_vel: Their velocities [rad/s].
+        target: What their drives are to reach, after the last action [rad].
         torque: What their drives exert [N·m].
         action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
         last_action: What it had asked for one control step before.
         link_force: The object's force on each link, in the link's frame [N]; no links if the task takes no `link_contact`.
+        normal_force: Sum of the normal forces of the object's contacts with each link [N]; no links unless the task
+            `wants_normal_force`.
         distance: Distance from each probe to the object's surface, negative inside [m]; no probes if the task takes no
             `surface_distance`.
         friction: Coefficient of sliding friction of the object.
@@ -92,10 +106,12 @@ class Now:
     object: BodyMotion
     joint_pos: Float[Tensor, "env joint"]
     joint_vel: Float[Tensor, "env joint"]
+    target: Float[Tensor, "env joint"]
     torque: Float[Tensor, "env joint"]
     action: Float[Tensor, "env joint"]
     last_action: Float[Tensor, "env joint"]
     link_force: Float[Tensor, "env link 3"]
+    normal_force: Float[Tensor, "env loaded"]
     distance: Float[Tensor, "env probe"]
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
@@ -106,7 +122,8 @@ class Start(NamedTuple):
     """How episodes begin.
 
     Attributes:
-        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing.
+        values: MuJoCo's arrays as for `sim.reset`, (env, …); rows of environments that are not reset mean nothing. With `ctrl`
+            among them drives begin with these targets; else they hold the positions of their joints.
         contacts: As for `sim.reset`: "none" for an object that touches nothing yet, or what was stored with a grasp.
     """
 
@@ -120,6 +137,7 @@ class Task(ABC, Generic[S]):
     Attributes:
         Spec: Model of its document.
         senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels.
+        wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
         score_unit: Unit of its score.
         spec: Its document.
         setup: What it is made for.
@@ -128,6 +146,7 @@ class Task(ABC, Generic[S]):
 
     Spec: ClassVar[type[TaskSpec]]
     senses: ClassVar[tuple[str, ...]] = ("link_contact", "surface_distance")
+    wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]
     spec: S
     setup: Setup
@@ -152,7 +171,8 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            own.copy_(torch.where(broadcast_over(chosen, own), torch.as_tensor(value, dtype=own.dtype, device=own.device), own))
+            new = value.to(own.dtype) if isinstance(value, Tensor) else value
+            own.copy_(torch.where(broadcast_over(chosen, own), new, own))
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:

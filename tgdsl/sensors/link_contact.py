@@ -1,13 +1,20 @@
-"""Link contact: per body, the solver's net contact force and a contact bit.
+"""Link contact: per body, the solver's net contact force, a contact bit, and the sum of the contacts' normal forces.
 
     f_b = Σ_o f_bo,   c_b = 1 if |f_b| > threshold, else 0                                    [N], [1]
+    s_b = Σ_o Σ_c max(0, f_boc · n_boc)                                                       [N]
 
 with f_bo the solver's net contact force of object o on body b [N], over all its contacts (there are no slots), in the frame of
-the body; the threshold in [N]. One row per body that carries the sensor, in the order of the layout. Forces of several objects
-are summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact; to separate
-objects, give each its own sensor. The bit is a step function and has no gradient.
+the body; the threshold in [N]; and, for the normal force s_b alone, f_boc and n_boc the force of each contact c and its unit
+normal out of the object. One row per body that carries the sensor, in the order of the layout. Forces of several objects are
+summed before the threshold: a body squeezed between two objects with equal forces reads zero and no contact, and s_b twice that
+force; to separate objects, give each its own sensor. The bit is a step function and has no gradient.
 
-Source: MuJoCo's contact sensor with the reduction `netforce` (XML reference, sensor/contact).
+The normal force is how hard a body presses, whatever its direction: that of two contacts that oppose one another is their sum,
+and friction is no part of it. It reads contacts one by one, `slots` of each pair of body and object. What others carry is
+shared out over these, see `quantities.contacts`: exact where all normals are the same, as under a flat face.
+
+Source: MuJoCo's contact sensor, with the reduction `netforce` for f_b and contact by contact for s_b (XML reference,
+sensor/contact).
 """
 
 from __future__ import annotations
@@ -17,7 +24,7 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, StrictInt, model_validator
 from torch import Tensor
 
 from tgdsl.fields.models import NonNegative
@@ -43,47 +50,57 @@ from tgdsl.sensors.base import (
 
 
 class LinkContactSpec(ProbeSpec):
-    """Whether each body is in contact, and the force on it."""
+    """Whether each body is in contact, the force on it, and how hard it is pressed."""
 
     kind: Literal["link_contact"]
     """Contact bit [1] and the solver's force [N] of each body."""
-    outputs: Annotated[tuple[Literal["contact", "force"], ...], Field(min_length=1)] = ("contact", "force")
-    """What a reading holds, the bit before the force."""
+    outputs: Annotated[tuple[Literal["contact", "force", "normal_force"], ...], Field(min_length=1)] = ("contact", "force")
+    """What a reading holds: the bit, then the force, then the sum of the contacts' normal forces."""
     threshold: NonNegative = 0.0
     """Force above which a body counts as touched [N]."""
+    slots: Annotated[StrictInt, Field(ge=1)] = 8
+    """Contacts per pair of body and object whose normal forces are summed, for the output `normal_force` alone [1]."""
     needs_taxels: ClassVar[bool] = False
+
+    @model_validator(mode="after")
+    def _is_used(self) -> LinkContactSpec:
+        if "slots" in self.model_fields_set and "normal_force" not in self.outputs:
+            raise ValueError("`slots` is used by the output `normal_force` alone, expected it to be left out")
+        return self
 
 
 def reference(
     spec: LinkContactSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return c [1] and f [N] of the outputs asked for: (body, channel)."""
-    net = gathered[Contacts].net
+    """Return c [1], f [N] and s [N] of the outputs asked for: (body, channel)."""
+    contacts = gathered[Contacts]
+    net, pressed = contacts.net, np.zeros((len(contacts.net), 1))
     is_touched = np.linalg.norm(net, axis=1) > spec.threshold
-    parts = {"contact": is_touched[:, None].astype(np.float64), "force": net}
+    for body, force, normal in zip(contacts.body, contacts.force, contacts.normal, strict=True):
+        pressed[body] += max(0.0, np.dot(force, normal))
+    parts = {"contact": is_touched[:, None].astype(np.float64), "force": net, "normal_force": pressed}
     return np.concatenate([parts[name] for name in parts if name in spec.outputs], axis=1), {}
 
 
 def lower(spec: LinkContactSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
-    """The net force alone is wanted: no slots, and no probe."""
-    channels: list[Channel] = []
-    if "contact" in spec.outputs:
-        channels.append(Channel("contact", "1"))
-    if "force" in spec.outputs:
-        channels += [Channel(f"force_{axis}", "N") for axis in "xyz"]
-    constants = {"threshold": scalar(spec.threshold)}
+    """The net force alone is wanted, without slots, unless normal forces are; and no probe."""
     force = tuple(Channel(f"force_{axis}", "N") for axis in "xyz")
-    requests = (Contacts(spec.objects),)
-    return Lowered(tuple(channels), constants, requests=requests, rows=body_axis(layout), signal=force)
+    parts = {"contact": (Channel("contact", "1"),), "force": force, "normal_force": (Channel("normal_force", "N"),)}
+    channels = tuple(channel for name, own in parts.items() if name in spec.outputs for channel in own)
+    signal, slots = (force + parts["normal_force"], spec.slots) if "normal_force" in spec.outputs else (force, 0)
+    constants = {"threshold": scalar(spec.threshold)}
+    return Lowered(channels, constants, requests=(Contacts(spec.objects, slots=slots),), rows=body_axis(layout), signal=signal)
 
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the force planes [N], by body, which are what noise acts on."""
-    return {f"force_{axis}": plane for axis, plane in zip("xyz", gathered[Contacts].net, strict=True)}, {}
+    """Return the force planes and the normal force [N], by body, which are what noise acts on."""
+    contacts = gathered[Contacts]
+    pressed = planes.dot(contacts.force, contacts.normal).clamp(min=0.0).sum(dim=-1)
+    return {**{f"force_{axis}": plane for axis, plane in zip("xyz", contacts.net, strict=True)}, "normal_force": pressed}, {}
 
 
 def decide(signal: Mapping[str, Tensor], constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
-    """Return the bit [1] and the force planes [N], by body."""
+    """Return the bit [1], the force planes and, if it is there, the normal force [N], by body."""
     force = (signal["force_x"], signal["force_y"], signal["force_z"])
     size = planes.safe_sqrt(planes.dot(force, force))
     bit = torch.where(size.isnan(), size, (size > constants["threshold"]).to(size.dtype))

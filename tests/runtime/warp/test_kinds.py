@@ -18,7 +18,7 @@ KINDS = {
     "touch": {"kind": "kinematic_taxel"},
     "near": {"kind": "proximity", "tolerance": 0.05},
     "force": {"kind": "force_taxel"},
-    "solver": {"kind": "link_contact"},
+    "solver": {"kind": "link_contact", "outputs": ["contact", "force", "normal_force"]},
     "skin": {"kind": "elastomer", "anchors": "points", "points": 200},
     "distance": {"kind": "surface_distance"},
 }

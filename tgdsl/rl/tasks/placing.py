@@ -44,7 +44,7 @@ def placed(
     qpos = setup.qpos.repeat(setup.num_envs, 1)
     xy = draws.uniform("placement", episode, 2, *spec.xy).to(dtype)
     yaw = draws.uniform("yaw", episode, 1, *spec.yaw)[:, 0].to(dtype)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=setup.device).expand(setup.num_envs, 3)
+    up = torch.eye(3, dtype=dtype, device=setup.device)[2].expand(setup.num_envs, 3)
     rise = setup.half_height - setup.half_height[:1]
     pos = qpos[:, own.start : own.start + 3] + torch.cat([xy, rise[:, None]], dim=1)
     quat = rotations.product(rotations.about(up, yaw), qpos[:, own.start + 3 : own.stop])

@@ -12,7 +12,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject, refuse_other_fields
@@ -91,22 +91,26 @@ class OwnFields(ObjectProperties):
             for env in np.flatnonzero((now != value.numpy()).reshape(len(now), -1).any(axis=1)).tolist():
                 self._row(name, env)[...] = value[env].numpy()
                 changed.add(env)
-        self._is_derived |= "body_mass" in fields
-        if self._own is not None and changed:
-            for env in changed:
-                mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))
+        if "body_mass" in fields:
+            self._derive(np.array(sorted(changed), dtype=np.int64))
+        elif self._own is not None:
             self._batch.set_models(self._own)
 
     def _set_mass(self, target: RigidObject, mask: Bool[Tensor, " env"], mass: Float[Tensor, " env"]) -> None:
         ids = np.flatnonzero(mask.numpy())
         for env, wanted in zip(ids.tolist(), mass.numpy()[ids], strict=True):
-            own, inertia = self._row("body_mass", env), self._row("body_inertia", env)
-            factor = wanted / own[target.bodies].sum()
-            own[target.bodies] *= factor
-            inertia[target.bodies] *= factor
+            model, own = self._chosen[env], target.bodies  # not of what it has now: rounding would add up
+            factor = wanted / model.body_mass[own].sum()
+            self._row("body_mass", env)[own] = factor * model.body_mass[own]
+            self._row("body_inertia", env)[own] = factor * model.body_inertia[own]
+        self._derive(ids)
+
+    def _derive(self, ids: Int[Array, " n"]) -> None:
+        """Have what follows from masses follow in some environments."""
+        self._is_derived = True
         if self._own is None:
-            self._batch.set_const(ids)
-            self._is_derived = True
+            if len(ids):
+                self._batch.set_const(ids)
             return
         for env in ids:
             mujoco.mj_setConst(self._own[env], mujoco.MjData(self._own[env]))

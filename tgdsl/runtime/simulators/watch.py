@@ -120,15 +120,17 @@ class WatchReader:
         bodies = tuple(dict.fromkeys((*watch.bodies, *of_sites)))
         self.inputs = _inputs(watch, bodies)
         """What a simulator has to read for it."""
-        self._carriers = [bodies.index(name) for name in of_sites]
+        carriers = [bodies.index(name) for name in of_sites]
+        self._carriers = torch.tensor(carriers, dtype=torch.int64, device=device)
         self._site_pos = torch.from_numpy(model.site_pos[sites]).to(device)
         self._site_quat = torch.from_numpy(model.site_quat[sites]).to(device)
-        self._pairs = [_pair(inputs, pair) for pair in watch.pairs]
+        pairs = [_pair(inputs, pair) for pair in watch.pairs]
+        self._pairs = torch.tensor(pairs, dtype=torch.int64, device=device)
 
     @property
     def has_pairs(self) -> bool:
         """Whether forces of pairs are watched."""
-        return bool(self._pairs)
+        return bool(len(self._pairs))
 
     def watched(self, values: SceneState, state: SceneState | None) -> Watched:
         """Return what was looked at.
@@ -142,7 +144,7 @@ class WatchReader:
         num, carried = len(self._watch.bodies), quat[:, self._carriers]
         site_pos, site_quat = (own.to(pos.dtype).expand(len(pos), -1, -1) for own in (self._site_pos, self._site_quat))
         force = pos.new_zeros((len(pos), 0, 3))
-        if self._pairs:
+        if self.has_pairs:
             assert state is not None and state.contact_netforce is not None
             force = state.contact_netforce[:, self._pairs]
         return Watched(

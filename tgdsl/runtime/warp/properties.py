@@ -20,6 +20,7 @@ from tgdsl.runtime.simulators.objects.properties import (
     RigidObject,
     refuse_other_fields,
 )
+from tgdsl.tensors.env_ids import broadcast_over
 
 
 class WorldProperties(ObjectProperties):
@@ -45,6 +46,13 @@ class WorldProperties(ObjectProperties):
         super().__init__(model, bodies_of, num_envs, device)
         self._fields = parameters
         self._indices: dict[tuple[str, str], Tensor] = {}
+        self._plain: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
+
+    def renew(self) -> None:
+        """Take what objects now are like as what masses are changed from: after others were chosen."""
+        for parts in self._plain.values():
+            for array, columns, value in parts:
+                value.copy_(array[:, columns])
 
     def fields(self) -> dict[str, Tensor]:
         """Return what environments have of their own: see `ObjectProperties.fields`."""
@@ -63,13 +71,17 @@ class WorldProperties(ObjectProperties):
             raise SimulationError(f"{what}: what follows of its mass is not a matter of scale; simulate on the CPU")
         own, inertia, subtree, body, dof = (self._fields[name] for name in MASS_FIELDS)
         bodies, above, dofs = (self._index(target, name, own.device) for name in ("bodies", "above", "dofs"))
+        parts = [(own, bodies), (inertia, bodies), (subtree, bodies), (body, bodies), (dof, dofs)]
+        if target.name not in self._plain:  # what masses are changed from each time: rounding would add up
+            self._plain[target.name] = [(array, columns, array[:, columns].clone()) for array, columns in parts]
+        plain = [value for _, _, value in self._plain[target.name]]
         before = own[:, bodies].sum(dim=1)
-        factor = torch.where(mask, mass.to(own.dtype) / before, 1.0)[:, None]
-        for array, columns, scale in ((own, bodies, factor), (subtree, bodies, factor), (dof, dofs, 1.0 / factor)):
-            array[:, columns] = array[:, columns] * scale
-        for array, scale in ((inertia, factor), (body, 1.0 / factor)):
-            array[:, bodies] = array[:, bodies] * scale[:, :, None]
-        subtree[:, above] = subtree[:, above] + before[:, None] * (factor - 1.0)
+        factor = mass.to(own.dtype) / plain[0].sum(dim=1)
+        scales = (factor, factor, factor, 1.0 / factor, 1.0 / factor)
+        for (array, columns), value, scale in zip(parts, plain, scales, strict=True):
+            new = value * scale.view(-1, *[1] * (value.ndim - 1))
+            array[:, columns] = torch.where(broadcast_over(mask, new), new, array[:, columns])
+        subtree[:, above] = subtree[:, above] + (own[:, bodies].sum(dim=1) - before)[:, None]
 
     def _set_friction(self, target: RigidObject, mask: Bool[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
         self._check("friction")

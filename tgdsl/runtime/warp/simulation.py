@@ -60,6 +60,7 @@ class WarpSimulation(Simulation):
         warp_data: MuJoCo Warp's data.
     """
 
+    properties: WorldProperties
     _objects: WorldObjects | None = None
 
     def __init__(
@@ -290,6 +291,7 @@ class WarpSimulation(Simulation):
     def _use_objects(self) -> None:
         assert self._objects is not None
         self._objects.write_to(self._worlds)
+        self.properties.renew()
 
     def _begin_episodes(self, env_ids: EnvIds | None, rows: Rows, *, finds_contacts: bool = True) -> None:
         mask = env_mask(env_ids, self.num_envs, self._stream.device)

@@ -1,0 +1,340 @@
+"""A whole step: order, instants, episodes, random numbers, what is told of them."""
+
+import math
+
+import jaxtyping
+import pytest
+import torch
+from tiny_tasks import RADIUS, taxel_world, tiny_env
+
+from tgdsl.errors import SimulationError
+
+STEPS = 12
+RANDOM = """randomise:
+  friction: [0.5, 1.5]
+  mass: [0, 100 g]
+  xy: [-5 mm, 5 mm]
+  yaw: [-0.3, 0.3]
+  drive: {gain: [0.9, 1.1], bias: [-0.01, 0.01], backlash: [0, 0.01], torque_noise: 0.1, delay: [0, 2]}
+  push: {x: [-0.2 N, 0.2 N], interval: [0.05 s, 0.2 s]}
+"""
+NOISY = "noise: noisy\ntouch: depth\n"
+
+
+def actions(env, num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def same(one, other, rows=slice(None)):
+    """Whether two groups of observations are the same to the last bit."""
+    return one.keys() == other.keys() and all(torch.equal(one[name][rows], other[name][rows]) for name in one)
+
+
+@pytest.fixture
+def make(tmp_path):
+    made = []
+
+    def env(*args, **options):
+        folder = tmp_path / str(len(made))
+        folder.mkdir()
+        made.append(tiny_env(folder, *args, **options))
+        return made[-1]
+
+    yield env
+    for one in made:
+        one.close()
+
+
+def test_groups_have_the_papers_contents(make):
+    env = make()
+    touched = 6 * 4
+    assert env.groups == {
+        "proprio": 3 * 2,
+        "tactile_sensors": touched,
+        "priv_proprio": 3 * 2 + 2 * 3,
+        "goal": 7,
+        "priv_obj_state": 3 + 6 + 3 + 3,
+        "priv_obj_props": 2 + 4,
+    }
+    obs = env.reset()
+    now_pos, now_vel = env.sim.qpos, env.sim.qvel
+    torch.testing.assert_close(obs["proprio"][:, :2], now_pos[:, :2].float())
+    torch.testing.assert_close(obs["proprio"][:, 2:4], now_vel[:, :2].float())
+    assert not obs["proprio"][:, 4:].any()
+    ball = obs["priv_obj_state"]
+    torch.testing.assert_close(ball[:, :3], now_pos[:, 3:6].float())
+    assert ball[:, 3:9].tolist() == [[1, 0, 0, 0, 1, 0]] * 4 and not ball[:, 9:].any()
+    torch.testing.assert_close(obs["priv_obj_props"][:, :2], torch.tensor([[0.8, 0.1]] * 4))
+    for column, (body, x) in enumerate((("left", 0.005), ("left", 0.005), ("right", -0.005), ("right", -0.005))):
+        lift = 0.01 if column % 2 else 0.0
+        point = taxel_world(env, body, (x, lift, lift), env.sim.qpos[0].numpy())
+        expected = float((point - env.sim.qpos[0, 3:6]).norm()) - RADIUS
+        assert obs["priv_obj_props"][0, 2 + column].item() == pytest.approx(expected, abs=1e-6)
+    action = actions(env, 1)[0]
+    made = env.step(action)
+    torch.testing.assert_close(made.obs["proprio"][:, 4:], action)
+    assert torch.equal(made.obs["priv_proprio"][:, :6], made.obs["proprio"])
+
+
+@pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
+def test_every_group_is_of_the_instant_of_its_call(make, simulator):
+    """A ball that moves as a known function of time, put elsewhere by each reset: of now, not of the step before."""
+    env = make(3, task="tiny_tasks:Coasting", gravity="0 0 0", more="episode: 0.1 s\ndrop_distance: 1\n", simulator=simulator)
+    assert env.max_steps == 4 and env.control_step == 0.025
+    env.reset()
+    env.steps[1] = 2  # the others' episodes end two steps later
+    age, episode = torch.zeros(3), torch.tensor([2.0, 2.0, 2.0])
+    speed = env.task.speed().cpu().float()
+    for action in actions(env, 11):
+        made = env.step(action)
+        age += 1
+        where = made.info.final_obs["priv_obj_state"].cpu()
+        # State is handed out of the start of the last physics step.
+        passed = 0.025 * age - 0.005
+        torch.testing.assert_close(where[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
+        torch.testing.assert_close(where[:, 1], speed * passed, rtol=0, atol=1e-6)
+        torch.testing.assert_close(where[:, 10], speed, rtol=0, atol=1e-6)
+        ended = made.truncated.cpu()
+        episode, age = episode + ended, torch.where(ended, 0.0, age)
+        ball = made.obs["priv_obj_state"].cpu()
+        passed = torch.where(ended, 0.0, passed)
+        torch.testing.assert_close(ball[:, 1], speed * passed, rtol=0, atol=1e-6)
+        torch.testing.assert_close(ball[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
+        for env_id in range(3):
+            qpos = env.sim.model.qpos0.copy()
+            qpos[:2] = made.obs["proprio"][env_id, :2].double().cpu()
+            point = taxel_world(env, "left", (0.005, 0.0, 0.0), qpos)
+            expected = (point.float() - ball[env_id, :3]).norm() - RADIUS
+            assert made.obs["priv_obj_props"][env_id, 2].item() == pytest.approx(float(expected), abs=2e-6)
+        assert not made.terminated.any()
+    assert episode.tolist() == [4, 5, 4]
+
+
+def test_episodes_of_known_length_are_truncated(make):
+    env = make(3, more="episode: 0.1 s\n")
+    env.reset()
+    env.steps[2] = 3
+    lengths = []
+    for action in actions(env, 8):
+        made = env.step(action)
+        assert torch.equal(made.info.ended, made.truncated | made.terminated)
+        lengths.append(made.truncated.tolist())
+        assert torch.equal(made.info.episode_steps == 4, made.truncated)
+    assert [row[0] for row in lengths] == [False, False, False, True] * 2
+    assert [row[2] for row in lengths] == [True, False, False, False] * 2
+
+
+def test_what_is_lost_terminates_and_is_not_truncated(make):
+    env = make(3)
+    env.reset()
+    env.steps[:] = torch.tensor([0, env.max_steps - 1, env.max_steps - 1])
+    env.sim.qpos[:2, 4] += 0.3
+    made = env.step(torch.zeros(3, 2))
+    assert made.terminated.tolist() == [True, True, False]
+    assert made.truncated.tolist() == [False, False, True]
+    assert (made.info.terms["drop"] < 0).tolist() == [True, True, False]
+    assert env.steps.tolist() == [0, 0, 0]
+
+
+def test_terms_sum_to_the_reward_and_to_the_episode(make):
+    env = make(3, more="episode: 0.1 s\n" + RANDOM)
+    env.reset()
+    total = torch.zeros(3)
+    for i, action in enumerate(actions(env, 4)):
+        made = env.step(action)
+        torch.testing.assert_close(sum(made.info.terms.values()), made.reward)
+        total += made.reward
+        assert made.info.episode_steps.tolist() == [i + 1] * 3
+    torch.testing.assert_close(made.info.episode_return, total)
+    torch.testing.assert_close(sum(made.info.episode_terms.values()), total)
+    following = env.step(actions(env, 1)[0])
+    torch.testing.assert_close(following.info.episode_return, following.reward)
+
+
+def test_the_last_observations_are_handed_out(make):
+    env = make(3, more="episode: 0.1 s\n")
+    other = make(3)
+    env.reset(), other.reset()
+    for action in actions(env, 4):
+        made, longer = env.step(action), other.step(action)
+    assert made.truncated.all() and not longer.truncated.any()
+    assert same(made.info.final_obs, longer.obs)
+    assert not torch.equal(made.obs["proprio"], longer.obs["proprio"])
+    assert same(longer.info.final_obs, longer.obs)
+
+
+@pytest.mark.parametrize("more", [RANDOM, NOISY, NOISY + RANDOM])
+def test_an_environments_reset_moves_nobody_else(make, more):
+    """Neither noise and history nor what is drawn: the others are as they were to the last bit."""
+    one, other = make(more=more), make(more=more)
+    assert same(one.reset(3), other.reset(3))
+    others = [0, 2, 3]
+    for i, action in enumerate(actions(one, STEPS)):
+        if i in (2, 3, 7):
+            other.steps[1] = other.max_steps - 1
+        made, found = one.step(action), other.step(action)
+        assert found.truncated.tolist() == [False, i in (2, 3, 7), False, False]
+        assert same(made.obs, found.obs, others) and torch.equal(made.reward[others], found.reward[others])
+
+
+def test_noise_advances_once_per_control_step(make):
+    """And once more for the first reading of an episode, of those environments alone."""
+    env = make(more=NOISY)
+    env.reset(1)
+    clock = env.touch.memory.clock
+    resets = torch.zeros(4, dtype=torch.int64)
+    for i, action in enumerate(actions(env, STEPS)):
+        if i % 3 == 0:
+            env.steps[i % 4] = env.max_steps - 1
+        resets += env.step(action).info.ended
+        assert torch.equal(clock.get_buffer("step"), 2 + i + resets)
+    assert resets.sum() == 4
+
+
+def test_the_same_seed_gives_the_same_bytes(make):
+    more = NOISY + RANDOM + "episode: 0.2 s\n"
+    envs = [make(5, more=more, seed=4), make(5, more=more, seed=4, threads=2), make(5, more=more, seed=5)]
+    for env in envs[:2]:
+        torch.set_num_threads(2 if env is envs[1] else 1)
+        env.found = [env._obs, *(env.step(action).obs for action in actions(env, STEPS))]
+    torch.set_num_threads(1)
+    assert all(same(a, b) for a, b in zip(envs[0].found, envs[1].found, strict=True))
+    assert not same(envs[2]._obs, envs[0].found[0])
+    again = [envs[2].reset(4), *(envs[2].step(action).obs for action in actions(envs[2], STEPS))]
+    assert all(same(a, b) for a, b in zip(envs[0].found, again, strict=True))
+
+
+@pytest.mark.slow
+def test_compiled_equals_eager(make, monkeypatch):
+    """Drives with a delay, noise, pushes, resets: all that is compiled besides the module."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    more = NOISY + RANDOM + "episode: 0.2 s\n"
+    eager, compiled = make(more=more, seed=1), make(more=more, seed=1, compiled=True)
+    for i, action in enumerate(actions(eager, STEPS)):
+        for env in (eager, compiled):
+            env.steps[i % 4] += 1
+        found, expected = compiled.step(action), eager.step(action)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(compiled.actuation.memory(), eager.actuation.memory(), rtol=1e-6, atol=1e-9)
+
+
+def test_as_many_environments_in_two_processes(make):
+    """Random numbers are counted by the environments of all processes."""
+    more = NOISY + RANDOM
+    whole = make(6, more=more, seed=2)
+    halves = [make(3, more=more, seed=2, first_env=first) for first in (0, 3)]
+    for action in [None, *actions(whole, 5)]:
+        parts = [
+            half._obs if action is None else half.step(action[rows]).obs
+            for half, rows in zip(halves, (slice(3), slice(3, 6)), strict=True)
+        ]
+        obs = whole._obs if action is None else whole.step(action).obs
+        for name, value in obs.items():
+            torch.testing.assert_close(torch.cat([part[name] for part in parts]), value, rtol=1e-5, atol=1e-6)
+
+
+def test_stop_and_go_on_is_bit_for_bit(make):
+    more = NOISY + RANDOM + "episode: 0.2 s\n"
+    env, other = make(more=more, seed=1), make(more=more, seed=9)
+    for action in actions(env, 5):
+        env.step(action)
+    saved = env.state_dict()
+    expected = [env.step(action) for action in actions(env, STEPS, 1)]
+    for _ in range(3):
+        other.step(torch.ones(4, 2))
+    assert same(other.load_state_dict(saved), saved["obs"])
+    for action, before in zip(actions(env, STEPS, 1), expected, strict=True):
+        made = other.step(action)
+        assert same(made.obs, before.obs) and torch.equal(made.reward, before.reward)
+        assert torch.equal(made.info.episode_return, before.info.episode_return)
+    with pytest.raises(SimulationError, match="of other environments"):
+        make(5, more=more).load_state_dict(saved)
+
+
+def test_what_is_drawn_is_what_physics_has(make):
+    env = make(8, more=RANDOM)
+    env.reset(0)
+    props = env.reset()["priv_obj_props"]
+    torch.testing.assert_close(env.sim.properties.friction("ball").float(), props[:, 0])
+    torch.testing.assert_close(env.sim.properties.mass("ball").float(), props[:, 1])
+    assert (props[:, 0] >= 0.4).all() and (props[:, 0] <= 1.2).all() and props[:, 0].std() > 0.05
+    assert (props[:, 1] >= 0.1).all() and (props[:, 1] <= 0.2).all() and props[:, 1].std() > 0.01
+    qpos = env.sim.qpos
+    assert (qpos[:, 3:5].abs() <= 0.005).all() and qpos[:, 3:5].std() > 1e-3
+    yaw = 2 * torch.atan2(qpos[:, 9], qpos[:, 6])
+    assert (yaw.abs() <= 0.3).all() and yaw.std() > 0.05
+    assert env.actuation.drawn["gain"].std() > 0.01
+
+
+def test_held_joints_stay_and_actions_move_targets(make):
+    env = make(2)
+    env.reset()
+    for _ in range(3):
+        env.step(torch.tensor([[1.0, -1.0], [0.0, 5.0]]))
+    torch.testing.assert_close(env.sim.ctrl[:, 2], torch.tensor([0.2, 0.2], dtype=torch.float64))
+    expected = torch.tensor([[0.1 + 0.15, -0.1 - 0.15], [0.1, -0.1 + 0.15]], dtype=torch.float64)
+    torch.testing.assert_close(env.actuation.target, expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(env.sim.ctrl[:, :2], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("more", ["", RANDOM])
+def test_an_action_that_is_no_number_ends_one_episode(make, more):
+    env, other = make(more=more), make(more=more)
+    env.reset(1), other.reset(1)
+    for i, action in enumerate(actions(env, 6)):
+        given = action.clone()
+        if i == 3:
+            given[2, 0] = math.nan
+            with pytest.warns(UserWarning, match="environments had faults: 1 had controls that are not finite"):
+                made = env.step(given)
+        else:
+            made = env.step(given)
+        found = other.step(action)
+        assert made.info.faults.tolist() == [False, False, i == 3, False] == made.terminated.tolist()
+        assert same(made.obs, found.obs, [0, 1, 3])
+        assert all(value.isfinite().all() for value in (*made.obs.values(), *made.info.final_obs.values(), made.reward))
+        if i == 3:
+            assert made.reward[2] == 0.0 and env.steps[2] == 0
+    assert env.sim.fault_counts.tolist() == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
+def test_an_environment_that_diverges_begins_anew(make, simulator):
+    env = make(3, simulator=simulator)
+    env.reset(1)
+    env.sim.qvel[1, 5] = 1e12
+    with pytest.warns(UserWarning, match="environments had faults: 1 diverged"):
+        made = env.step(torch.zeros(3, 2))
+    assert made.info.faults.tolist() == [False, True, False] == made.terminated.tolist()
+    assert made.reward[1] == 0.0 and all(value.isfinite().all() for value in made.obs.values())
+    for _ in range(3):
+        made = env.step(torch.zeros(3, 2))
+        assert not made.info.faults.any() and all(value.isfinite().all() for value in made.obs.values())
+
+
+@pytest.mark.parametrize(
+    ("touch", "kind", "size"),
+    [
+        *(("none", None, 0), ("bool", "contact", 4), ("agg_bool", "contact", 2), ("depth", "contact_depth", 4)),
+        *(("agg_force", "contact_depth", 6), ("force", "kinematic_taxel", 12), ("force_torque", "kinematic_taxel", 24)),
+        *(("elastomer", "elastomer", 12), ("proximity", "proximity", 24), ("force_taxel", "force_taxel", 12)),
+    ],
+)
+def test_only_what_is_chosen_is_computed(make, touch, kind, size):
+    env = make(2, more=f"touch: {touch}\n")
+    kinds = {sensor.kind for sensor in env.touch.plan.sensors}
+    assert kinds == {"link_contact", "surface_distance", *([kind] if kind else [])}
+    assert env.groups.get("tactile_sensors", 0) == size
+    env.step(torch.zeros(2, 2))
+
+
+def test_a_placement_is_a_group_of_links(make):
+    env = make(2, more="touch: depth\nplacement: tips\n")
+    assert env.groups["tactile_sensors"] == 2 and set(env.touch.taxels["depth"]["link"]) == {"right"}
+
+
+def test_an_action_of_another_shape_is_refused(make):
+    env = make(2)
+    with pytest.raises(SimulationError, match=r"action has shape \(2, 3\), expected \(2, 2\)"):
+        env.step(torch.zeros(2, 3))

@@ -1,0 +1,179 @@
+"""Documents of tasks: what is wrong is told at its place, with what would be right."""
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+from ruamel.yaml import YAML
+from tiny_tasks import tiny_env, write_task
+
+from tgdsl.errors import SimulationError, SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.schema import task_schema
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+
+REPOSITORY = Path(__file__).parents[2]
+DOCUMENTS = sorted(
+    path for path in (REPOSITORY / "examples" / "tasks").glob("*.yaml") if "task:" in path.read_text(encoding="utf-8")
+)
+
+
+def problems(call):
+    """Return the mistakes that a call is refused with."""
+    with pytest.raises(SpecError) as caught:
+        call()
+    return caught.value.problems
+
+
+@pytest.mark.parametrize(
+    ("more", "line", "path", "says"),
+    [
+        ("rewards: {spinn: 2}\n", 8, "rewards.spinn", "spin"),
+        ("randomise: {friction: [1.5, 0.5]}\n", 8, "randomise.friction", "not ordered"),
+        ("randomise: {friction: [-1, 2]}\n", 8, "randomise.friction", "expected more than 0"),
+        ("randomise: {drive: {backlash: [-0.1, 0.2]}}\n", 8, "randomise.drive.backlash", "at least 0"),
+        ("randomise:\n  push:\n    x: 3 mm\n", 10, "randomise.push.x", "unit of force"),
+        ("touch: forse\n", 8, "touch", "force"),
+        ("episode: -1 s\n", 7, "episode", "more than 0"),
+        ("physics: {cone: round}\n", 8, "physics.cone", "elliptic"),
+        ("physics: {substeps: 0}\n", 8, "physics.substeps", "1"),
+        ("action: {scale: 3 mm}\n", 8, "action.scale", "unit of angle"),
+        ("color: red\n", 8, "color", "unknown key"),
+    ],
+)
+def test_what_is_wrong_is_told_at_its_place(tmp_path, more, line, path, says):
+    task = write_task(tmp_path, more=more)
+    (found,) = problems(lambda: load_task(task))
+    assert (found.file, found.line, found.path) == (str(task), line, path)
+    assert says in f"{found.what} {found.hint}"
+
+
+def test_all_mistakes_are_told_at_once(tmp_path):
+    task = write_task(tmp_path, more="rewards: {spinn: 2}\nepisode: x\n")
+    assert {found.path for found in problems(lambda: load_task(task))} == {"rewards.spinn", "episode"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "path", "says"),
+    [
+        ("joints: [left, right]", "joints: [left, wright]", 5, "joints[1]", 'no actuated joint is called "wright"'),
+        ("joints: [left, right]", 'joints: ["thumb*"]', 5, "joints[0]", 'no actuated joint matches "thumb*"'),
+        ("object: ball", "object: cube", 4, "object", 'has no object "cube", only ball'),
+        ("keyframe: home", "keyframe: hom", 6, "keyframe", 'the scene has no keyframe "hom"'),
+        ("sensors.yaml", "sensor.yaml", 3, "document", 'there is no file "sensor.yaml"'),
+        ("in_palm_rotate", "in_palm_rotat", 2, "task", 'there is no task "in_palm_rotat"'),
+        ("in_palm_rotate", "nowhere.py:Task", 2, "task", "there is no file"),
+        ("in_palm_rotate", "pathlib:Path", 2, "task", "no subclass of tgdsl.rl.task.Task"),
+        ("in_palm_rotate", "pathlib:Paths", 2, "task", "AttributeError"),
+    ],
+)
+def test_what_does_not_fit_the_scene_is_told_at_its_place(tmp_path, old, new, line, path, says):
+    task = write_task(tmp_path)
+    task.write_text(task.read_text().replace(old, new))
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert (found.file, found.line, found.path) == (str(task), line, path)
+    assert says in found.what
+
+
+def test_a_sensor_that_the_document_lacks_is_named(tmp_path):
+    task = write_task(tmp_path, more="touch: proximity\n")
+    sensors = tmp_path / "sensors.yaml"
+    whole = sensors.read_text()
+    sensors.write_text("\n".join(line for line in whole.splitlines() if "kind: proximity" not in line))
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert found.path == "touch" and found.line == 8
+    assert found.what == '"sensors.yaml" has no sensor of kind "proximity", expected one'
+    sensors.write_text(whole + "  nearer: {kind: proximity, links: hand, feels: [ball]}\n")
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert found.what == '"sensors.yaml" has the sensors near, nearer of kind "proximity", expected one'
+    sensors.write_text("\n".join(line for line in whole.splitlines() if "link_contact" not in line))
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert found.path == "task" and '"link_contact"' in found.what
+
+
+def test_a_group_of_links_that_the_layout_lacks_is_named(tmp_path):
+    task = write_task(tmp_path, more="placement: finger\n")
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert found.path == "sensors.touch.links" and '"finger"' in found.what
+
+
+def test_a_document_without_a_task_names_those_there_are(tmp_path):
+    (tmp_path / "task.yaml").write_text("tgdsl: 1\n")
+    (found,) = problems(lambda: load_task(tmp_path / "task.yaml"))
+    assert "in_palm_rotate" in found.what
+
+
+def test_values_are_set_by_dotted_path(tmp_path):
+    task = write_task(tmp_path)
+    spec = load_task(task, {"rewards.spin": 3, "randomise.friction": "[0.5, 2]", "episode": "2 s"}).spec
+    assert (spec.rewards.spin, spec.randomise.friction, spec.episode) == (3.0, (0.5, 2.0), 2.0)
+    (found,) = problems(lambda: load_task(task, {"rewards.spinn": 3}))
+    assert found.file == "--set rewards.spinn=3"
+
+
+def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
+    task = write_task(tmp_path, task="own.py:Own", more="extra: 4\n")
+    (tmp_path / "own.py").write_text(
+        "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate, InPalmRotateSpec\n"
+        "class OwnSpec(InPalmRotateSpec):\n"
+        "    extra: int = 1\n"
+        "    '''Something.'''\n"
+        "class Own(InPalmRotate):\n"
+        "    Spec = OwnSpec\n"
+    )
+    env = TouchEnv(task, 2, threads=1)
+    assert isinstance(env.task, InPalmRotate) and env.spec.extra == 4
+    task.write_text(task.read_text().replace("extra: 4", "extra: x"))
+    (found,) = problems(lambda: load_task(task))
+    assert found.path == "extra" and found.line == 8
+
+
+def test_a_mapping_is_a_document_too(tmp_path, monkeypatch):
+    task = write_task(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert TouchEnv(YAML(typ="safe").load(task), 2, threads=1).num_actions == 2
+
+
+def test_joints_that_cannot_be_moved_to_targets_are_refused(tmp_path):
+    task = write_task(tmp_path)
+    robot = tmp_path / "tiny.xml"
+    robot.write_text(
+        robot.read_text().replace('<position name="left" joint="left" kp="1" kv="0.05"', '<motor name="left" joint="left"')
+    )
+    (found,) = problems(lambda: TouchEnv(task, 2))
+    assert found.path == "joints" and "is no position servo" in found.what
+
+
+def test_an_object_that_is_fixed_cannot_be_placed(tmp_path):
+    task = write_task(tmp_path)
+    scene = tmp_path / "scene.xml"
+    text = scene.read_text().replace('<freejoint name="ball"/>', '<joint name="ball" type="hinge"/>')
+    scene.write_text(text.replace("  0 0 0.03 1 0 0 0", " 0"))
+    with pytest.raises(SimulationError, match='the object\'s body "ball" has no free joint'):
+        TouchEnv(task, 2)
+
+
+def test_an_unknown_simulator_is_refused(tmp_path):
+    with pytest.raises(SimulationError, match='simulator is "wrap"; did you mean "warp"'):
+        tiny_env(tmp_path, simulator="wrap")
+
+
+def test_the_schema_in_the_repository_is_the_one_of_the_code():
+    kept = (REPOSITORY / "tgdsl.task.schema.json").read_text(encoding="utf-8")
+    assert kept == json.dumps(task_schema(), indent=2, ensure_ascii=False) + "\n", "run `tgdsl schema --tasks`"
+    jsonschema.Draft202012Validator.check_schema(task_schema())
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.stem)
+def test_documents_in_the_repository_are_good(path):
+    assert load_task(path).spec.tgdsl == 1
+    jsonschema.validate(YAML(typ="safe").load(path), task_schema())
+
+
+@pytest.mark.parametrize("more", ["rewards: {spinn: 2}", "touch: forse", "action: {scale: 3 mm}", "color: red", "task: rotate"])
+def test_editors_see_mistakes(tmp_path, more):
+    document = YAML(typ="safe").load(write_task(tmp_path)) | YAML(typ="safe").load(more)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document, task_schema())
