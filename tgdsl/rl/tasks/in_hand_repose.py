@@ -46,7 +46,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -119,7 +119,7 @@ class InHandReposeSpec(TaskSpec):
     """f_max: less force on a link costs nothing [N]."""
 
     @model_validator(mode="after")
-    def _within_reach(self) -> Self:
+    def _within_reach(self) -> InHandReposeSpec:
         control_step = self.physics.timestep * self.physics.substeps
         if not self.goal_tolerance < self.goal_step <= math.pi:
             expected = f"more than goal_tolerance, {self.goal_tolerance:g} rad, and at most a half turn"
