@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.console.progress import Progress
-from tgdsl.errors import SimulationError
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
@@ -32,6 +32,8 @@ from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_
 from tgdsl.rl.task import Now
 from tgdsl.tensors.fused import FusedCall
 
+PREPARING_STEPS = 3
+"""The third step is captured on a GPU, and the second one compiled."""
 Observations = dict[str, Float[Tensor, "env feature"]]
 
 
@@ -138,7 +140,10 @@ class TouchEnv:
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
-        self.task = loaded.task(self.spec, setup)
+        try:
+            self.task = loaded.task(self.spec, setup)
+        except LowerError as error:
+            raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
         random = self.spec.randomise
         arrays = self.sim.arrays
@@ -150,10 +155,12 @@ class TouchEnv:
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
-        parts = (self._command, self._judge, self._observe)
-        self._commanded, self._judged, self._observed = (FusedCall(part, is_compiled) for part in parts)
+        self._commanded = FusedCall(self._command, is_compiled)
+        self._judged = FusedCall(self._judge, is_compiled)
+        self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
+        self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
 
@@ -186,6 +193,11 @@ class TouchEnv:
     def steps(self) -> Int[Tensor, " env"]:
         """Control steps of each environment's present episode: a live tensor."""
         return self._episodes.steps
+
+    @property
+    def now(self) -> Now:
+        """The instant that the last observations are of; its tensors hold until the next step."""
+        return self._instant
 
     def reset(self, seed: int | None = None) -> Observations:
         """Begin a new episode in all environments.
@@ -270,6 +282,16 @@ class TouchEnv:
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
 
+    def _prepare(self, tell: Progress, is_compiled: bool) -> None:
+        """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
+        is_cuda = self.sim.qpos.is_cuda
+        if not (is_cuda or is_compiled):
+            return
+        tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+        self.reset()
+        for _ in range(PREPARING_STEPS):
+            self.step(torch.zeros_like(self._action))
+
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""
         self._episodes.begin(chosen)
@@ -325,7 +347,7 @@ class TouchEnv:
         forces = {f"force_{axis}": none for axis in "xyz"}
         if contact:
             forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
-        return Now(
+        self._instant = Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
@@ -341,6 +363,7 @@ class TouchEnv:
             mass=self._episodes.mass,
             readings=readings,
         )
+        return self._instant
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""

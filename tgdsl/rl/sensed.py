@@ -84,7 +84,7 @@ def compile_sensed(
         own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
         wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
-    kept = list(dict.fromkeys([*by_kind.values(), *([felt] if felt else [])]))
+    kept = {*by_kind.values(), *([felt] if felt else [])}
     touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
     body = document.spec.objects[spec.object].body_of(spec.object)
     channels = next((own.channels for own in touch.outputs if own.name == contact), ())

@@ -11,7 +11,7 @@ from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.pushes import PushSpec
 
 TouchType = Literal[
-    *("none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel")
+    "none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel"
 ]
 """What a policy feels, by one word: none, the paper's eight types, and forces that match the load."""
 SENSED: dict[str, tuple[str, str]] = {

@@ -82,8 +82,8 @@ def make_simulation(
     given: dict[str, Any] = {"substeps": spec.physics.substeps, "keyframe": spec.keyframe, "options": spec.physics.options}
     given |= {"watch": watch, "on_fault": "note"}
     if simulator == "warp":
-        capacities = spec.physics.capacities
-        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **given, **capacities)
+        capacities: dict[str, Any] = dict(spec.physics.capacities)
+        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **(given | capacities))
     return BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
 
 

@@ -1,0 +1,127 @@
+"""Turning an object on the palm: rewards and ends against the reference, and what pays."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from task_records import Recorder, assert_reference
+from tiny_tasks import tiny_env
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.tasks.in_palm_rotate import Rewards, reference
+
+DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "in_palm_rotate.yaml"
+MORE = "episode: 0.5 s\nmax_force: 0.05 N\nfree_distance: 1 mm\ndrop_distance: 20 mm\naction: {scale: 0.3}\n"
+
+
+def random_actions(env, num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
+    push = "randomise: {xy: [-5 mm, 5 mm], yaw: [-1, 1], push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
+    env = tiny_env(tmp_path, 4, more=MORE + push)
+    recorder = Recorder(env)
+    for i, action in enumerate(random_actions(env, 80)):
+        env.sim.qvel[:2, 8] = 6.0  # spun by hand: nothing else turns a ball
+        recorder.step(action if i < 40 else torch.ones_like(action))
+    assert sum(len(episodes) for episodes in recorder.episodes) >= 12
+    every = {*Rewards.model_fields, "is_over", "score"}
+    assert assert_reference(recorder, reference) == every
+
+
+@pytest.mark.slow
+def test_the_hand_too():
+    env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"episode": "0.5 s", "action.scale": 0.3})
+    recorder = Recorder(env)
+    for action in random_actions(env, 50):
+        recorder.step(action)
+    assert {"spin", "near", "tilt", "action_rate", "work"} <= assert_reference(recorder, reference)
+
+
+def turned(env, rate, steps=8):
+    """Return the mean reward of a ball that a script turns about the vertical, at a rate for each environment [rad/s]."""
+    env.reset()
+    total, rate = torch.zeros(env.num_envs), torch.as_tensor(rate, dtype=torch.float64)
+    for i in range(1, steps + 1):
+        half = 0.5 * rate * env.control_step * i
+        env.sim.qpos[:, 6:10] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
+        env.sim.qvel[:, 3:] = 0
+        total += env.step(torch.zeros(env.num_envs, env.num_actions)).reward
+    return total / steps
+
+
+def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path):
+    env = tiny_env(tmp_path, 5, gravity="0 0 0")
+    wrong, slowly_wrong, rest, slow, right = turned(env, [-2.0, -0.5, 0.0, 0.5, 2.0]).tolist()
+    assert wrong < slowly_wrong < rest < slow < right
+    # Without goals it is the rate alone that pays.
+    dt = env.control_step
+    assert right - rest == pytest.approx(2.0 * 2.0 * dt, rel=0.2) and rest - wrong == pytest.approx(2.0 * 2.0 * dt, rel=0.2)
+
+
+def test_turning_to_and_fro_pays_nothing(tmp_path):
+    """Goals that were reached stay reached, and each way back costs what the way there has paid."""
+    env = tiny_env(tmp_path, 2, gravity="0 0 0", more="rewards: {near: 0, work: 0}\nepisode: 10 s\n")
+    env.reset()
+    total, angle, reached = torch.zeros(2), 0.0, 0
+    path = [*np.linspace(0, 1.7, 30), *np.linspace(1.7, 0, 30), *np.linspace(0, 1.7, 30), *np.linspace(1.7, 0, 30)]
+    for angle in path:
+        half = torch.full((2,), 0.5 * angle, dtype=torch.float64)
+        env.sim.qpos[:, 6:10] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
+        env.sim.qvel[:] = 0
+        made = env.step(torch.zeros(2, 2))
+        total += made.reward
+        reached += int(made.info.terms["success"][0] > 0)
+    assert reached == 1 and made.info.score.tolist() == [1.0, 1.0]
+    assert total[0].item() == pytest.approx(Rewards().success * env.control_step, abs=0.02)
+
+
+def test_goals_are_quarter_turns(tmp_path):
+    env = tiny_env(tmp_path, 1, gravity="0 0 0", more="episode: 10 s\n")
+    obs = env.reset()
+    assert obs["goal"][0].tolist() == pytest.approx([0, 1, 0, -1, 0, 0, math.pi / 2], abs=1e-6)
+    reached = []
+    for i in range(1, 140):
+        angle = torch.tensor(0.05 * i, dtype=torch.float64)
+        env.sim.qpos[0, 6:10] = torch.stack([(0.5 * angle).cos(), 0 * angle, 0 * angle, (0.5 * angle).sin()])
+        env.sim.qvel[:] = 0
+        made = env.step(torch.zeros(1, 2))
+        if made.info.terms["success"][0] > 0:
+            reached.append(0.05 * i)
+        goal = (len(reached) + 1) * math.pi / 2
+        expected = [math.cos(goal), math.sin(goal), 0, -math.sin(goal), math.cos(goal), 0]
+        assert made.obs["goal"][0, :6].tolist() == pytest.approx(expected, abs=1e-5)
+    assert reached == pytest.approx([k * math.pi / 2 - 0.1 for k in (1, 2, 3, 4)], abs=0.051)
+    assert made.info.score.item() == 4.0
+
+
+def test_a_tilted_object_reaches_no_goal(tmp_path):
+    env = tiny_env(tmp_path, 2, gravity="0 0 0", more="episode: 10 s\n")
+    env.reset()
+    for i in range(1, 40):
+        half = torch.tensor([0.5 * 0.05 * i] * 2, dtype=torch.float64)
+        turn = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
+        tilt = torch.tensor([0.0, 0.25], dtype=torch.float64)  # half of 0.5 rad about x
+        w, z = turn[:, 0], turn[:, 3]
+        env.sim.qpos[:, 6:10] = torch.stack([w * tilt.cos(), w * tilt.sin(), z * tilt.sin(), z * tilt.cos()], dim=1)
+        env.sim.qvel[:] = 0
+        made = env.step(torch.zeros(2, 2))
+    assert made.info.score.tolist() == [1.0, 0.0]
+    assert env.task.tilt.tolist() == pytest.approx([0.0, 0.5], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", list(Rewards.model_fields))
+def test_a_weight_scales_its_term_alone(tmp_path, name):
+    one, two = (tmp_path / "one"), (tmp_path / "two")
+    one.mkdir(), two.mkdir()
+    more = MORE + "randomise: {push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
+    plain = tiny_env(one, 3, more=more)
+    other = tiny_env(two, 3, more=more, overrides={f"rewards.{name}": 2 * getattr(Rewards(), name)})
+    for action in random_actions(plain, 15):
+        a, b = plain.step(action).info.terms, other.step(action).info.terms
+        for term, value in a.items():
+            torch.testing.assert_close(b[term], value * (2 if term == name else 1))

@@ -1,0 +1,275 @@
+"""Hold an object in the air between fingertips, and press on it as hard as commanded, whatever it weighs.
+
+An episode begins with the object held: gravity pulls it out along the fingertips' surfaces. The command F* is a sum of normal
+forces, and changes at random times. With s_l the sum of the normal forces of the object's contacts with link l, p and q the
+object's position and orientation, p_0 and q_0 those at the start,
+
+    F   = Σ_l s_l,   e = F / F* − 1                             sum of normal forces [N], its relative error [1]
+    F*  = F_min + u (F_max − F_min),   u ∈ U(0, 1)              command [N], drawn at the start and every 2 to 4 s
+    F_min = max(F_low, κ m g / μ)                               least force that is commanded [N]
+    θ   = angle(q q_0⁻¹)                                        by how much the object has turned [rad]
+
+The start is the keyframe of the object's variant, held with F_0, and its drives' targets w for the first command
+
+    w   = q_j + F*/F_0 (w_0 − q_j)                              q_j joint positions, w_0 the keyframe's controls [rad]
+
+Groups: `goal` holds F* [N]; `priv_force` F and s_l of each link [N]; `priv_obj_state` and `priv_obj_props` as in `groups`.
+
+The reward is the sum of these terms times Δt. The error is that to the command which was known before the step.
+
+    force_near         w · exp(−(e/σ)²)                                          2 1/s
+    force_far          w · max(0, 1 − |e|)                                       1 1/s
+    object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
+    object_angle       w · θ                                                     −1 1/(rad s)
+    drop               w · (|p − p_0| > d_max)                                   −100 1/s
+    crush              w · (F > F_crush)                                         −100 1/s
+    action_rate        w · |a_t − a_{t−1}|²                                      −0.01 1/s
+    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −40 1/(rad s)
+    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
+
+An episode ends for good where the object is dropped or crushed. Both force terms are 0 or more and end with the object: to hold
+on pays in any case.
+
+Score: root of the mean of e² over all steps later than `settling` after the last change of the command, the start being one; 1,
+as without any force, until there is such a step. Less is better. It says nothing of drops: the share of episodes without a drop
+is that of those which end truncated and not terminated; `episode_terms` tells drops from crushes.
+
+Source: ours, for what a force follows that no depth tells; `drop`, `joint_limit` and `work` have the weights that Chung et al.,
+*Tactile Genesis*, appendix, "Reward terms", have for tasks in the palm. A command that could not carry the object with a margin
+κ would ask for a drop, so it is not drawn: κ = 1.3 is the least with which all objects are held for ten seconds without any
+action. That F_min follows from the object is known to nobody but the privileged groups.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from pydantic import Field
+from torch import Tensor
+
+from tgdsl.errors import LowerError, SimulationError
+from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl.spec import TaskSpec, Time, Weight
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks.placing import object_qpos
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+
+Force = Annotated[float, Quantity("force", gt=0.0)]
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    force_near: Weight = 2.0
+    """Force close to the command [1/s]."""
+    force_far: Weight = 1.0
+    """Force less than as far from the command as none at all [1/s]."""
+    object_distance: Weight = -100.0
+    """Distance of the object from where it started, beyond `free_distance` [1/(m s)]."""
+    object_angle: Weight = -1.0
+    """By how much the object has turned [1/(rad s)]."""
+    drop: Weight = -100.0
+    """Object dropped [1/s]."""
+    crush: Weight = -100.0
+    """Object crushed [1/s]."""
+    action_rate: Weight = -0.01
+    """Change of the action [1/s]."""
+    joint_limit: Weight = -40.0
+    """Joints near the ends of their ranges [1/(rad s)]."""
+    work: Weight = -5e-3
+    """Power of the drives [1/J]."""
+
+
+class GripForceSpec(TaskSpec):
+    """Press on an object as hard as commanded, and hold it."""
+
+    starts: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Keyframes in which the object is held with `start_force`: one for each of its variants, in their order."""
+    start_force: Force = 5.0
+    """F_0, sum of normal forces in these keyframes [N]."""
+    force: Annotated[Range, RangeOf("force", gt=0.0)] = (1.0, 8.0)
+    """F_low and F_max, least and largest sum of normal forces that is commanded [N]."""
+    hold_margin: Positive = 1.3
+    """κ: no less is commanded than so many times what carries the object by friction [1]."""
+    change: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
+    """Time from one command to the next, drawn for each [s]."""
+    settling: Time = 1.0
+    """Time after a change of the command that does not count for the score [s]."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    force_width: Positive = 0.2
+    """σ, relative error at which `force_near` has fallen to 1/e [1]."""
+    free_distance: PositiveLength = 0.005
+    """r: closer to where it started, the object costs nothing [m]."""
+    drop_distance: PositiveLength = 0.04
+    """d_max: further from where it started, the object is lost [m]."""
+    max_force: Force = 15.0
+    """F_crush: a larger sum of normal forces crushes the object [N]."""
+
+
+def reference(spec: GripForceSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
+            `torque` [N·m], `action`, `normal_force` (step, link) [N], `command`, as observed then [N], and `is_new`, whether
+            that was drawn then; and `low`, `high`, limits [rad].
+        dt: Δt [s].
+    """
+    weights, low, high = spec.rewards, record["low"], record["high"]
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    since, squares, rows = 0, [], []
+    for t in range(1, len(record["pos"])):
+        since += 1
+        force = float(np.sum(record["normal_force"][t]))
+        error = force / record["command"][t - 1] - 1.0
+        if since * dt > spec.settling - 0.5 * dt:
+            squares.append(error**2)
+        since = 0 if record["is_new"][t] else since
+        distance = float(np.linalg.norm(record["pos"][t] - record["pos"][0]))
+        alike = min(1.0, abs(float(np.dot(record["quat"][t], record["quat"][0]))))
+        is_dropped, is_crushed = distance > spec.drop_distance, force > spec.max_force
+        row = {
+            "force_near": weights.force_near * math.exp(-((error / spec.force_width) ** 2)),
+            "force_far": weights.force_far * max(0.0, 1.0 - abs(error)),
+            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
+            "object_angle": weights.object_angle * 2.0 * math.acos(alike),
+            "drop": weights.drop * is_dropped,
+            "crush": weights.crush * is_crushed,
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
+            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        }
+        rows.append(row | {"is_over": is_dropped or is_crushed, "score": math.sqrt(np.mean(squares)) if squares else 1.0})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+class GripForce(Task[GripForceSpec]):
+    """The task."""
+
+    Spec = GripForceSpec
+    wants_normal_force = True
+    score_unit = "RMS of force error over command"
+
+    def __init__(self, spec: GripForceSpec, setup: Setup):
+        """Look up the keyframes.
+
+        Raises:
+            LowerError: If there is no such keyframe, or not one for each variant, or commands change within a control step.
+        """
+        super().__init__(spec, setup)
+        limits = (setup.actuators.low, setup.actuators.high)
+        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.qpos, self.ctrl = (_keyframes(spec, setup, name)[setup.variant] for name in ("qpos", "ctrl"))
+        self.item, own = object_qpos(setup), setup.actuators
+        self.moved = torch.from_numpy(own.actuator).to(setup.device, torch.int64)
+        held = self.qpos[:, torch.from_numpy(own.qpos).to(setup.device, torch.int64)]
+        self.held, self.lag = held, self.ctrl[:, self.moved] - held
+        self.weight = float(np.linalg.norm(setup.model.opt.gravity))
+        self.first, self.last = (round(end / setup.control_step) for end in spec.change)
+        if self.first < 1:
+            what = f"commands change every {spec.change[0]:g} s, more often than control steps of {setup.control_step:g} s"
+            raise LowerError(what, "change", "expected at least one")
+        self.settled = math.ceil(spec.settling / setup.control_step - 0.5)
+        self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
+        self.command, self.error = self.keep("command"), self.keep("error")
+        self.left, self.since = self.keep("left", dtype=torch.int64), self.keep("since", dtype=torch.int64)
+        self.count = self.keep("count", dtype=torch.int64)  # of commands, above them of episodes
+        self.squares, self.samples = self.keep("squares"), self.keep("samples")
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Hold objects with the force of the first command."""
+        item = self.qpos[:, self.item]
+        self.begin(chosen, start_pos=item[:, :3], start_quat=item[:, 3:], error=0.0, squares=0.0, samples=0.0)
+        self.begin(chosen, count=episode << 32)
+        self._command(chosen, self.setup.mass, self.setup.friction)
+        share = self.command / self.spec.start_force
+        ctrl = self.ctrl.index_copy(1, self.moved, self.held + share[:, None] * self.lag)
+        return Start({"qpos": self.qpos, "ctrl": ctrl})
+
+    def advance(self, now: Now) -> None:
+        """Note the error to the command, and give another command where it is time."""
+        self.since += 1
+        self.error.copy_(now.normal_force.sum(dim=1) / self.command - 1.0)
+        is_settled = self.since >= self.settled
+        self.squares += torch.where(is_settled, self.error.square(), 0.0)
+        self.samples += is_settled
+        self.left -= 1
+        is_due = self.left <= 0
+        self.count += is_due
+        self._command(is_due, now.mass, now.friction)
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped or crushed."""
+        return self._is_dropped(now) | self._is_crushed(now)
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        spec, weights = self.spec, self.spec.rewards
+        distance = (now.object.pos - self.start_pos).norm(dim=1)
+        turned = rotations.angle(rotations.product(now.object.quat, rotations.inverse(self.start_quat)))
+        return {
+            "force_near": weights.force_near * torch.exp(-(self.error / spec.force_width).square()),
+            "force_far": weights.force_far * (1.0 - self.error.abs()).clamp(min=0.0),
+            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
+            "object_angle": weights.object_angle * turned,
+            "drop": weights.drop * self._is_dropped(now),
+            "crush": weights.crush * self._is_crushed(now),
+            "action_rate": weights.action_rate * terms.action_rate(now),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "work": weights.work * terms.work(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the command, and what is privileged of the force and the object."""
+        return {
+            "goal": self.command[:, None],
+            "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return the root of the mean squared relative error of settled forces; 1 where none has been seen."""
+        mean = self.squares / self.samples.clamp(min=1.0)
+        return torch.where(self.samples > 0, mean.sqrt(), 1.0)
+
+    def _command(self, chosen: Bool[Tensor, " env"], mass: Float[Tensor, " env"], friction: Float[Tensor, " env"]) -> None:
+        """Draw commands of some environments, and when the next ones come."""
+        spec, draws = self.spec, self.setup.draws
+        low, high = spec.force
+        least = (spec.hold_margin * self.weight * mass / friction).clamp(min=low, max=high)
+        share = draws.uniform("command", self.count, 1)[:, 0].to(least.dtype)
+        left = draws.integers("command interval", self.count, 1, self.first, self.last)[:, 0]
+        self.begin(chosen, command=least + share * (high - least), left=left, since=0.0)
+
+    def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
+        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+
+    def _is_crushed(self, now: Now) -> Bool[Tensor, " env"]:
+        return now.normal_force.sum(dim=1) > self.spec.max_force
+
+
+def _keyframes(spec: GripForceSpec, setup: Setup, field: str) -> Float[Tensor, "variant number"]:
+    """Return `qpos` or `ctrl` of the starts.
+
+    Raises:
+        LowerError: If there is no such keyframe, or not one for each variant.
+    """
+    if len(spec.starts) != setup.num_variants:
+        what = f"{len(spec.starts)} starts, and the object has {setup.num_variants} variants"
+        raise LowerError(what, "starts", "expected a keyframe for each")
+    rows = []
+    for name in spec.starts:
+        try:
+            rows.append(getattr(setup.model, f"key_{field}")[keyframe_id(setup.model, name)])
+        except SimulationError as error:
+            raise LowerError(str(error), "starts") from error
+    return torch.from_numpy(np.array(rows)).to(setup.device, setup.dtype)
