@@ -43,7 +43,7 @@ from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.scene.digest import scene_digest
 
 SIDE_BY_SIDE = 256
-"""Trials at once."""
+"""Most trials at once; of a few grasps there are twice as many."""
 PUSHES = 4
 """Pushes of each trial."""
 SHARE = 0.25
@@ -115,7 +115,7 @@ class _Trials:
         inputs, task = sensed.touch.inputs, loaded.spec
         self.spec, self.joints = spec, moved_joints(loaded, sensed)
         self.num_variants = inputs.num_variants[inputs.objects.index(task.object)] if task.object in inputs.objects else 1
-        num_envs = max(SIDE_BY_SIDE, self.num_variants)
+        num_envs = max(self.num_variants, min(SIDE_BY_SIDE, 2 * spec.num))
         sim = make_simulation(loaded, sensed, self.joints, num_envs, "cpu", "mujoco")
         assert isinstance(sim, BatchSimulation)
         self.sim, model = sim, sim.model
