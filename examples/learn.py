@@ -6,9 +6,9 @@
     python examples/learn.py --plot out/learn                    # table and curve of the runs that are there
 
 What a policy sees besides its own command (targets, last action, time left): with `--touch` the taxels of the fingertip; with
-`--blind` nothing; with `--joints` measured positions and velocities of the joints, whose error betrays contact. The critic, which
-is gone after learning, also sees where the ridge is, in all three. Then the policy is evaluated without exploration, in episodes
-that are the same for all.
+`--blind` nothing; with `--joints` measured positions and velocities of the joints, whose error betrays contact. The critic,
+which is gone after learning, also sees where the ridge is, in all three. Then the policy is evaluated without exploration, in
+episodes that are the same for all.
 
 A run writes NAME.json (results and curve) and NAME.pt, the policy: tgdsl play examples/tasks/find_ridge.yaml --policy NAME.pt
 --groups command tactile_sensors. From the same seed, numbers of environments, threads and iterations follow the same results.
@@ -52,8 +52,8 @@ SAID_EVERY = 5.0
 class Result:
     """One run: `success` and its 95 % `interval` are of the evaluation.
 
-    Each row of `curve` is an iteration in which episodes ended: minutes, episodes so far, and the share of those that ended in it
-    which went well, with exploration.
+    Each row of `curve` is an iteration in which episodes ended: minutes, episodes so far, and the share of those that ended in
+    it which went well, with exploration.
     """
 
     condition: str
@@ -182,7 +182,7 @@ def evaluate(runner: OnPolicyRunner, condition: str, threads: int, num: int = 10
     return env.successes / env.ended, env.ended
 
 
-def interval(share: float, num: int, z: float = 1.959964) -> tuple[float, float]:
+def interval(share: float, num: int, z: float = 1.959963984540054) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a share of a number of trials."""
     middle = (share + z * z / (2 * num)) / (1 + z * z / num)
     half = z / (1 + z * z / num) * math.sqrt(share * (1 - share) / num + z * z / (4 * num * num))
@@ -273,10 +273,7 @@ def main() -> None:
         learn_all(given.seeds, given.jobs, passed_on)
     elif given.plot is None:
         run = learn(given.condition, given.seed, given.envs, given.threads, given.minutes, given.iterations, given.out)
-        low, high = run.interval
-        print(
-            f"{run.condition} {run.seed}: {run.success:.1%} of {run.evaluated} ({low:.1%} to {high:.1%}); chance {run.chance:.1%}"
-        )
+        print(f"{run.condition} {run.seed}: {run.success:.1%} of {run.evaluated} episodes; chance is {run.chance:.1%}")
     if results := read(folder):
         print(table(results), end="")
         plot(results, folder / "curve.png")

@@ -10,9 +10,9 @@ An episode ends when its time is over, and has gone well if the fingertip rests 
 worth anything later. Who knows nothing of the ridge does best at a fixed place, where it rests with a probability of at most
 2 ε / (b − a), r being uniform on [a, b]: `chance`.
 
-Groups: `command` holds the targets of the joints [rad], the last action and the share of the episode that is left, none of which
-knows of the ridge; `priv_ridge` p − r [m], v [m/s] and |f| [N]. Measured positions of the joints are in `proprio`; where they
-differ from the targets something is in the way, so a policy without touch must not have them.
+Groups: `command` holds the targets of the joints [rad], the last action and the share of the episode that is left, none of
+which knows of the ridge; `priv_ridge` p − r [m], v [m/s] and |f| [N]. Measured positions of the joints are in `proprio`; where
+they differ from the targets something is in the way, so a policy without touch must not have them.
 
 The reward is the sum of these terms times Δt.
 
@@ -33,6 +33,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Position, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import rotations, terms
 from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
@@ -91,8 +92,8 @@ def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) 
 
     Args:
         spec: The task's document.
-        record: One row per instant, the first that at the start: of the fingertip `pos` [m], `quat`, `linvel` [m/s] and `angvel`
-            [rad/s]; `place`, where the ridge is [m]; `force`, of the ridge on the fingertip [N]; and `action`.
+        record: One row per instant, the first that at the start: of the fingertip `pos` [m], `quat`, `linvel` [m/s] and
+            `angvel` [rad/s]; `place`, where the ridge is [m]; `force`, of the ridge on the fingertip [N]; and `action`.
         dt: Δt [s].
     """
     weights, rows = spec.rewards, []
@@ -131,11 +132,19 @@ class FindRidge(Task[FindRidgeSpec]):
     score_unit = "found"
 
     def __init__(self, spec: FindRidgeSpec, setup: Setup):
-        """Begin with the ridge where the scene has it."""
+        """Begin with the ridge where the scene has it.
+
+        Raises:
+            SimulationError: If the ridge is no mocap body, and so cannot be put elsewhere.
+        """
         super().__init__(spec, setup)
+        model = setup.model
         self.num_steps = max(1, round(spec.episode / setup.control_step))
-        self.ridge = int(setup.model.body(setup.object).mocapid[0])
-        self.mocap = torch.from_numpy(setup.model.key_mpos[0].reshape(-1, 3)).to(setup.device, setup.dtype)
+        self.ridge = int(model.body(setup.object).mocapid[0])
+        if self.ridge < 0:
+            raise SimulationError(f'the object\'s body "{setup.object}" is no mocap body: give it mocap="true" in the scene')
+        bodies = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
+        self.mocap = torch.from_numpy(model.body_pos[bodies]).to(setup.device, setup.dtype)
         self.pad = torch.tensor(spec.pad, dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         self.elapsed, self.rests = self.keep("elapsed"), self.keep("rests", dtype=torch.bool)
 
@@ -179,6 +188,21 @@ class FindRidge(Task[FindRidgeSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return whether it rests."""
         return self.rests.to(self.setup.dtype)
+
+    def script(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        """Return the actions of a policy written by hand, for clean `depth` at `low`: slide, and centre what is felt.
+
+        Three rows of taxels run along the finger. On the plate both outer ones reach into it; on the ridge, which lifts the
+        finger, only that on its side.
+        """
+        target, depth = obs["command"][:, :2], obs["tactile_sensors"].view(-1, 3, 3)
+        low, _, high = (1e3 * depth.sum(dim=2)).unbind(dim=1)  # [mm]
+        is_on_plate, balance = (low > 3.0) & (high > 3.0), low - high
+        passed = torch.where(balance < -0.6, 0.5, -0.5)
+        bend = torch.where(is_on_plate, passed, (-0.1 * balance).clamp(-0.5, 0.5))
+        bend = torch.where(depth.amax(dim=(1, 2)) > 0.0, bend, 0.0)
+        press = ((0.225 - target[:, 1]) / self.spec.action.scale).clamp(-1.0, 1.0)
+        return torch.stack([bend, press, torch.zeros_like(bend)], dim=1)
 
     def _motion(self, now: Now) -> Float[Tensor, "env 3"]:
         """Return p − r [m], v [m/s] and |f| [N]."""

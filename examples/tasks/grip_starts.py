@@ -10,6 +10,7 @@ and each finger with a quarter; their size is adjusted until the contacts' norma
 
 from __future__ import annotations
 
+import copy
 import re
 from pathlib import Path
 
@@ -126,6 +127,22 @@ class Holding:
         return torques[: model.nu]
 
 
+def scene_of(scenes: SceneModels, variant: int) -> mujoco.MjModel:
+    """Return the scene with a variant of the object, of `MASS`."""
+    model = copy.copy(scenes.model({OBJECT: Choice(variant)}))
+    body = model.body(OBJECT)
+    model.body_inertia[body.id] *= MASS / body.mass[0]
+    model.body_mass[body.id] = MASS
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def width_of(scenes: SceneModels, variant: int) -> float:
+    """Return the width of a variant between thumb and fingers: of a box along its x, of a cylinder its diameter [m]."""
+    [size] = [geom.size for geom in scenes.objects[OBJECT].variants[variant] if geom is not None]
+    return 2.0 * size[0]
+
+
 def numbers(values: np.ndarray) -> str:
     """Return numbers as MuJoCo's XML has them."""
     return " ".join(f"{value:.5g}" for value in np.round(values, 5) + 0.0)
@@ -137,12 +154,8 @@ def main() -> None:
     scenes = SceneModels(touch.plan.scene, {"timestep": 0.005})
     keys = []
     for i in range(len(scenes.objects[OBJECT].variants)):
-        model = scenes.model({OBJECT: Choice(i)})
-        body, [size] = model.body(OBJECT), [geom.size for geom in scenes.objects[OBJECT].variants[i] if geom is not None]
-        model.body_inertia[body.id] *= MASS / body.mass[0]
-        model.body_mass[body.id] = MASS
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-        holding = Holding(model, 2.0 * size[0])
+        model = scene_of(scenes, i)
+        holding = Holding(model, width_of(scenes, i))
         qpos, targets = holding.hold()
         print(f"hold-{i}: {holding.force():.2f} N, object at {np.round(qpos[model.nu :], 3)}")
         hand, item = numbers(qpos[: model.nu]), numbers(qpos[model.nu :])

@@ -1,6 +1,6 @@
 """What happened in environments, step by step, as the `reference` of a task takes it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -19,9 +19,14 @@ class Recorder:
         episodes: Of each environment, its episodes so far: records of instants, of terms, and of what ended.
     """
 
-    def __init__(self, env: TouchEnv):
-        """Begin with a new episode in every environment."""
-        self.env = env
+    def __init__(self, env: TouchEnv, more: Callable[[], Record] = dict):
+        """Begin with a new episode in every environment.
+
+        Args:
+            env: The environments.
+            more: Returns copies of what else is noted of each instant, (env, …) by name.
+        """
+        self.env, self._more = env, more
         self._instants: list[list[Record]] = []
         env.reset()
         self.episodes: list[list[tuple[list[Record], list[Record]]]] = [[] for _ in range(env.num_envs)]
@@ -31,7 +36,7 @@ class Recorder:
         """Make a step and note it."""
         task, seen = self.env.task, []
         whole = task.advance
-        task.advance = lambda now: (whole(now), seen.append(instant(now)))[0]  # type: ignore[method-assign]
+        task.advance = lambda now: (whole(now), seen.append(instant(now) | self._more()))[0]  # type: ignore[method-assign]
         try:
             made = self.env.step(action)
         finally:
@@ -45,7 +50,7 @@ class Recorder:
         self._begin(torch.nonzero(made.info.ended).flatten().tolist())
 
     def _begin(self, envs: Sequence[int]) -> None:
-        now = instant(self.env.now)
+        now = instant(self.env.now) | self._more()
         for env in envs:
             self.episodes[env].append(([{name: value[env] for name, value in now.items()}], []))
 

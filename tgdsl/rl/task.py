@@ -31,7 +31,7 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import put_rows
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -171,8 +171,7 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            new = value.to(own.dtype) if isinstance(value, Tensor) else value
-            own.copy_(torch.where(broadcast_over(chosen, own), new, own))
+            put_rows(own, chosen, value.to(own.dtype) if isinstance(value, Tensor) else value)
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:

@@ -248,7 +248,7 @@ class GripForce(Task[GripForceSpec]):
         least = (spec.hold_margin * self.weight * mass / friction).clamp(min=low, max=high)
         share = draws.uniform("command", self.count, 1)[:, 0].to(least.dtype)
         left = draws.integers("command interval", self.count, 1, self.first, self.last)[:, 0]
-        self.begin(chosen, command=least + share * (high - least), left=left, since=0)
+        self.begin(chosen, command=least + share * (high - least), left=left, since=0.0)
 
     def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
         return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance

@@ -1,0 +1,371 @@
+"""Holding an object as hard as commanded: rewards against the reference, what pays, starts, commands, ends."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from task_records import Recorder, assert_reference
+
+import tgdsl
+from tgdsl.errors import SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.tasks.grip_force import Rewards, reference
+from tgdsl.scene.scene import Choice, SceneModels
+
+FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
+DOCUMENT = FOLDER / "grip_force.yaml"
+NUM = 8
+"""As many environments as the object has variants."""
+PLAIN = {"touch": "none", "randomise.drive": {}, "randomise.push": {}}
+"""Ideal drives, and no pushes."""
+GRAVITY = 9.81
+
+
+def grip(num_envs=NUM, **overrides):
+    named = {name.replace("__", "."): value for name, value in overrides.items()}
+    return TouchEnv(DOCUMENT, num_envs, threads=1, overrides=PLAIN | named)
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Eight objects, ideal drives, no pushes."""
+    made = grip()
+    yield made
+    made.close()
+
+
+def still(env):
+    return torch.zeros(env.num_envs, env.num_actions)
+
+
+def random_actions(env, num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def force_of(made):
+    """Return the sum of normal forces after a step, that of the end of an episode included [N]."""
+    return made.info.final_obs["priv_force"][:, 0].double()
+
+
+def command(env):
+    return {"command": env.task.command.double().numpy().copy()}
+
+
+def by_command(spec, record, dt):
+    """The reference, told when commands were new by their change."""
+    return reference(spec, {**record, "is_new": np.diff(record["command"], prepend=0.0) != 0}, dt)
+
+
+ODD = {
+    "episode": "0.6 s", "change": ["0.1 s", "0.2 s"], "settling": "0.06 s", "force": ["2 N", "6 N"], "force_width": 0.4,
+    "free_distance": "0.1 mm", "drop_distance": "6 mm", "max_force": "9 N", "action.scale": "0.02 rad",
+    "randomise.push": {"z": ["-4 N", "-4 N"], "interval": ["0.2 s", "0.3 s"]},
+    "rewards": {name: 1.5 * value for name, value in Rewards()},
+}  # fmt: skip
+"""Other numbers than the document's, and enough going on that every term is seen."""
+
+
+def test_rewards_ends_and_scores_equal_the_reference():
+    env = grip(**ODD)
+    recorder = Recorder(env, lambda: command(env))
+    for i, action in enumerate(random_actions(env, 60)):
+        recorder.step(torch.ones_like(action) if i % 30 > 20 else action)
+    assert sum(len(episodes) for episodes in recorder.episodes) > 2 * NUM
+    found = assert_reference(recorder, by_command)
+    # The end of a joint's range is nowhere near.
+    assert found == {*Rewards.model_fields, "is_over", "score"} - {"joint_limit"}
+    env.close()
+
+
+@pytest.mark.slow
+def test_the_document_as_it_is_equals_the_reference():
+    env = TouchEnv(DOCUMENT, NUM, threads=1)
+    recorder = Recorder(env, lambda: command(env))
+    for action in random_actions(env, 150):
+        recorder.step(action)
+    assert {"force_near", "force_far", "object_angle", "action_rate", "work"} <= assert_reference(recorder, by_command)
+    env.close()
+
+
+def test_a_joint_at_the_end_of_its_range_costs(env):
+    """0.05 rad beyond the middle 95 % of a range."""
+    env.reset(0)
+    now, (low, high) = env.now, (env.task.low, env.task.high)
+    pos = now.joint_pos.clone()
+    pos[:, 3] = 0.5 * (low[3] + high[3]) + 0.95 * 0.5 * (high[3] - low[3]) + 0.05
+    terms = env.task.reward(replace(now, joint_pos=pos), torch.zeros(NUM, dtype=torch.bool))
+    torch.testing.assert_close(terms["joint_limit"], torch.full((NUM,), -40 * 0.05).double())
+
+
+def scripted(env, share):
+    """Return what the terms of force pay where a script says that forces are a share of the command [1/s]."""
+    now = env.now
+    force = torch.zeros_like(now.normal_force)
+    force[:, :2] = (0.5 * share * env.task.command)[:, None]
+    now = replace(now, normal_force=force)
+    env.task.advance(now)
+    terms = env.task.reward(now, torch.zeros(env.num_envs, dtype=torch.bool))
+    return terms["force_near"] + terms["force_far"]
+
+
+def test_the_right_force_beats_half_of_it_and_twice_it(env):
+    """And it pays less the further it is from the command, either way; nothing pays for no force at all."""
+    env.reset(0)
+    none, half, less, right, more, twice, thrice = (scripted(env, share) for share in (0, 0.5, 0.9, 1.0, 1.1, 2.0, 3.0))
+    torch.testing.assert_close(right, torch.full_like(right, 3.0))
+    assert (right > less).all() and (less > half).all() and (half > none).all()
+    assert (right > more).all() and (more > twice).all() and (none < 1e-9).all() and (twice < 1e-9).all()
+    assert (thrice < 1e-9).all() and (thrice >= 0).all()
+
+
+def press(env, share):
+    """Have the drives press with a share of the command, as far as the start's targets tell: w of the module's page."""
+    task = env.task
+    lag = (share * task.command / task.spec.start_force)[:, None] * task.lag
+    env.actuation.target.copy_(task.held + lag)
+
+
+def test_pressing_as_hard_as_commanded_beats_half_and_twice():
+    """In physics, for every object: 50 g, which half the force still holds, and a command that stays."""
+    env = grip(force=["3 N", "3 N"], randomise__mass=["30 g", "30 g"], randomise__friction=[1.25, 1.25])
+    paid = {}
+    for share in (0.5, 1.0, 2.0):
+        env.reset(0)
+        press(env, share)
+        total = torch.zeros(NUM)
+        for _ in range(24):
+            made = env.step(still(env))
+            assert not made.info.ended.any()
+            total += made.reward
+        force = force_of(made)
+        assert ((force - 3.0 * share).abs() < 0.5).all()
+        paid[share] = total
+    assert (paid[1.0] > paid[0.5]).all() and (paid[1.0] > paid[2.0]).all()
+    env.close()
+
+
+def test_force_taxel_weighs_the_mass():
+    """At rest the taxels of thumb and fingers carry the weight, to 1 %, and nothing of the objects' force is missed."""
+    env = grip(touch="force_taxel", resolution="low", force=["7 N", "7 N"], randomise__friction=[1.5, 1.5])
+    for seed in (0, 1):
+        env.reset(seed)
+        for _ in range(30):
+            env.step(still(env))
+        felt = env._sensed.felt
+        readings, taxels = env.now.readings[felt].double(), env.touch.taxels[felt]
+        bodies = list(dict.fromkeys(taxels["link"]))
+        total = torch.zeros(NUM, 3, dtype=torch.float64)
+        for i in range(NUM):
+            data = mujoco.MjData(env.sim.model)
+            data.qpos[:] = env.sim.qpos[i].numpy()
+            mujoco.mj_kinematics(env.sim.model, data)
+            for body in bodies:
+                own = readings[i, torch.from_numpy(np.asarray(taxels["link"]) == body)].sum(dim=0).numpy()
+                total[i] += torch.from_numpy(data.body(str(body)).xmat.reshape(3, 3) @ own)
+        weight = env.now.mass * GRAVITY
+        assert env.now.mass.min() >= 0.02 and env.now.mass.max() <= 0.3 and env.now.mass.std() > 0.03
+        assert ((-total[:, 2] / weight - 1).abs() < 0.01).all()
+        # Sideways the thumb's force and the fingers' cancel.
+        assert (total[:, :2].norm(dim=1) < 0.01 * 7).all()
+    env.close()
+
+
+def test_groups(env):
+    obs = env.reset(0)
+    links = len(env.task.setup.links)
+    assert env.groups == {
+        "proprio": 24, "priv_proprio": 24 + 3 * links, "goal": 1, "priv_force": 1 + links, "priv_obj_state": 15,
+        "priv_obj_props": 2 + len(env.touch.rows[env._sensed.distance]["link"]),
+    }  # fmt: skip
+    torch.testing.assert_close(obs["goal"][:, 0].double(), env.task.command, rtol=1e-6, atol=0)
+    torch.testing.assert_close(obs["priv_obj_props"][:, 1].double(), env.task.setup.mass, rtol=1e-6, atol=0)
+    assert not obs["priv_force"].any()  # nothing is looked for after a reset
+    made = env.step(still(env))
+    own = made.obs["priv_force"]
+    torch.testing.assert_close(own[:, 0], own[:, 1:].sum(dim=1))
+    on = [name for name, forces in zip(env.task.setup.links, own[:, 1:].T, strict=True) if forces.any()]
+    assert on == ["right_hand_thumb_rota_link2", "right_hand_index_rota_link2", "right_hand_mid_link2"]
+    # The normal force of a link is a part of its whole force; friction is the rest.
+    whole = made.obs["priv_proprio"][:, 24:].view(NUM, links, 3).norm(dim=2)
+    assert (own[:, 1:] <= whole + 1e-5).all() and (own[:, 1:] > 0.6 * whole).logical_or(whole == 0).all()
+
+
+def test_commands_are_drawn_from_what_can_hold_the_object():
+    """Uniform from κ m g / μ, but at least 1 N, to 8 N: a Kolmogorov-Smirnov test at 1e-6, and both ends."""
+    env = grip(64, randomise__mass=["0 g", "280 g"])
+    shares, least = [], []
+    for seed in range(8):
+        env.reset(seed)
+        found, mass, friction = env.task.command, env.task.setup.mass, env.task.setup.friction
+        low = (1.3 * mass * GRAVITY / friction).clamp(min=1.0)
+        assert (found >= low).all() and (found <= 8).all() and low.max() < 6.5
+        shares.append((found - low) / (8 - low))
+        least.append(low)
+    share = torch.cat(shares).sort().values
+    assert (torch.cat(least) == 1).any()
+    gap = (share - torch.arange(len(share)) / len(share)).abs().max()
+    assert gap < np.sqrt(-0.5 * np.log(0.5e-6) / len(share)) and share[0] < 0.02 and share[-1] > 0.98
+    env.close()
+
+
+def test_commands_change_at_random_times():
+    """Every 5 to 8 control steps, each environment by itself; the command of a step is that which was observed before it."""
+    env = grip(change=["0.125 s", "0.2 s"], settling="0.05 s", episode="2 s")
+    obs, age = env.reset(0), torch.zeros(NUM, dtype=torch.int64)
+    ages, changes = [], []
+    for _ in range(60):
+        before, score = obs["goal"][:, 0], env.task.squares.clone()
+        made = env.step(still(env))
+        obs = made.obs
+        assert not made.info.ended.any()
+        error = force_of(made) / before.double() - 1
+        torch.testing.assert_close(env.task.error, error, rtol=0, atol=1e-5)
+        age += 1
+        is_settled = age >= 2
+        torch.testing.assert_close(env.task.squares - score, torch.where(is_settled, error**2, 0.0), rtol=0, atol=1e-5)
+        is_new = obs["goal"][:, 0] != before
+        ages += age[is_new].tolist()
+        changes.append(is_new)
+        age = torch.where(is_new, 0, age)
+    assert set(ages) == {5, 6, 7, 8}
+    assert len({tuple(column.tolist()) for column in torch.stack(changes).T}) == NUM
+    env.close()
+
+
+def test_the_score_of_an_episode_without_a_settled_force_is_that_of_no_force(env):
+    env.reset(0)
+    scores = [env.step(still(env)).info.score for _ in range(40)]
+    assert all((score == 1).all() for score in scores[:39])  # the fortieth step is one second after the start
+    assert (scores[39] < 0.5).all()
+
+
+def test_what_falls_ends_as_a_drop(env):
+    env.reset(0)
+    env.sim.qpos[2, 14] -= 0.05
+    made = env.step(still(env))
+    assert made.terminated.tolist() == [i == 2 for i in range(NUM)] and not made.truncated.any()
+    assert made.info.terms["drop"][2].item() == pytest.approx(-100 * env.control_step)
+    assert not made.info.terms["crush"].any()
+
+
+def test_what_is_pressed_too_hard_ends_as_crushed(env):
+    env.reset(0)
+    press(env, torch.where(torch.arange(NUM) == 4, 25.0 / env.task.command, 1.0))
+    for _ in range(12):
+        made = env.step(still(env))
+        assert torch.equal(made.terminated, force_of(made) > 15)
+        if made.terminated.any():
+            break
+    assert made.terminated.tolist() == [i == 4 for i in range(NUM)]
+    assert made.info.terms["crush"][4].item() == pytest.approx(-100 * env.control_step)
+    assert not made.info.terms["drop"].any()
+
+
+def test_the_end_of_one_episode_leaves_the_others_alone(env):
+    """One object is taken away in one run and not in the other: all others go on as they do there, to the last bit."""
+    kept = []
+    for is_taken in (False, True):
+        env.reset(3)
+        rows = []
+        for i, action in enumerate(random_actions(env, 12)):
+            if is_taken and i == 4:
+                env.sim.qpos[5, 12] += 0.1
+            made = env.step(action)
+            assert made.terminated.tolist() == [is_taken and i == 4 and env_id == 5 for env_id in range(NUM)]
+            rows.append(torch.cat([*made.obs.values(), made.reward[:, None]], dim=1))
+        kept.append(torch.stack(rows))
+    others = [i for i in range(NUM) if i != 5]
+    assert torch.equal(kept[0][:, others], kept[1][:, others]) and not torch.equal(kept[0][5:, 5], kept[1][5:, 5])
+
+
+@pytest.mark.parametrize(
+    ("changes", "path", "says"),
+    [
+        ({"starts": ["hold-0"]}, "starts", "1 starts, and the object has 8 variants; expected a keyframe for each"),
+        ({"starts": [*(f"hold-{i}" for i in range(7)), "hold-9"]}, "starts", 'the scene has no keyframe "hold-9"'),
+        ({"change": ["0.01 s", "1 s"]}, "change", "commands change every 0.01 s, more often than control steps of 0.025 s"),
+        ({"force": ["0 N", "8 N"]}, "force", "expected more than 0"),
+        ({"force_width": -1}, "force_width", "more than 0"),
+        ({"max_force": "3 mm"}, "max_force", "unit of force"),
+        ({"rewards": {"grip": 1}}, "rewards.grip", "unknown key"),
+    ],
+)
+def test_mistakes_are_told_at_their_place(changes, path, says):
+    with pytest.raises(SpecError) as caught:
+        grip(**changes)
+    (found,) = caught.value.problems
+    assert found.path == path and says in f"{found.what}; {found.hint}"
+
+
+@pytest.mark.slow
+def test_every_object_is_held_for_ten_seconds_without_an_action():
+    """Of all masses, frictions and commands: with what the command asks for, to 15 % and 0.4 N, and at most 1 cm lower."""
+    env = grip(64, change=["20 s", "20 s"])
+    asked, forces = env.task.command.clone(), []
+    place = env.task.start_pos.clone()
+    for i in range(env.max_steps):
+        made = env.step(still(env))
+        assert not made.terminated.any()
+        forces += [force_of(made)] if i > 40 else []
+    force = torch.stack(forces).mean(dim=0)
+    assert ((force - asked).abs() < 0.15 * asked + 0.4).all()
+    moved = (made.info.final_obs["priv_obj_state"][:, :3].double() - place).norm(dim=1)
+    assert moved.max() < 0.01 and moved.median() < 0.002
+    env.close()
+
+
+@pytest.mark.slow
+def test_the_whole_range_of_commands_can_be_pressed():
+    """A script that closes the loop reaches 1 to 8 N with every object, within 2 %, with a third of the drives' torque."""
+    env = grip(change=["20 s", "20 s"], randomise__mass=["0 g", "0 g"])
+    limit = torch.from_numpy(env.task.setup.actuators.limit)
+    for wanted in (1.0, 2.0, 4.0, 8.0):
+        env.reset(0)
+        share = torch.full((NUM,), wanted, dtype=torch.float64) / env.task.command
+        for _ in range(160):
+            press(env, share)
+            made = env.step(still(env))
+            share = share + 0.2 * (wanted - force_of(made)) / env.task.command
+        assert not made.terminated.any()
+        assert ((force_of(made) / wanted - 1).abs() < 0.02).all()
+        assert (env.now.torque.abs() / limit).max() < 0.34
+    env.close()
+
+
+@pytest.mark.slow
+def test_the_keyframes_are_those_that_the_script_finds(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    import grip_starts
+
+    touch = tgdsl.compile(FOLDER / "grip.yaml", sensors=["felt"])
+    scenes = SceneModels(touch.plan.scene, {"timestep": 0.005})
+    for variant in (0, 6):
+        model = grip_starts.scene_of(scenes, variant)
+        holding = grip_starts.Holding(model, grip_starts.width_of(scenes, variant))
+        qpos, ctrl = holding.hold()
+        key = scenes.model({"item": Choice(variant)}).key(f"hold-{variant}")
+        assert holding.force() == pytest.approx(5.0, abs=0.1)
+        np.testing.assert_allclose(qpos, key.qpos, atol=2e-4)
+        np.testing.assert_allclose(ctrl, key.ctrl, atol=2e-4)
+    sys.modules.pop("grip_starts")
+
+
+@pytest.mark.slow
+def test_mujoco_warp_holds_it_too():
+    """Half a second with the same draws: forces agree to 5 % and 0.2 N, and commands to rounding."""
+    forces = []
+    for simulator in ("mujoco", "warp"):
+        env = TouchEnv(DOCUMENT, NUM, overrides=PLAIN, simulator=simulator)
+        obs = env.reset(1)
+        for _ in range(20):
+            made = env.step(still(env))
+            assert not made.info.ended.any()
+        forces.append((obs["goal"].cpu(), force_of(made).cpu()))
+        env.close()
+    torch.testing.assert_close(forces[0][0], forces[1][0], rtol=1e-5, atol=0)
+    torch.testing.assert_close(forces[0][1], forces[1][1], rtol=0.05, atol=0.2)
