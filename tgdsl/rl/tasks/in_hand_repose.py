@@ -97,7 +97,7 @@ class InHandReposeSpec(TaskSpec):
     """Weights of the reward's terms."""
     goal_step: Angle = 0.4
     """α: how far a goal is from the one before [rad]."""
-    goal_axis: Literal["any", "vertical"] = "any"
+    goal_axis: Literal["any", "vertical"] = "vertical"
     """About what a goal is turned: any axis, or the vertical, either way."""
     goal_tolerance: Angle = 0.1
     """ε: a goal is reached this close to it [rad]."""
@@ -174,7 +174,7 @@ def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: floa
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    cross = np.cross(np.eye(3), axis).T
+    cross = np.cross(np.eye(3), axis)
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
@@ -211,7 +211,9 @@ class InHandRepose(Task[InHandReposeSpec]):
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
         qpos, pos, quat = placed(self.setup, self.spec.randomise, episode)
-        self.begin(chosen, start_pos=pos, episode=episode, reached=0, held=0, waited=0, is_reached=False, is_late=False)
+        for own in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
+            own.masked_fill_(chosen, 0)
+        self.begin(chosen, start_pos=pos, episode=episode)
         goal = self._goal_after(quat)
         left = rotations.angle(rotations.product(goal, rotations.inverse(quat)))
         self.begin(chosen, goal=goal, left=left, error=left, rate=0.0)
