@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.runners import OnPolicyRunner
 
 from tgdsl.rl.adapters.rsl_rl import TouchVecEnv
@@ -125,6 +126,7 @@ def learn(condition: str, seed: int, num_envs: int, threads: int, minutes: float
     with contextlib.redirect_stdout(io.StringIO()):  # the networks, printed
         runner = OnPolicyRunner(env, settings(condition), device="cpu")
     for model in (runner.alg.actor, runner.alg.critic):
+        assert isinstance(model.obs_normalizer, EmpiricalNormalization)
         model.obs_normalizer.eps = 1e-6  # rsl_rl's 0.01 would hide depths, which are in metres
     begun, said, curve, done = time.monotonic(), 0.0, [], 0
     while not is_done(done, iterations, time.monotonic() - begun, 60.0 * minutes):
