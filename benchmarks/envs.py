@@ -241,7 +241,7 @@ def split(env: TouchEnv, num_steps: int = 30) -> dict[str, float]:
 
 
 def used_memory(device: torch.device) -> float:
-    """Return the memory that this process uses [MB]: the GPU's, of all processes if it cannot tell them apart, or the host's."""
+    """Return what memory this process uses [MB]: the GPU's, of all processes if they cannot be told apart, or the host's."""
     if device.type == "cuda":
         try:
             import pynvml

@@ -12,7 +12,9 @@ from tgdsl.schema.conditional import conditional
 
 def task_schema() -> dict[str, Any]:
     """Return the schema of all tasks of tgdsl by name; of one's own task it knows what all tasks have in common."""
-    specs: dict[str, type[TaskSpec]] = {name: getattr(import_module(place), class_).Spec for name, (place, class_) in TASKS.items()}
+    specs: dict[str, type[TaskSpec]] = {
+        name: getattr(import_module(place), class_).Spec for name, (place, class_) in TASKS.items()
+    }
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")

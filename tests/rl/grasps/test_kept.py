@@ -71,7 +71,7 @@ def test_a_file_holds_what_was_written(tmp_path):
 def test_files_that_do_not_fit_are_refused(tmp_path):
     file = tmp_path / "grasps.npz"
     write_grasps(BY_HAND, file)
-    with pytest.raises(SimulationError, match="grasps of another scene .*sample them again with `tgdsl grasps`"):
+    with pytest.raises(SimulationError, match=r"grasps of another scene .*sample them again with `tgdsl grasps`"):
         read_grasps(file, "b" * 64, "rod")
     with pytest.raises(SimulationError, match='grasps of the object "rod", expected "cube"'):
         read_grasps(file, "a" * 64, "cube")

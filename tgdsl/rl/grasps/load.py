@@ -18,9 +18,7 @@ from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.scene.digest import scene_digest
 
 
-def with_grasps(
-    setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None
-) -> Setup:
+def with_grasps(setup: Setup, loaded: LoadedTask, sim: Simulation, scene: SceneFile, progress: Progress | None = None) -> Setup:
     """Return what a task is made for, with its grasps if its document has any; the simulation has to be reset afterwards.
 
     Args:

@@ -2,7 +2,8 @@
 
 One trial, in simulation, nothing of the object's mass, friction or the drives being random:
 
-1. Joints start near the task's keyframe, by `spread` or a quarter of their range, the object is turned and moved at random and held there.
+1. Joints start near the task's keyframe, by `spread` or a quarter of their range, the object is turned and moved at random and
+   held there.
 2. For `close` the joints that the policy moves go, each in a time of its own, from where they are to near the controls of the
    keyframe `closed`; but a target never leads its joint by more than the trial's `squeeze`, so that a finger that has met the
    object presses with that times its servo's gain. The other joints have the keyframe's controls.
@@ -12,8 +13,8 @@ One trial, in simulation, nothing of the object's mass, friction or the drives b
 A grasp is kept where the object is near where it was held, both at the end of 3. and of 4., and links press on it from opposite
 sides. All is counted, not drawn: trials are the same on every computer of one kind, however many threads it has.
 
-Shapes: `env` environments, trials side by side, `joint` joints that the policy moves, `link` links, `nq` and `nu` as in MuJoCo's
-model.
+Shapes: `env` environments, trials side by side, `joint` joints that the policy moves, `link` links, `nq` and `nu` as in
+MuJoCo's model.
 """
 
 from __future__ import annotations

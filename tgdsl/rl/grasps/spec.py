@@ -21,7 +21,7 @@ class GraspSpec(SpecModel):
     """How grasps are sampled, and which of them are kept: see `tgdsl.rl.grasps.sampling`."""
 
     closed: str = "closed"
-    """The scene's keyframe whose controls the joints that the policy moves close towards; they start near the task's keyframe."""
+    """The scene's keyframe to whose controls the joints that the policy moves close; they start near the task's keyframe."""
     file: str | None = None
     """A file that `tgdsl grasps --out` wrote, relative to this document; default: the user's cache, sampled if it has none."""
     num: Whole = 512

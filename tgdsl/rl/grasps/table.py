@@ -116,6 +116,8 @@ class GraspTable:
             each = {name: getattr(state, name) for name in FIELDS} | {"pos": motion.pos, "quat": motion.quat}
             for name, value in each.items():
                 if value is not None:
-                    own = found.setdefault(name, torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device))
+                    own = found.setdefault(
+                        name, torch.zeros((len(self.qpos), *value.shape[1:]), dtype=value.dtype, device=device)
+                    )
                     own[index] = value.to(device)
         return found

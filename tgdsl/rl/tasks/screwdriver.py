@@ -11,8 +11,8 @@ those of the site at its tip, and j the joints that the policy moves, j_0 at the
 Groups: `priv_obj_state` as in `groups`, and the distance from each probe to the object's surface [m]; `priv_obj_props` friction
 and mass [kg] alone. There is no goal.
 
-The reward is the sum of these terms times Δt; weights are the paper's. On the right what each is worth beside `spin` at 2 rad/s,
-which is 20 1/s.
+The reward is the sum of these terms times Δt; weights are the paper's. On the right what each is worth beside `spin` at 2
+rad/s, which is 20 1/s.
 
     spin               w · min(Δψ/Δt, ω_max)                     10 1/rad
     near               w · mean_p exp(−max(0, d_p)/λ)            1 1/s              1 1/s if all probes touch
@@ -25,11 +25,11 @@ which is 20 1/s.
     work               w · Σ_j |τ_j q̇_j|                         −1e-3 1/J          −0.002 at 2 W
 
 So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where θ > `drop_tilt` or the tip is out of the screw,
-|s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after a
-drop nothing is added.
+|s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
+a drop nothing is added.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names; formulas,
-Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what turning
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
+formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what turning
 forth has paid, however fast: `spin` is bounded above alone.
 """
 
