@@ -38,8 +38,8 @@ pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = 
 costs 5, and `success` 12.5 at once.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also speaks of
-penalties of grip and slip, which its table does not have, and which are left out.
+formulas, Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also
+speaks of penalties of grip and slip, which its table does not have, and which are left out.
 """
 
 from __future__ import annotations

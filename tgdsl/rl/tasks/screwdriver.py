@@ -29,8 +29,8 @@ So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where �
 a drop nothing is added.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what turning
-forth has paid, however fast: `spin` is bounded above alone.
+formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what
+turning forth has paid, however fast: `spin` is bounded above alone.
 """
 
 from __future__ import annotations
