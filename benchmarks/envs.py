@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +29,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import tgdsl
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 
@@ -241,18 +241,10 @@ def split(env: TouchEnv, num_steps: int = 30) -> dict[str, float]:
 
 
 def used_memory(device: torch.device) -> float:
-    """Return what memory this process uses [MB]: the GPU's, of all processes if they cannot be told apart, or the host's."""
+    """Return what memory is used [MB]: on a GPU by all its processes, else by this one."""
     if device.type == "cuda":
-        try:
-            import pynvml
-
-            pynvml.nvmlInit()
-            gpu = pynvml.nvmlDeviceGetHandleByIndex(torch.cuda.current_device())
-            own = [p for p in pynvml.nvmlDeviceGetComputeRunningProcesses(gpu) if p.pid == os.getpid() and p.usedGpuMemory]
-            return own[0].usedGpuMemory / 1e6
-        except Exception:
-            free, total = torch.cuda.mem_get_info()
-            return (total - free) / 1e6
+        free, total = torch.cuda.mem_get_info()
+        return (total - free) / 1e6
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
@@ -276,7 +268,7 @@ def go_on(env: TouchEnv, seconds: float) -> dict[str, float]:
     if is_cuda:
         torch.cuda.synchronize()
     took, (ended, faults, score) = time.perf_counter() - start, counts.tolist()
-    if hasattr(env.sim, "check"):
+    if isinstance(env.sim, tgdsl.WarpSimulation):
         env.sim.check()
     return {
         "seconds": took,

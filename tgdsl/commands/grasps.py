@@ -51,7 +51,11 @@ class Grasps:
             sensed = compile_sensed(loaded, "cpu", progress, only=("link_contact",))
         joints, scene = moved_joints(loaded, sensed), sensed.touch.plan.scene
         with tqdm(total=spec.num, desc="sampling", unit="grasp", disable=None, leave=False) as bar:
-            grasps = kept_grasps(loaded, scene, joints, lambda num, _: bar.update(num - bar.n) and None)
+
+            def found(num: int, _: int) -> None:
+                bar.update(num - bar.n)
+
+            grasps = kept_grasps(loaded, scene, joints, found)
         variants = len(set(grasps.variant.tolist()))
         print(f"{len(grasps)} grasps of {variants} variant{'s' if variants > 1 else ''} of {grasps.object}: {folder()}")
         if self.out is not None:
