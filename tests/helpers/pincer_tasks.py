@@ -113,6 +113,7 @@ def write_pincer(
     return folder / "task.yaml"
 
 
-def pincer_env(folder: Path, num_envs: int = 4, *, overrides=None, seed: int = 0, threads: int = 1, **written) -> TouchEnv:
+def pincer_env(folder: Path, num_envs: int = 4, *, overrides=None, seed=0, simulator=None, **written) -> TouchEnv:
     """Return environments of the task; `written` as for `write_pincer`."""
-    return TouchEnv(write_pincer(folder, **written), num_envs, overrides=overrides, seed=seed, threads=threads)
+    document = write_pincer(folder, **written)
+    return TouchEnv(document, num_envs, overrides=overrides, seed=seed, simulator=simulator, threads=1)

@@ -214,9 +214,10 @@ def test_draws_are_counted(tmp_path):
 
 @pytest.mark.parametrize("touch", ["none", "bool", "force_taxel"])
 @pytest.mark.parametrize("num_envs", [1, 5])
-def test_contacts_are_those_that_the_simulation_finds_there(tmp_path, touch, num_envs):
-    """By the pairs and fields of each module, from one file of grasps."""
-    env = pincer_env(tmp_path, num_envs, overrides={"touch": touch})
+@pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
+def test_contacts_are_those_that_the_simulation_finds_there(tmp_path, touch, num_envs, simulator):
+    """By the pairs and fields of each module, in the simulator that will step them."""
+    env = pincer_env(tmp_path, num_envs, overrides={"touch": touch}, simulator=simulator)
     table, sim = env.task.grasps, env.sim
     wanted = {name for name in FIELDS if name in env.touch.inputs.fields}
     assert set(table.contacts) == wanted and "contact_netforce" in wanted

@@ -143,7 +143,7 @@ def test_the_screwdrivers_grasps():
     grasps = sampled(REPOSITORY / "examples" / "tasks" / "screwdriver.yaml", num=128)
     assert np.bincount(grasps.variant).tolist() == [32] * 4
     lift, quat = grasps.qpos[:, 12], grasps.qpos[:, 13:]
-    assert np.abs(lift).max() < 5e-4
+    assert np.abs(lift).max() < 2.5e-3  # half of what ends an episode
     tilt = np.arccos(1 - 2 * (quat[:, 1] ** 2 + quat[:, 2] ** 2))
     assert tilt.max() < 0.1
     yaw = np.sort(2 * np.arctan2(quat[:, 3], quat[:, 0]) % (2 * np.pi))

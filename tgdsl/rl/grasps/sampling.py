@@ -42,6 +42,7 @@ from tgdsl.rl.start import make_simulation, moved_joints
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.scene.digest import scene_digest
+from tgdsl.schema.yaml import Path
 
 SIDE_BY_SIDE = 256
 """Most trials at once; of a few grasps there are twice as many."""
@@ -122,10 +123,11 @@ class _Trials:
         self.sim, model = sim, sim.model
         self.variant: Int[Tensor, " env"] = torch.arange(num_envs) % self.num_variants
         try:
+            place: Path = ("joints",)
             actuators = Actuators.of(model, self.joints)
+            place = ("grasps", "closed")
             closed = keyframe_id(model, spec.closed)
         except SimulationError as error:
-            place = ("joints",) if "actuator" in str(error) else ("grasps", "closed")
             raise loaded.error(place, str(error)) from error
         self._actuator, self._joint = torch.from_numpy(actuators.actuator), torch.from_numpy(actuators.qpos)
         self._low, self._high = torch.from_numpy(actuators.low), torch.from_numpy(actuators.high)
