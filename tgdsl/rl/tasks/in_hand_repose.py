@@ -1,8 +1,8 @@
 """Turn an object on the palm to one orientation after another, with all fingers.
 
 An episode begins with the object upright on the palm, turned about the vertical by any angle. The first goal is a rotation by
-α = `goal_step` from there about an axis that is drawn, each other one such a rotation from the goal before, so that errors do not
-add up. With q the object's orientation, g_k goal k, a_k its axis of unit length in the world, and p and p_0 the object's
+α = `goal_step` from there about an axis that is drawn, each other one such a rotation from the goal before, so that errors do
+not add up. With q the object's orientation, g_k goal k, a_k its axis of unit length in the world, and p and p_0 the object's
 position now and at the start,
 
     g_0 = rot(a_0, α) q_0,   g_{k+1} = rot(a_{k+1}, α) g_k                goals
@@ -34,12 +34,12 @@ An episode ends for good where the object is further than `drop_distance` from p
 `goal_timeout`: what has failed is not worth what would have come. Score: goals in a row, k.
 
 Nothing pays for turning the wrong way: a turn away makes both tracking terms smaller, and costs in `progress` what the way back
-pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = ε tracking pays 13.8 until the timeout, which costs
-5, and `success` 12.5 at once.
+pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = ε tracking pays 13.8 until the timeout, which
+costs 5, and `success` 12.5 at once.
 
-Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names; formulas,
-Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also speaks of
-penalties of grip and slip, which its table does not have, and which are left out.
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
+formulas, Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also
+speaks of penalties of grip and slip, which its table does not have, and which are left out.
 """
 
 from __future__ import annotations
