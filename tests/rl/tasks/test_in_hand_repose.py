@@ -352,9 +352,7 @@ def test_the_documents_have_the_papers_numbers(document):
 def test_each_hand_holds_all_objects_without_an_action(document, joints):
     quiet = {"touch": "none", "goal_timeout": "1000 s", "randomise.push": {"x": 0}}
     env = TouchEnv(document, 32, threads=1, overrides=quiet)
-    assert env.num_actions == joints
-    sizes = {tuple(env.sim.env_model(i).geom("item").size) for i in range(16)}
-    assert len(sizes) == 16
+    assert env.num_actions == joints and env.task.setup.num_variants == 16
     for _ in range(round(10 / env.control_step)):
         made = rest(env)
         assert not made.terminated.any(), f"{made.terminated.nonzero().flatten().tolist()} were lost"
