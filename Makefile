@@ -9,13 +9,18 @@ TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test test-fast lint bench soak clean
+.PHONY: demo learn test test-fast lint bench soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
 	@$(BIN)/tgdsl compile examples/xhand1_palm.yaml -o out/xhand1_palm.safetensors
 	@echo "stepping its scene: the hand squeezes a cube"
 	@$(BIN)/tgdsl run out/xhand1_palm.safetensors --out out
+
+# Ten minutes in which a finger learns to find a ridge by touch: see docs/learn.md. `make learn MINUTES=1` takes one; LEARN="--blind".
+MINUTES ?= 10
+learn: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python examples/learn.py --minutes $(MINUTES) $(LEARN)
 
 # One process per core, each with one thread of its own: most of the time goes into compiling kernels.
 test: $(READY)

@@ -7,7 +7,8 @@
 Actions are random, episodes begin anew as they end. Of each task and friction cone:
 
 - `ratio`: `TouchEnv.step` over the same physics and the same module alone (on a GPU `sim.step_and_read`, else `sim.step` and
-  the module), from the same states, with the same controls. Blocks of both alternate; medians of all blocks.
+  the module), from the same states and with the same targets of the same drives; `ratio_ideal`: without drives, with the
+  robot's own actuators. Blocks alternate; medians of all blocks.
 - shares of a step, in percent: physics with the `drive`s, `touch` with what is watched, `logic` (actions, pushes, rewards,
   observations), `reset` (what begins episodes and reads them). On a GPU from events within its CUDA graph.
 - `--seconds`: goes on that long; counts what is no number, faults, ended episodes, and the memory after a fifth and at the end.
@@ -18,6 +19,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -127,43 +129,51 @@ def make(options: argparse.Namespace, task: Path, cone: str, **overrides: Any) -
     return made
 
 
-def alone(env: TouchEnv) -> Callable[[Tensor], object]:
-    """Return a control step of environments' physics and module, with nothing else of them; it takes controls."""
-    sim, touch = env.sim, env.touch
-    sim.drive = None
-    if env.device.type == "cuda":
-        return sim.step_and_read  # type: ignore[union-attr]
+class Alone:
+    """The physics and the module of environments, with nothing else of them."""
 
-    def step(control: Tensor) -> object:
+    def __init__(self, env: TouchEnv, is_ideal: bool):
+        """Take environments; `is_ideal`: the robot's own actuators are to do all."""
+        self._env, self._is_ideal = env, is_ideal or env.actuation.is_ideal
+        if self._is_ideal:
+            env.sim.drive = None
+
+    def begin(self, state: dict[str, dict[str, Tensor]]) -> None:
+        """Go on from the state of other environments of the same task."""
+        self._env.load_state_dict(state)
+        if self._is_ideal:
+            self._env.sim.arrays["qfrc_applied"].zero_()
+
+    def step(self, targets: tuple[Tensor, Tensor]) -> object:
+        """Make a control step with controls or, where there are drives, their targets."""
+        env, (controls, past) = self._env, targets
+        if not self._is_ideal:
+            env.actuation.memory()["past"].copy_(past)
+        if env.device.type == "cuda":
+            return env.sim.step_and_read(controls if self._is_ideal else None)  # type: ignore[union-attr]
         with torch.no_grad():
-            sim.step(control)
-            return touch(sim.state())
-
-    return step
+            env.sim.step(controls if self._is_ideal else None)
+            return env.touch(env.sim.state())
 
 
-def compare(options: argparse.Namespace, env: TouchEnv, plain: TouchEnv) -> tuple[list[float], list[float]]:
-    """Return what a step takes in each block, of the environments and of physics and module alone [s]."""
-    clock, given, step, length = Clock(env.device), actions(env), alone(plain), options.steps
-    for _ in range(3):
-        step(plain.sim.ctrl.clone())
-    taken: tuple[list[float], list[float]] = ([], [])
-    for _ in range(options.blocks):
-        plain.sim.load_state_dict(env.sim.state_dict())
-        controls: list[Tensor] = []
-        chosen = [next(given) for _ in range(length)]
+def compare(options: argparse.Namespace, env: TouchEnv, others: list[Alone]) -> list[list[float]]:
+    """Return what a step takes in each block, of the environments, and of physics and module alone [s]."""
+    clock, given, length = Clock(env.device), actions(env), options.steps
+    taken: list[list[float]] = [[] for _ in range(1 + len(others))]
+    for block in range(1 + options.blocks):  # in the first of them all is captured
+        state, targets, chosen = env.state_dict(), [], [next(given) for _ in range(max(length, 3))]
 
-        def with_env(chosen: list[Tensor] = chosen, controls: list[Tensor] = controls) -> None:
+        def whole(chosen: list[Tensor] = chosen, targets: list[Any] = targets) -> None:
             for action in chosen:
                 env.step(action)
-                controls.append(env.sim.ctrl.clone())
+                targets.append((env.sim.ctrl.clone(), env.actuation.memory()["past"].clone()))
 
-        def without(controls: list[Tensor] = controls) -> None:
-            for control in controls:
-                step(control)
-
-        for times, work in zip(taken, (with_env, without), strict=True):
-            times.append(clock.seconds(work) / length)
+        times = [clock.seconds(whole)]
+        for other in others:
+            other.begin(state)
+            times.append(clock.seconds(lambda other=other, targets=targets: [other.step(target) for target in targets]))
+        for own, took in zip(taken, times, strict=True):
+            own.extend([took / len(chosen)] if block else [])
     return taken
 
 
@@ -231,10 +241,18 @@ def split(env: TouchEnv, num_steps: int = 30) -> dict[str, float]:
 
 
 def used_memory(device: torch.device) -> float:
-    """Return the memory in use [MB]: the GPU's, or this process's."""
+    """Return what memory this process uses [MB]: the GPU's, of all processes if they cannot be told apart, or the host's."""
     if device.type == "cuda":
-        free, total = torch.cuda.mem_get_info()
-        return (total - free) / 1e6
+        try:
+            import pynvml
+
+            pynvml.nvmlInit()
+            gpu = pynvml.nvmlDeviceGetHandleByIndex(torch.cuda.current_device())
+            own = [p for p in pynvml.nvmlDeviceGetComputeRunningProcesses(gpu) if p.pid == os.getpid() and p.usedGpuMemory]
+            return own[0].usedGpuMemory / 1e6
+        except Exception:
+            free, total = torch.cuda.mem_get_info()
+            return (total - free) / 1e6
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 
@@ -273,6 +291,20 @@ def go_on(env: TouchEnv, seconds: float) -> dict[str, float]:
     }
 
 
+def times_of(options: argparse.Namespace, env: TouchEnv, task: Path, cone: str) -> dict[str, Any]:
+    """Return the medians of what a step takes, with and without what is not physics and module."""
+    plain = [make(options, task, cone) for _ in range(2 if options.alone else 0)]
+    others = [Alone(own, is_ideal) for own, is_ideal in zip(plain, (False, True), strict=False)]
+    blocks = compare(options, env, others)
+    for own in plain:
+        own.close()
+    whole, *alone = (statistics.median(times) for times in blocks)
+    found: dict[str, Any] = {"step_ms": 1e3 * whole, "steps_per_s": env.num_envs / whole, "blocks": blocks}
+    for name, took in zip(("", "_ideal"), alone, strict=False):
+        found |= {f"alone{name}_ms": 1e3 * took, f"ratio{name}": whole / took}
+    return found
+
+
 def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any]:
     """Return all that is measured of a task with a friction cone."""
     start = time.perf_counter()
@@ -284,31 +316,28 @@ def measure(options: argparse.Namespace, task: Path, cone: str) -> dict[str, Any
     row: dict[str, Any] = {"task": task.stem, "cone": cone, "envs": env.num_envs, "first_s": time.perf_counter() - start}
     for _ in range(options.warm):
         env.step(next(given))
-    plain = make(options, task, cone)
-    blocks, blocks_alone = compare(options, env, plain)
-    plain.close()
-    del plain
-    whole, bare = statistics.median(blocks), statistics.median(blocks_alone)
-    row |= {"step_ms": 1e3 * whole, "alone_ms": 1e3 * bare, "ratio": whole / bare, "steps_per_s": env.num_envs / whole}
-    row["blocks"] = [blocks, blocks_alone]
-    parts = split(env)
-    total = sum(parts.values())
-    row["parts_ms"] = {label: 1e3 * took for label, took in parts.items()}
-    row |= {f"{part}_%": 100.0 * sum(t for label, t in parts.items() if share_of(label) == part) / total for part in PARTS}
+    if options.blocks:
+        row |= times_of(options, env, task, cone)
+        parts = split(env)
+        total = sum(parts.values())
+        row["parts_ms"] = {label: 1e3 * took for label, took in parts.items()}
+        row |= {f"{part}_%": 100.0 * sum(t for name, t in parts.items() if share_of(name) == part) / total for part in PARTS}
     if options.seconds:
         row["long"] = go_on(env, options.seconds)
     env.close()
     return row
 
 
-COLUMNS = ("task", "cone", "envs", "first_s", "step_ms", "alone_ms", "ratio", "steps_per_s", *(f"{part}_%" for part in PARTS))
+TIMES = ("first_s", "step_ms", "alone_ms", "alone_ideal_ms", "ratio", "ratio_ideal", "steps_per_s")
+COLUMNS = ("task", "cone", "envs", *TIMES, *(f"{part}_%" for part in PARTS))
 
 
 def told(row: dict[str, Any]) -> str:
     """Return a row as text."""
-    cells = [f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name]) for name in COLUMNS]
-    lines = ["  ".join(f"{name} {cell}" for name, cell in zip(COLUMNS, cells, strict=True))]
-    lines += ["  parts [ms]: " + ", ".join(f"{label} {took:.3f}" for label, took in row["parts_ms"].items())]
+    known = {name: row[name] for name in COLUMNS if name in row}
+    lines = ["  ".join(f"{name} {cell:.4g}" if isinstance(cell, float) else f"{name} {cell}" for name, cell in known.items())]
+    if "parts_ms" in row:
+        lines += ["  parts [ms]: " + ", ".join(f"{label} {took:.3f}" for label, took in row["parts_ms"].items())]
     if "long" in row:
         lines += ["  long: " + ", ".join(f"{name} {value:.6g}" for name, value in row["long"].items())]
     return "\n".join(lines)
@@ -323,7 +352,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2, help="of physics and torch, on the CPU")
     parser.add_argument("--cones", nargs="+", default=["elliptic", "pyramidal"])
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the documents")
-    parser.add_argument("--blocks", type=int, default=20)
+    parser.add_argument("--blocks", type=int, default=20, help="0: time nothing")
+    parser.add_argument("--alone", action=argparse.BooleanOptionalAction, default=True, help="time physics and module alone")
     parser.add_argument("--steps", type=int, default=20, help="control steps of a block")
     parser.add_argument("--warm", type=int, default=WARM_STEPS, help="control steps before anything is timed")
     parser.add_argument("--seconds", type=float, default=0.0, help="how long to go on afterwards")

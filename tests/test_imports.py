@@ -192,3 +192,21 @@ def test_pymeshlab_is_imported_in_one_function():
     """It is GPL-3: no compiled module, and nothing that only imports tgdsl, may load it."""
     found = [(name, is_inside) for name, file in MODULES.items() for i, is_inside in imports(file) if room_of(i) == "pymeshlab"]
     assert found == [("surfaces.meshlab", True)]
+
+
+def test_what_learners_bring_is_imported_by_adapters_and_the_video():
+    """It is an extra; what is imported in no function is in a file that nothing else of tgdsl imports."""
+    learners = ("gymnasium", "rsl_rl", "tensordict", "imageio_ffmpeg", "skrl", "stable_baselines3")
+    found = {
+        (name, room_of(i), is_inside)
+        for name, file in MODULES.items()
+        for i, is_inside in imports(file)
+        if room_of(i) in learners
+    }
+    assert found == {
+        ("rl.adapters.gymnasium", "gymnasium", False),
+        ("rl.adapters.rsl_rl", "rsl_rl", False),
+        ("rl.adapters.rsl_rl", "tensordict", False),
+        ("rl.playing.video", "imageio_ffmpeg", True),
+    }
+    assert not [name for name, file in MODULES.items() if any(i.startswith("rl.adapters") for i in own(file))]

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from tgdsl.module.module import TactileModule
     from tgdsl.module.state import SceneState
     from tgdsl.module.taxels.identity import check_taxels as check_taxels
+    from tgdsl.rl.env import TouchEnv
     from tgdsl.runtime.batch.simulation import BatchSimulation
     from tgdsl.runtime.connect import connect as connect
     from tgdsl.runtime.simulate import simulate as simulate
@@ -52,6 +53,7 @@ _PLACES = {
     "TactileModule": "module.module",
     "TaxelError": "errors",
     "TgdslError": "errors",
+    "TouchEnv": "rl.env",
     "WarpSimulation": "runtime.warp",
     "check_taxels": "module.taxels.identity",
     "compile": "compiler.pipeline",
@@ -76,6 +78,7 @@ __all__ = [
     "TactileModule",
     "TaxelError",
     "TgdslError",
+    "TouchEnv",
     "WarpSimulation",
     "check_taxels",
     "compile",

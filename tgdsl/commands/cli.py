@@ -15,6 +15,7 @@ from tgdsl.commands.calibrate import Calibrate
 from tgdsl.commands.compile import Compile
 from tgdsl.commands.explain import Explain
 from tgdsl.commands.export_usd import ExportUsd
+from tgdsl.commands.grasps import Grasps
 from tgdsl.commands.hand.hand import Hand
 from tgdsl.commands.import_ import Import
 from tgdsl.commands.layout.layout import Layout
@@ -37,6 +38,7 @@ Command = (
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
     | Annotated[Cache, tyro.conf.subcommand("cache")]
+    | Annotated[Grasps, tyro.conf.subcommand("grasps")]
     | Annotated[Hand, tyro.conf.subcommand("hand")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
 )

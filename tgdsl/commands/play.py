@@ -14,7 +14,7 @@ from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.rl.env import TouchEnv
-    from tgdsl.rl.playing.actions import Actor
+    from tgdsl.rl.playing.actor import Actor
     from tgdsl.rl.playing.record import Record
 
 _FILES = {"record": "played.npz", "video": "played.mp4"}

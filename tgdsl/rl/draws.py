@@ -47,7 +47,7 @@ class Draws:
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._keys: dict[str, Int[Tensor, " half"]] = {}
         self._index: dict[int, Int[Tensor, " num"]] = {}
-        self._hashed = FusedCall(self._hash, is_compiled, has_fixed_shapes=False)
+        self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
         """Choose another seed, in place: graphs that were captured draw its numbers."""
@@ -67,27 +67,33 @@ class Draws:
             low: Lower bound.
             high: Upper bound.
         """
-        return low + (high - low) * uniform(self._words(what, counter, num), torch.float32)
+        return low + (high - low) * self._shares(*self._stream(what, num), counter)
 
     def normal(self, what: str, counter: Int[Tensor, " env"], num: int) -> Float[Tensor, "env num"]:
         """Return numbers of mean 0 and variance 1, float32: see `uniform`."""
-        first, second = normal_pair(self._words(what, counter, (num + 1) // 2), torch.float32)
+        first, second = normal_pair(self._words(*self._stream(what, (num + 1) // 2), counter), torch.float32)
         return torch.cat([first, second], dim=1)[:, :num]
 
     def integers(self, what: str, counter: Int[Tensor, " env"], num: int, low: int, high: int) -> Int[Tensor, "env num"]:
         """Return whole numbers from `low` to `high`, both included: see `uniform`."""
-        share = uniform(self._words(what, counter, num), torch.float32)
+        share = self._shares(*self._stream(what, num), counter)
         return low + (share * (high - low + 1)).to(torch.int64).clamp(max=high - low)
 
-    def _words(self, what: str, counter: Int[Tensor, " env"], num: int) -> Int[Tensor, "env num"]:
+    def _stream(self, what: str, num: int) -> tuple[Int[Tensor, " half"], Int[Tensor, " num"]]:
+        """Return the key of what numbers are for, and their places in the stream."""
         if what not in self._keys:  # at the first call: a graph that is captured later copies nothing from the host
             self._keys[what] = torch.tensor(sensor_key(self.seed, what), dtype=torch.int32, device=self._device)
         if num not in self._index:
             self._index[num] = torch.arange(num, dtype=torch.int32, device=self._device)
-        return self._hashed(self._keys[what], counter, self._index[num])
+        return self._keys[what], self._index[num]
+
+    def _share(
+        self, key: Int[Tensor, " half"], index: Int[Tensor, " num"], counter: Int[Tensor, " env"]
+    ) -> Float[Tensor, "env num"]:
+        return uniform(self._hash(key, index, counter), torch.float32)
 
     def _hash(
-        self, key: Int[Tensor, " half"], counter: Int[Tensor, " env"], index: Int[Tensor, " num"]
+        self, key: Int[Tensor, " half"], index: Int[Tensor, " num"], counter: Int[Tensor, " env"]
     ) -> Int[Tensor, "env num"]:
         low, high = counter.to(torch.int32)[:, None], mix((counter >> 32).to(torch.int32))[:, None]
         begun = mix(mix(mix(self._envs.to(torch.int32)[:, None] ^ key) ^ low) ^ high)

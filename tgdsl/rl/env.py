@@ -18,12 +18,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.console.progress import Progress
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.sensed import GROUP, compile_sensed
@@ -31,6 +32,8 @@ from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_
 from tgdsl.rl.task import Now
 from tgdsl.tensors.fused import FusedCall
 
+PREPARING_STEPS = 3
+"""The third step is captured on a GPU, and the second one compiled."""
 Observations = dict[str, Float[Tensor, "env feature"]]
 
 
@@ -136,6 +139,7 @@ class TouchEnv:
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
         setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
+        setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         try:
             self.task = loaded.task(self.spec, setup)
         except LowerError as error:
@@ -156,6 +160,7 @@ class TouchEnv:
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
         self._readings: dict[str, Tensor] = {}
+        self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
 
@@ -276,6 +281,16 @@ class TouchEnv:
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
         return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+
+    def _prepare(self, tell: Progress, is_compiled: bool) -> None:
+        """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
+        is_cuda = self.sim.qpos.is_cuda
+        if not (is_cuda or is_compiled):
+            return
+        tell(f"compiling kernels of {'physics and touch' if is_cuda else 'touch'}, which are kept for the next run")
+        self.reset()
+        for _ in range(PREPARING_STEPS):
+            self.step(torch.zeros_like(self._action))
 
     def _begin(self, chosen: Bool[Tensor, " env"]) -> None:
         """Begin episodes of some environments."""

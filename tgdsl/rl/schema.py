@@ -12,14 +12,18 @@ from tgdsl.schema.conditional import conditional
 
 def task_schema() -> dict[str, Any]:
     """Return the schema of all tasks of tgdsl by name; of one's own task it knows what all tasks have in common."""
-    specs: dict[str, type[TaskSpec]] = {name: getattr(import_module(place), own).Spec for name, (place, own) in TASKS.items()}
+    specs: dict[str, type[TaskSpec]] = {
+        name: getattr(import_module(place), class_).Spec for name, (place, class_) in TASKS.items()
+    }
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")
         definitions |= schema.pop("$defs", {})
         schema.pop("title", None)
         definitions[model.__name__] = schema
-    definitions["TaskSpec"]["additionalProperties"] = True
+    own = definitions["TaskSpec"]
+    own["additionalProperties"] = True
+    own["properties"]["randomise"] = {"type": "object", "description": own["properties"]["randomise"]["description"]}
     definitions = {name: conditional(definition, definitions) for name, definition in definitions.items()}
     chain: dict[str, Any] = {"$ref": "#/$defs/TaskSpec"}
     for name, model in reversed(specs.items()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,13 +42,16 @@ class Sensed:
     object: str
 
 
-def compile_sensed(loaded: LoadedTask, device: torch.device | str, progress: Progress | None = None) -> Sensed:
+def compile_sensed(
+    loaded: LoadedTask, device: torch.device | str, progress: Progress | None = None, only: Sequence[str] | None = None
+) -> Sensed:
     """Compile what a task's environments feel.
 
     Args:
         loaded: The task's document.
         device: Where the module lives.
         progress: Is told in a line what is being done.
+        only: Kinds of sensors that are taken instead of those that the policy feels and the task looks at.
 
     Raises:
         SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
@@ -65,12 +69,12 @@ def compile_sensed(loaded: LoadedTask, device: torch.device | str, progress: Pro
         what = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
         raise loaded.error(("object",), what)
     kinds = {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
-    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in loaded.task.senses}
+    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
     felt = None
-    if spec.touch != "none":
+    if spec.touch != "none" and only is None:
         kind, observed = SENSED[spec.touch]
         felt = _sensor_of(loaded, kinds, kind, ("touch",))
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}

@@ -25,12 +25,13 @@ from torch import Tensor
 
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
+from tgdsl.rl.grasps.table import GraspTable
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import put_rows
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -56,6 +57,7 @@ class Setup:
         friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
         mass: Mass of each object [kg], likewise.
         draws: Random numbers.
+        grasps: Grasps that episodes begin from; None if the task's document has none.
     """
 
     num_envs: int
@@ -74,6 +76,7 @@ class Setup:
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
     draws: Draws
+    grasps: GraspTable | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +171,7 @@ class Task(ABC, Generic[S]):
         """Set what is remembered of some environments, by name."""
         for name, value in values.items():
             own = self.memory[name]
-            new = value.to(own.dtype) if isinstance(value, Tensor) else value
-            own.copy_(torch.where(broadcast_over(chosen, own), new, own))
+            put_rows(own, chosen, value.to(own.dtype) if isinstance(value, Tensor) else value)
 
     @abstractmethod
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:

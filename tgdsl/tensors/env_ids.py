@@ -91,3 +91,18 @@ def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "
     With `torch.where` or `masked_fill_` it then chooses whole environments.
     """
     return mask.view(-1, *[1] * (values.ndim - 1))
+
+
+def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) -> None:
+    """Write new values into chosen environments of a tensor (env, …), by one kernel.
+
+    Args:
+        target: Is written into.
+        chosen: The environments.
+        new: One number, or values that broadcast to the tensor, of its dtype.
+    """
+    mask = broadcast_over(chosen, target)
+    if isinstance(new, Tensor):
+        torch.where(mask, new, target, out=target)
+    else:
+        target.masked_fill_(mask, new)

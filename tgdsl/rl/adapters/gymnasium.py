@@ -5,8 +5,9 @@ one in the same step (`AutoresetMode.SAME_STEP`): `info["final_obs"]` has the la
 `info["final_info"]` what is told of its last step. Entries of `info` are those of `StepInfo`, each with its mask under `_` and
 its name.
 
-gymnasium's wrappers of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of this mode;
-the argument `groups` leaves out what a policy shall not see. All its other wrappers take this environment.
+Of gymnasium's wrappers, those of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of
+this mode: the argument `groups` leaves out what a policy shall not see. `NumpyToTorch` cannot convert `final_obs` as an array:
+`output="torch"` takes its place. All others take this environment.
 
 Shapes: `env` environments, `joint` joints that the policy moves.
 """
@@ -14,7 +15,8 @@ Shapes: `env` environments, `joint` joints that the policy moves.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from operator import index
+from typing import Any, Literal, SupportsIndex
 
 import numpy as np
 import torch
@@ -47,7 +49,7 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         device: Where tensors are.
     """
 
-    def __init__(self, touch_env: TouchEnv, output: Output = "numpy", groups: Sequence[str] | None = None):
+    def __init__(self, touch_env: TouchEnv, output: Output | str = "numpy", groups: Sequence[str] | None = None):
         """Translate an environment.
 
         Args:
@@ -75,7 +77,9 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: SupportsIndex | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin a new episode in all environments.
 
         Args:
@@ -88,12 +92,13 @@ class TouchVectorEnv(VectorEnv[dict[str, Any], Any, Any]):
         Raises:
             TgdslError: If there is a seed per environment, or an option.
         """
-        if seed is not None and not isinstance(seed, (int, np.integer)):
+        if isinstance(seed, Sequence):
             raise TgdslError(f"seed is {seed!r}: expected one whole number for all environments, which makes those of each")
         if options:
             raise TgdslError(f"reset has no options, found {', '.join(map(repr, options))}: all environments begin anew")
-        super().reset(seed=seed)
-        return self._obs(self.touch_env.reset(None if seed is None else int(seed))), {}
+        chosen = None if seed is None else index(seed)
+        super().reset(seed=chosen)
+        return self._obs(self.touch_env.reset(chosen)), {}
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Make one control step.

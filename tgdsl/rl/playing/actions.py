@@ -1,4 +1,4 @@
-"""Who acts: nobody, chance, a script or a learned policy.
+"""Actions that nobody has learned: none, random ones, those of a script.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
@@ -9,38 +9,29 @@ import runpy
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.actor import Actor
 
 KINDS = ("zero", "random", "script")
 """Actions by one word; else they are a function of a file, `FILE.py:FUNCTION`."""
+ScriptFunction = Callable[[TouchEnv, Mapping[str, Tensor]], Any]
+"""Takes an environment and its observations by group, and returns actions (env, joint)."""
 
 
 class ScriptError(TgdslError):
     """A script that cannot be run, or whose actions do not fit."""
 
 
-class Actor(Protocol):
-    """Who acts."""
-
-    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
-        """Return the actions, from −1 to 1, for observations."""
-        ...
-
-    def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget what is remembered of episodes that have ended."""
-        ...
-
-
-class Zero:
-    """Nobody: zeros."""
+class ZeroActor(Actor):
+    """Asks for nothing: zeros."""
 
     def __init__(self, env: TouchEnv):
         """Begin."""
@@ -50,11 +41,8 @@ class Zero:
         """Return zeros."""
         return self._action
 
-    def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Do nothing."""
 
-
-class Chance:
+class RandomActor(Actor):
     """Numbers from −1 to 1, the same for an environment however many there are."""
 
     def __init__(self, env: TouchEnv, seed: int):
@@ -68,22 +56,20 @@ class Chance:
         self._count += 1
         return self._draws.uniform("played actions", self._count, self._num, -1.0, 1.0)
 
-    def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Do nothing."""
 
+class ScriptActor(Actor):
+    """A function of the environment and its observations."""
 
-class Script:
-    """A function of the environment and its observations that returns actions."""
-
-    def __init__(self, env: TouchEnv, function: Callable[[TouchEnv, Mapping[str, Tensor]], Any], name: str):
+    def __init__(self, env: TouchEnv, function: ScriptFunction, name: str, file: str = ""):
         """Begin.
 
         Args:
             env: The environment.
-            function: Returns actions (env, joint).
-            name: What it is called in errors.
+            function: Returns the actions.
+            name: What errors call it.
+            file: The file that it is in, if errors shall name the line in it.
         """
-        self._env, self._function, self._name = env, function, name
+        self._env, self._function, self._name, self._file = env, function, name, file
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
         """Return what the function returns.
@@ -91,21 +77,19 @@ class Script:
         Raises:
             ScriptError: If it raises anything, or what it returns does not fit.
         """
-        env = self._env
+        env, wanted = self._env, (self._env.num_envs, self._env.num_actions)
         try:
-            action = torch.as_tensor(self._function(env, obs), dtype=torch.float32, device=env.device)
-        except TgdslError:
-            raise
+            found = self._function(env, obs)
         except Exception as error:  # whatever a user's code raises
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            raise ScriptError(f"{place.filename}:{place.lineno}: {self._name}: {type(error).__name__}: {error}") from error
-        if tuple(action.shape) != (env.num_envs, env.num_actions):
-            wanted = f"({env.num_envs}, {env.num_actions})"
+            place = f"{_place(self._file, error)}: {self._name}" if self._file else self._name
+            raise ScriptError(f"{place}: {type(error).__name__}: {error}") from error
+        try:
+            action = torch.as_tensor(found, dtype=torch.float32, device=env.device)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ScriptError(f"{self._name}: actions are {type(found).__name__}, expected {wanted} numbers") from error
+        if tuple(action.shape) != wanted:
             raise ScriptError(f"{self._name}: actions have shape {tuple(action.shape)}, expected {wanted}")
         return action
-
-    def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Do nothing: a script knows `env.steps`."""
 
 
 def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
@@ -113,20 +97,20 @@ def actor_of(env: TouchEnv, actions: str, seed: int = 0) -> Actor:
 
     Args:
         env: The environment.
-        actions: One of `KINDS`, `script` being the task's own method `script(obs)`; or `FILE.py:FUNCTION`: the function takes
-            the environment and its observations, and returns actions (env, joint).
-        seed: What chance follows from.
+        actions: One of `KINDS`, `script` being the task's own method `script(obs)`; or `FILE.py:FUNCTION`, a `ScriptFunction`.
+        seed: What random actions follow from.
 
     Raises:
         ScriptError: If there is no such script.
     """
     if actions == "zero":
-        return Zero(env)
+        return ZeroActor(env)
     if actions == "random":
-        return Chance(env, seed)
+        return RandomActor(env, seed)
     if actions == "script":
-        return Script(env, _own_script(env), f"the script of {env.spec.task}")
-    return Script(env, _function(actions), actions)
+        return ScriptActor(env, _own_script(env), f"the script of {env.spec.task}")
+    function, file, name = _script_of(actions)
+    return ScriptActor(env, function, name, file)
 
 
 def check_actions(actions: str) -> None:
@@ -136,18 +120,18 @@ def check_actions(actions: str) -> None:
         ScriptError: If there is no such script.
     """
     if actions not in KINDS:
-        _function(actions)
+        _script_of(actions)
 
 
-def _own_script(env: TouchEnv) -> Callable[[TouchEnv, Mapping[str, Tensor]], Any]:
+def _own_script(env: TouchEnv) -> ScriptFunction:
     script = getattr(env.task, "script", None)
     if script is None:
         raise ScriptError(f'the task "{env.spec.task}" brings no script of its own; name one as FILE.py:FUNCTION')
     return lambda _, obs: script(obs)
 
 
-def _function(actions: str) -> Callable[[TouchEnv, Mapping[str, Tensor]], Any]:
-    """Return the function that `FILE.py:FUNCTION` names.
+def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
+    """Return the function that `FILE.py:FUNCTION` names, the file and the function's name.
 
     Raises:
         ScriptError: If there is none.
@@ -164,12 +148,12 @@ def _function(actions: str) -> Callable[[TouchEnv, Mapping[str, Tensor]], Any]:
     functions = [key for key, value in found.items() if callable(value) and not key.startswith("_")]
     if not callable(found.get(name)):
         raise ScriptError(f'{file}: there is no function "{name}"; {did_you_mean(name, functions, "functions")}')
-    return found[name]
+    return found[name], file, name
 
 
 def _place(file: str, error: Exception) -> str:
-    """Return the file, and the line in it that raised."""
-    if isinstance(error, SyntaxError):
+    """Return a file, and the line in it that an error comes from."""
+    if isinstance(error, SyntaxError) and error.filename == file:
         return f"{file}:{error.lineno}"
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     return f"{file}:{lines[-1]}" if lines else file

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import Step, TouchEnv
-from tgdsl.rl.playing.actions import Actor
+from tgdsl.rl.playing.actor import Actor
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,8 @@ class Played:
     Attributes:
         index: Its number, from 0.
         obs: Observations that the action was chosen from, by group.
-        qpos: MuJoCo's `qpos` at the same instant.
+        qpos: MuJoCo's `qpos` at the start of this step; observations are of one physics step before, but for the first of an
+            episode.
         action: The action.
         step: What came of it.
     """

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.rl.playing.actor import Actor
 
 ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 """Groups that a policy sees unless others are named: of these, those that there are."""
@@ -42,7 +43,7 @@ def actor_groups(groups: Mapping[str, int], named: Sequence[str] = ()) -> tuple[
     return tuple(named) or tuple(name for name in ACTOR_GROUPS if name in groups)
 
 
-class Policy:
+class Policy(Actor):
     """A learned policy that acts in some environments.
 
     Attributes:
@@ -89,7 +90,7 @@ class Policy:
             return self._module(torch.cat([obs[name] for name in self.groups], dim=1))
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget what is remembered of episodes that have ended; a recurrent policy from rsl_rl has one environment alone."""
+        """Forget what is remembered, if all episodes have ended: a recurrent policy of rsl_rl takes one environment alone."""
         if hasattr(self._module, "reset") and bool(ended.all()):
             self._module.reset()
 

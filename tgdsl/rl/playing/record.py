@@ -21,11 +21,11 @@ from tgdsl.runtime.simulators.memory import refuse_beyond_memory
 class Record:
     """Keeps steps and writes them.
 
-    The file holds, of each control step, what the action was chosen from: `time` (step,) [s], `obs:<group>` (step, env,
-    feature), `qpos` (step, env, nq); the `action` (step, env, joint); and what came of it: `reward`, `term:<name>` (weight and
-    Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. Of each episode that has ended it holds
-    `ended:step`, `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations
-    `ended:obs:<group>` (episode, feature). `joints` and `score_unit` say what joints and scores are.
+    The file holds, of each control step, its start's `time` (step,) [s], the observations `obs:<group>` (step, env, feature)
+    that the action was chosen from, `qpos` (step, env, nq), the `action` (step, env, joint); and what came of it: `reward`,
+    `term:<name>` (weight and Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. See `Played`. Of each
+    episode that has ended it holds `ended:step`, `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its
+    last observations `ended:obs:<group>` (episode, feature). `joints` and `score_unit` say what joints and scores are.
     """
 
     def __init__(self, env: TouchEnv, num_steps: int):

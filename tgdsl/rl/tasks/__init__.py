@@ -1,7 +1,9 @@
 """Tasks, one file each."""
 
 TASKS: dict[str, tuple[str, str]] = {
-    "in_palm_rotate": ("tgdsl.rl.tasks.in_palm_rotate", "InPalmRotate"),
     "grip_force": ("tgdsl.rl.tasks.grip_force", "GripForce"),
+    "in_hand_repose": ("tgdsl.rl.tasks.in_hand_repose", "InHandRepose"),
+    "in_palm_rotate": ("tgdsl.rl.tasks.in_palm_rotate", "InPalmRotate"),
+    "screwdriver": ("tgdsl.rl.tasks.screwdriver", "Screwdriver"),
 }
 """The tasks of tgdsl by name: module and class."""

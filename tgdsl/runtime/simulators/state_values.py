@@ -137,7 +137,7 @@ class StateTable:
 
     def _judged(self, name: str, value: Float[Tensor, "env ..."]) -> tuple[Float[Tensor, "env ..."], Bool[Tensor, "2 env"]]:
         """Return a value with quaternions of unit length, and where it is not finite and where a quaternion is zero."""
-        is_finite = torch.isfinite(value) & torch.isfinite(value.to(self._arrays[name].dtype))
+        is_finite = torch.isfinite(value.to(self._arrays[name].dtype))
         is_unfinite = ~(is_finite.flatten(1).all(dim=1) if is_finite.ndim > 1 else is_finite)
         quats = None
         if name == "qpos" and len(self._quats):

@@ -90,14 +90,19 @@ class WorldProperties(ObjectProperties):
         own[:, geoms, 0] = torch.where(mask[:, None], friction.to(own.dtype)[:, None], own[:, geoms, 0])
 
     def _mass(self, target: RigidObject) -> Float[Tensor, " env"]:
-        self._check("mass")
-        own = self._fields["body_mass"]
+        own = self._values("body_mass")
         return own[:, self._index(target, "bodies", own.device)].sum(dim=1)
 
     def _friction(self, target: RigidObject) -> Float[Tensor, " env"]:
-        self._check("friction")
-        own = self._fields["geom_friction"]
+        own = self._values("geom_friction")
         return own[:, self._index(target, "geoms", own.device), 0].amax(dim=1)
+
+    def _values(self, field: str) -> Float[Tensor, "env ..."]:
+        """Return what each environment has of a field of the model, also where all share it."""
+        if field in self._fields:
+            return self._fields[field]
+        shared = torch.from_numpy(getattr(self._model, field)).to(self._device, torch.float32)
+        return shared.expand(self._num_envs, *shared.shape)
 
     def _check(self, word: str) -> None:
         if not self._fields.keys() >= set(PER_ENV[word]):

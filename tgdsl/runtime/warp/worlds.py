@@ -24,7 +24,8 @@ from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows
 from tgdsl.runtime.warp.contacts import PairContacts, foreign_sensors
 from tgdsl.runtime.warp.faults import Faults
 from tgdsl.runtime.warp.stream import GraphedCall, WarpStream, libraries
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import put_rows
+from tgdsl.tensors.torch_internals import copy_each
 
 _VELOCITIES = ("cvel", "cdof_dot")
 """What `forward` finds of velocities, and takes of the evaluation before for the constraints of loops."""
@@ -189,7 +190,7 @@ class Worlds:
             for name, values in rows.values.items():
                 array = self.arrays[name]
                 if array.numel():
-                    array.copy_(torch.where(broadcast_over(is_put, array), values, array))
+                    put_rows(array, is_put, values)
 
     def make_stale(self, mask: Bool[Tensor, " env"]) -> None:
         """Have poses, velocities and contacts of some environments evaluated when they are next asked for."""
@@ -225,7 +226,8 @@ class Worlds:
         It is for a `GraphedCall`.
         """
         arrays = {name: self.arrays[name] for name in (*_DERIVED, "history")} | self.contacts.arrays
-        earlier = {name: array.clone() for name, array in arrays.items()}
+        arrays = {name: array for name, array in arrays.items() if array.numel()}
+        earlier = _copied(arrays)
         for _ in range(2 if self._has_loops else 1):
             self._mjw.forward(self.model, self.data)
         self.contacts.update(self.model, self.data)
@@ -237,8 +239,8 @@ class Worlds:
 
         Those of all are evaluated, which costs little, and the others are given back their earlier instant.
         """
-        arrays = {name: self.arrays[name] for name in _DERIVED}
-        earlier = {name: array.clone() for name, array in arrays.items()}
+        arrays = {name: self.arrays[name] for name in _DERIVED if self.arrays[name].numel()}
+        earlier = _copied(arrays)
         self._mjw.fwd_kinematics(self.model, self.data)
         self._mjw.com_vel(self.model, self.data)
         self._give_back(self._is_reset, earlier, arrays)
@@ -246,12 +248,11 @@ class Worlds:
 
     def _give_back(self, is_new: Bool[Tensor, " env"], earlier: Mapping[str, Tensor], arrays: Mapping[str, Tensor]) -> None:
         """Give environments that are not new back what they had, and take the joints of those that are."""
+        is_old = ~is_new
         for name, before in earlier.items():
-            array = arrays[name]
-            if array.numel():
-                array.copy_(torch.where(broadcast_over(is_new, array), array, before))
+            put_rows(arrays[name], is_old, before)
         for name, kept in self.kept.items():
-            kept.copy_(torch.where(broadcast_over(is_new, kept), self.arrays[name], kept))
+            put_rows(kept, is_new, self.arrays[name])
 
     def forget_graphs(self) -> None:
         """Capture anew at the next calls."""
@@ -284,11 +285,11 @@ class Worlds:
         for name, start in self._start.items():
             array = self.arrays[name]
             if array.numel():
-                array.copy_(torch.where(broadcast_over(self._is_reset, array), start, array))
+                put_rows(array, self._is_reset, start)
         for name in _VELOCITIES:
             array = self.arrays[name]
             if array.numel():  # what is not a number there would come back in the next evaluation
-                array.masked_fill_(broadcast_over(self._is_reset, array), 0.0)
+                put_rows(array, self._is_reset, 0.0)
         self.faults.clear(self._is_reset)
         self._is_stale |= self._is_reset
 
@@ -301,6 +302,13 @@ def constraint_rows(model: mujoco.MjModel, num_contacts: int) -> int:
     limits = np.count_nonzero(model.jnt_limited) + 2 * np.count_nonzero(model.tendon_limited)
     friction = np.count_nonzero(model.dof_frictionloss) + np.count_nonzero(model.tendon_frictionloss)
     return int(num_contacts * per_contact + 6 * model.neq + 2 * limits + friction)
+
+
+def _copied(arrays: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies of float32 arrays, made by one kernel."""
+    copies = {name: torch.empty_like(array) for name, array in arrays.items()}
+    copy_each(list(copies.values()), list(arrays.values()))
+    return copies
 
 
 def _view(wp: Any, array: Any, stream: WarpStream) -> Tensor:

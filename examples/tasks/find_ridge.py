@@ -1,0 +1,213 @@
+"""Slide a fingertip over a plate, and stop on a ridge whose place only touch tells: a task of one's own, to copy.
+
+An episode begins with the fingertip just above the plate, at one of its ends; the ridge is further on, uniformly distributed.
+With p the middle of the pad and v its velocity, r the ridge's place, both across the ridge, and f the ridge's force on the
+fingertip, the fingertip
+
+    rests        |p − r| ≤ ε  and  |f| ≥ f_min  and  |v| ≤ v_max
+
+An episode ends when its time is over, and has gone well if the fingertip rests then. That is its end for good: nothing is
+worth anything later. Who knows nothing of the ridge does best at a fixed place, where it rests with a probability of at most
+2 ε / (b − a), r being uniform on [a, b]: `chance`.
+
+Groups: `command` holds the targets of the joints [rad], the last action and the share of the episode that is left, none of
+which knows of the ridge; `priv_ridge` p − r [m], v [m/s] and |f| [N]. Measured positions of the joints are in `proprio`; where
+they differ from the targets something is in the way, so a policy without touch must not have them.
+
+The reward is the sum of these terms times Δt.
+
+    rest               w · (rests)                                               1 1/s
+    found              w · (rests, at the end)                                   80 1/s
+    action_rate        w · |a_t − a_{t−1}|²                                      −1e-3 1/s
+
+Without touch all places within [a + ε, b − ε] pay the same, so nothing but chance can be learned. Score: whether it rests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.fields.models import Position, PositiveLength, Quantity, Range, RangeOf, SpecModel
+from tgdsl.rl import rotations, terms
+from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.runtime.simulators.watch import Watch
+
+ACROSS = 1
+"""World axis across the ridge."""
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    rest: Weight = 1.0
+    """The fingertip rests on the ridge [1/s]."""
+    found: Weight = 80.0
+    """It does so at the end [1/s]."""
+    action_rate: Weight = -1e-3
+    """Change of the action [1/s]."""
+
+
+class RidgeRandomSpec(RandomSpec):
+    """What is random."""
+
+    place: Annotated[Range, RangeOf("length")] = (-0.008, 0.016)
+    """a and b: where the ridge is, along the world's y [m]."""
+
+
+class FindRidgeSpec(TaskSpec):
+    """Stop on a ridge that can only be felt."""
+
+    randomise: RidgeRandomSpec = RidgeRandomSpec()
+    """What is random."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    tip: str = "right_hand_index_rota_link2"
+    """The body of the fingertip."""
+    pad: Position = (0.009, 0.0, 0.032)
+    """The middle of its pad, in its frame [m]."""
+    tolerance: PositiveLength = 0.001
+    """ε: how far the ridge may be from the middle of the pad [m]."""
+    min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.1
+    """f_min: less force of the ridge is no rest [N]."""
+    max_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.01
+    """v_max: faster is no rest [m/s]."""
+
+
+def chance(spec: FindRidgeSpec) -> float:
+    """Return the probability with which the best fixed place is on the ridge."""
+    low, high = spec.randomise.place
+    return min(1.0, 2.0 * spec.tolerance / (high - low)) if high > low else 1.0
+
+
+def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: of the fingertip `pos` [m], `quat`, `linvel` [m/s] and
+            `angvel` [rad/s]; `place`, where the ridge is [m]; `force`, of the ridge on the fingertip [N]; and `action`.
+        dt: Δt [s].
+    """
+    weights, rows = spec.rewards, []
+    for t in range(1, len(record["pos"])):
+        w, x, y, z = record["quat"][t]
+        turned = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        arm = turned @ np.array(spec.pad)
+        offset = record["pos"][t][ACROSS] + arm[ACROSS] - record["place"][t]
+        speed = (record["linvel"][t] + np.cross(record["angvel"][t], arm))[ACROSS]
+        rests = (
+            abs(offset) <= spec.tolerance
+            and np.linalg.norm(record["force"][t]) >= spec.min_force
+            and abs(speed) <= spec.max_speed
+        )
+        is_over = t >= round(spec.episode / dt)
+        row = {
+            "rest": weights.rest * rests,
+            "found": weights.found * (rests and is_over),
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+        }
+        rows.append(row | {"is_over": is_over, "score": float(rests)})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+class FindRidge(Task[FindRidgeSpec]):
+    """The task."""
+
+    Spec = FindRidgeSpec
+    senses = ("link_contact",)
+    score_unit = "found"
+
+    def __init__(self, spec: FindRidgeSpec, setup: Setup):
+        """Begin with the ridge where the scene has it.
+
+        Raises:
+            SimulationError: If the ridge is no mocap body, and so cannot be put elsewhere.
+        """
+        super().__init__(spec, setup)
+        model = setup.model
+        self.num_steps = max(1, round(spec.episode / setup.control_step))
+        self.ridge = int(model.body(setup.object).mocapid[0])
+        if self.ridge < 0:
+            raise SimulationError(f'the object\'s body "{setup.object}" is no mocap body: give it mocap="true" in the scene')
+        bodies = np.flatnonzero(model.body_mocapid >= 0)[np.argsort(model.body_mocapid[model.body_mocapid >= 0])]
+        self.mocap = torch.from_numpy(model.body_pos[bodies]).to(setup.device, setup.dtype)
+        self.pad = torch.tensor(spec.pad, dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        self.elapsed, self.rests = self.keep("elapsed"), self.keep("rests", dtype=torch.bool)
+
+    @classmethod
+    def watch(cls, spec: FindRidgeSpec) -> Watch:
+        """The fingertip is looked at."""
+        return Watch(bodies=(spec.tip,))
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Put ridges elsewhere."""
+        pos = self.mocap.repeat(self.setup.num_envs, 1, 1)
+        pos[:, self.ridge, ACROSS] = self.setup.draws.uniform("place", episode, 1, *self.spec.randomise.place)[:, 0].to(pos)
+        self.begin(chosen, elapsed=0.0, rests=0.0)
+        return Start({"mocap_pos": pos})
+
+    def advance(self, now: Now) -> None:
+        """Look at whether the fingertip rests on the ridge."""
+        offset, speed, force = self._motion(now).unbind(dim=1)
+        is_pressed = (force >= self.spec.min_force) & (speed.abs() <= self.spec.max_speed)
+        self.rests.copy_(is_pressed & (offset.abs() <= self.spec.tolerance))
+        self.elapsed += 1.0
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where time is over."""
+        return self.elapsed >= self.num_steps
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        weights = self.spec.rewards
+        return {
+            "rest": weights.rest * self.rests,
+            "found": weights.found * (self.rests & is_over),
+            "action_rate": weights.action_rate * terms.action_rate(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what was commanded, and what is privileged of the ridge."""
+        left = 1.0 - self.elapsed / self.num_steps
+        return {"command": torch.cat([now.target, now.action, left[:, None]], dim=1), "priv_ridge": self._motion(now)}
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return whether it rests."""
+        return self.rests.to(self.setup.dtype)
+
+    def script(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        """Return the actions of a policy written by hand, for clean `depth` at `low`: slide, and centre what is felt.
+
+        Three rows of taxels run along the finger. On the plate both outer ones reach into it; on the ridge, which lifts the
+        finger, only that on its side.
+        """
+        target, depth = obs["command"][:, :2], obs["tactile_sensors"].view(-1, 3, 3)
+        low, _, high = (1e3 * depth.sum(dim=2)).unbind(dim=1)  # [mm]
+        is_on_plate, balance = (low > 3.0) & (high > 3.0), low - high
+        passed = torch.where(balance < -0.6, 0.5, -0.5)
+        bend = torch.where(is_on_plate, passed, (-0.1 * balance).clamp(-0.5, 0.5))
+        bend = torch.where(depth.amax(dim=(1, 2)) > 0.0, bend, 0.0)
+        press = ((0.225 - target[:, 1]) / self.spec.action.scale).clamp(-1.0, 1.0)
+        return torch.stack([bend, press, torch.zeros_like(bend)], dim=1)
+
+    def _motion(self, now: Now) -> Float[Tensor, "env 3"]:
+        """Return p − r [m], v [m/s] and |f| [N]."""
+        tip = now.watched.body(self.spec.tip)
+        arm = rotations.rotated(tip.quat, self.pad)
+        offset = (tip.pos + arm - now.object.pos)[:, ACROSS]
+        speed = (tip.linvel + torch.linalg.cross(tip.angvel, arm))[:, ACROSS]
+        return torch.stack([offset, speed, now.link_force[:, 0].norm(dim=1)], dim=1)

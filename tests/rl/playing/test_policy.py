@@ -1,0 +1,98 @@
+"""A learned policy in a TorchScript file: it acts as the network did, and one of other sizes is refused by name."""
+
+import pytest
+import torch
+from rsl_rl.models import MLPModel, RNNModel
+from tensordict import TensorDict
+
+from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+GROUPS = {"proprio": 6, "goal": 7}
+
+
+def exported(model, file):
+    """Write a model as rsl_rl's `export_policy_to_jit` does."""
+    torch.jit.script(model.as_jit().cpu()).save(str(file))
+    return file
+
+
+def network(kind=MLPModel, num_actions=2, num_envs=3, **more):
+    torch.manual_seed(0)
+    obs = TensorDict({name: torch.randn(num_envs, size) for name, size in GROUPS.items()}, batch_size=[num_envs])
+    model = kind(obs, {"actor": list(GROUPS)}, "actor", num_actions, hidden_dims=[8], **more)
+    return model.eval(), obs
+
+
+def test_it_acts_as_the_network_that_was_exported(tmp_path):
+    """With normalised observations and a distribution, of which an exported policy returns the mean."""
+    model, obs = network(obs_normalization=True, distribution_cfg={"class_name": "GaussianDistribution"})
+    model.obs_normalizer._mean.fill_(0.3)
+    policy = Policy(exported(model, tmp_path / "policy.pt"), GROUPS, 3, 2)
+    action = policy({**obs, "priv_obj_state": torch.zeros(3, 15)})
+    torch.testing.assert_close(action, model(obs).detach())
+    assert not action.requires_grad
+
+
+def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
+    model, obs = network(RNNModel, num_envs=1, rnn_type="gru", rnn_hidden_dim=4, rnn_num_layers=1)
+    policy = Policy(exported(model, tmp_path / "policy.pt"), GROUPS, 1, 2)
+    obs = dict(obs)
+    first, second = policy(obs), policy(obs)
+    assert not torch.equal(first, second)
+    policy.begin(torch.tensor([False]))
+    assert not torch.equal(policy(obs), first)
+    policy.begin(torch.tensor([True]))
+    assert torch.equal(policy(obs), first)
+    with pytest.raises(
+        PolicyError, match=r"does not take proprio \(6\) \+ goal \(7\) = 13 numbers of 3 environments: .*hidden"
+    ):
+        Policy(tmp_path / "policy.pt", GROUPS, 3, 2)
+
+
+def test_groups_are_named_or_those_of_a_hand_that_there_are():
+    groups = {"priv_proprio": 9, "goal": 7, "proprio": 6}
+    assert actor_groups(groups) == ("proprio", "goal")
+    assert actor_groups(groups, ("goal", "priv_proprio")) == ("goal", "priv_proprio")
+    with pytest.raises(PolicyError, match='there is no group of observations "gaol"; did you mean "goal"'):
+        actor_groups(groups, ("gaol",))
+
+
+def test_policies_that_do_not_fit(tmp_path):
+    model, _ = network()
+    file = exported(model, tmp_path / "policy.pt")
+    cases = {
+        (("proprio", "goal"), 3): "this policy returns actions (3, 2), expected (3, 3): joints are others",
+        (("goal",), 2): "this policy takes 13 numbers, not goal (7) = 7; name its groups, in its order",
+    }
+    for (names, num_actions), message in cases.items():
+        with pytest.raises(PolicyError) as raised:
+            Policy(file, {name: GROUPS[name] for name in names}, 3, num_actions)
+        assert str(raised.value) == f"{file}: {message}"
+
+
+def test_modules_that_are_no_policies(tmp_path):
+    class Two(torch.nn.Module):
+        def forward(self, first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+            return first + second
+
+    class Pair(torch.nn.Module):
+        def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            return obs, obs
+
+    messages = {Two: r"does not take .* = 13 numbers of 3 environments: ", Pair: r"returns a tuple, expected \(3, 2\)"}
+    for kind, message in messages.items():
+        torch.jit.script(kind()).save(str(tmp_path / "module.pt"))
+        with pytest.raises(PolicyError, match=message):
+            Policy(tmp_path / "module.pt", GROUPS, 3, 2)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(PolicyError) as raised:
+        Policy(tmp_path / "none.pt", GROUPS, 3, 2)
+    assert str(raised.value) == f"{tmp_path}/none.pt: cannot read this file: No such file or directory"
+    torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # what the runner keeps: no policy by itself
+    (tmp_path / "text.pt").write_text("no module")
+    for name in ("model_0.pt", "text.pt"):
+        with pytest.raises(PolicyError, match=rf"{name}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit`"):
+            Policy(tmp_path / name, GROUPS, 3, 2)

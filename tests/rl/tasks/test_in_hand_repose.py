@@ -1,0 +1,360 @@
+"""Turning an object to one orientation after another: rewards and ends against the reference, goals, and what pays."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from task_records import Recorder
+from tiny_tasks import tiny_env
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.actuation import PAPER
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.tasks.in_hand_repose import InHandReposeSpec, Rewards, reference
+
+FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
+DOCUMENTS = [FOLDER / "in_hand_repose.yaml", FOLDER / "in_hand_repose_sharpa.yaml"]
+QUICK = """episode: 0.6 s
+goal_step: 0.3
+goal_tolerance: 0.2
+goal_hold: 2
+goal_timeout: 0.3 s
+track_width: 0.3
+track_half: 0.15
+max_spin: 2
+near_width: 1 cm
+max_force: 0.05 N
+drop_distance: 2 cm
+action: {scale: 0.3}
+randomise: {xy: [-5 mm, 5 mm], yaw: [-3, 3], push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}
+"""
+
+
+def repose(folder, num_envs=2, more="episode: 20 s\n", gravity="0 0 0", axis="any", **options):
+    folder.mkdir(exist_ok=True)
+    return tiny_env(folder, num_envs, task="in_hand_repose", gravity=gravity, more=more + f"goal_axis: {axis}\n", **options)
+
+
+def random_actions(env, num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def goal_axes(num_envs, episode, goal, kind="any", seed=0):
+    """Return the axes that the goals of some episode turn about, from the counted numbers."""
+    count = torch.full((num_envs,), (episode << 32) + goal)
+    draws = Draws(seed, num_envs)
+    if kind == "vertical":
+        side = draws.integers("goal side", count, 1, 0, 1).double().numpy()
+        return np.concatenate([0 * side, 0 * side, 2 * side - 1], axis=1)
+    axis = draws.normal("goal axis", count, 3).double().numpy()
+    return axis / np.linalg.norm(axis, axis=1, keepdims=True)
+
+
+def put(env, rotation):
+    """Turn each environment's ball by a script: it is at rest there."""
+    quat = np.roll(rotation.as_quat(), 1, axis=-1)
+    env.sim.qpos[:, 6:10] = torch.from_numpy(np.broadcast_to(quat, (env.num_envs, 4)).copy())
+    env.sim.qvel[:, 3:] = 0
+
+
+def rest(env):
+    return env.step(torch.zeros(env.num_envs, env.num_actions))
+
+
+def compare(env, recorder, first_episode=2, kind="any"):
+    """Compare all that was recorded with the reference; return the terms of all episodes by name."""
+    axes, seen, records = {}, [], iter(recorder.records())
+    for env_id, episodes in enumerate(recorder.episodes):
+        for number, (_, rows) in enumerate(episodes, start=first_episode):
+            if not rows:
+                continue
+            record, found = next(records)
+            if number not in axes:
+                axes[number] = [goal_axes(env.num_envs, number, k, kind) for k in range(12)]
+            record["goal_axis"] = np.stack([axis[env_id] for axis in axes[number]])
+            expected = reference(env.spec, record, env.control_step)
+            assert expected.keys() == found.keys()
+            for name, value in expected.items():
+                scale = max(1.0, float(np.abs(value).max()))
+                np.testing.assert_allclose(found[name], value, rtol=0, atol=1e-6 * scale, err_msg=name)
+            seen.append(found)
+    assert next(records, None) is None
+    return seen
+
+
+@pytest.mark.parametrize("kind", ["any", "vertical"])
+def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
+    env = repose(tmp_path, 4, QUICK, "0 0 -9.81", kind)
+    recorder = Recorder(env)
+    for i, action in enumerate(random_actions(env, 70)):
+        env.sim.qvel[1, 6:9] = 3.0 if i % 4 else -3.0  # turned by hand: nothing else turns a ball
+        if i % 5 in (0, 1):
+            env.sim.qpos[0, 6:10] = env.task.goal[0]
+        recorder.step(action if i < 40 else torch.ones_like(action))
+    seen = compare(env, recorder, kind=kind)
+    assert len(seen) >= 12 and max(rows["score"].max() for rows in seen) >= 2
+    assert sum(rows["goal_timeout"].any() for rows in seen) >= 2 and sum(rows["drop"].any() for rows in seen) >= 1
+    terms = set(Rewards.model_fields) | {"is_over", "score"}
+    assert {name for rows in seen for name, value in rows.items() if np.abs(value).max() > 1e-9} == terms
+    assert max(np.abs(rows["progress"]).max() for rows in seen) > 0.2 * 2  # what is faster the wrong way costs more
+    assert max(rows["progress"].max() for rows in seen) <= 0.2 * 2 + 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("document", DOCUMENTS, ids=["xhand1", "sharpa"])
+def test_the_hands_too(document):
+    quick = {"episode": "0.6 s", "action.scale": 0.3, "goal_tolerance": 0.39, "goal_hold": 2, "goal_timeout": "0.4 s"}
+    env = TouchEnv(document, 4, threads=1, overrides={**quick, "touch": "none"})
+    recorder = Recorder(env)
+    for action in random_actions(env, 60):
+        recorder.step(action)
+    assert len(compare(env, recorder, kind="vertical")) >= 8
+
+
+def test_terms_at_a_known_angle(tmp_path):
+    env = repose(tmp_path)
+    env.reset()
+    for angle in (0.4, 0.25, 0.12):
+        put(env, Rotation.from_rotvec(goal_axes(2, 2, 0) * (0.4 - angle)))
+        terms = rest(env).info.terms
+        rates = {name: (value / env.control_step).tolist() for name, value in terms.items()}
+        assert rates["track_gaussian"] == pytest.approx([2 * math.exp(-0.5 * (angle / 0.2) ** 2)] * 2, rel=1e-5)
+        assert rates["track_inverse"] == pytest.approx([2 / (1 + (angle / 0.1) ** 2)] * 2, rel=1e-5)
+        assert rates["success"] == rates["drop"] == rates["goal_timeout"] == [0, 0]
+
+
+@pytest.mark.parametrize("kind", ["any", "vertical"])
+def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path, kind):
+    env = repose(tmp_path, 5, axis=kind)
+    env.reset()
+    axes, total = goal_axes(5, 2, 0, kind), torch.zeros(5)
+    for step in range(1, 9):
+        put(env, Rotation.from_rotvec(axes * np.array([[-1.2], [-0.3], [0.0], [0.3], [1.2]]) * env.control_step * step))
+        total += rest(env).reward
+    wrong, slowly_wrong, still, slow, right = total.tolist()
+    assert wrong < slowly_wrong < still < slow < right
+
+
+@pytest.mark.parametrize("there", [0.05, 0.1, 0.3], ids=["slowly", "at max_spin", "faster than max_spin"])
+def test_away_and_back_again_makes_no_progress(tmp_path, there):
+    """Fast away and slowly back, or the other way round: a loss is never clipped, a gain is."""
+    env = repose(tmp_path, 2)
+    env.reset()
+    axes, paid = goal_axes(2, 2, 0), torch.zeros(2)
+    for first, second in ((there, 0.05), (0.05, there)):
+        path = [*np.arange(0, 0.6, first)[1:], 0.6, *np.arange(0.6, 0, -second)[1:], 0.0]
+        for angle in path:
+            put(env, Rotation.from_rotvec(-angle * axes))
+            paid += rest(env).info.terms["progress"]
+    assert (paid < 1e-6).all()
+    if there <= 0.1:
+        assert paid.tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["any", "vertical"])
+def test_a_goal_is_held_and_the_next_one_starts_from_it(tmp_path, kind):
+    env = repose(tmp_path, 3, "episode: 20 s\ngoal_hold: 3\n", axis=kind)
+    obs, goal = env.reset(), Rotation.identity(3)
+    for k in range(4):
+        goal = Rotation.from_rotvec(0.4 * goal_axes(3, 2, k, kind)) * goal
+        columns = goal.as_matrix()[:, :, :2].transpose(0, 2, 1).reshape(3, 6)
+        np.testing.assert_allclose(obs["goal"][:, :6], columns, rtol=0, atol=1e-6)
+        beside = Rotation.from_rotvec([0.05, 0, 0]) * goal  # within the tolerance, and no part of the goal after
+        put(env, beside)
+        for held in range(1, 4):
+            made = rest(env)
+            obs = made.obs
+            assert made.info.terms["success"].tolist() == pytest.approx([500 * env.control_step * (held == 3)] * 3)
+            assert made.info.score.tolist() == [k + (held == 3)] * 3
+            if held < 3:
+                assert obs["goal"][:, 6].tolist() == pytest.approx([0.05] * 3, abs=1e-6)
+        assert ((obs["goal"][:, 6] >= 0.35 - 1e-6) & (obs["goal"][:, 6] <= 0.45 + 1e-6)).all()
+        # Its change of goal is no progress, neither forth nor back.
+        assert rest(env).info.terms["progress"].tolist() == pytest.approx([0.0] * 3, abs=1e-6)
+
+
+def test_a_goal_that_is_left_too_early_is_not_reached(tmp_path):
+    env = repose(tmp_path, 2, "episode: 20 s\ngoal_hold: 3\n")
+    env.reset()
+    goal = Rotation.from_rotvec(0.4 * goal_axes(2, 2, 0))
+    for there in (True, True, False, True, True, False):
+        put(env, goal if there else Rotation.identity(2))
+        assert not rest(env).info.terms["success"].any()
+    assert env.task.score().tolist() == [0, 0]
+
+
+def test_a_goal_that_takes_too_long_ends_the_episode_for_good(tmp_path):
+    env = repose(tmp_path, 2, "episode: 20 s\ngoal_hold: 1\ngoal_timeout: 0.1 s\n")
+    env.reset()
+    rest(env), rest(env)
+    goal = Rotation.from_rotvec(0.4 * goal_axes(2, 2, 0)).as_rotvec()
+    goal[1] = 0  # the second one stays where it was
+    put(env, Rotation.from_rotvec(goal))
+    assert rest(env).info.score.tolist() == [1, 0]
+    made = rest(env)
+    assert made.terminated.tolist() == [False, True] and not made.truncated.any()
+    assert made.info.terms["goal_timeout"].tolist() == pytest.approx([0, -200 * env.control_step])
+    assert made.info.terms["drop"].tolist() == [0, 0]
+    assert [rest(env).terminated.tolist() for _ in range(4)] == [[False, False], [False, False], [True, False], [False, True]]
+
+
+def test_a_goal_reached_in_the_last_moment_is_not_late(tmp_path):
+    env = repose(tmp_path, 1, "episode: 20 s\ngoal_hold: 2\ngoal_timeout: 0.1 s\n")
+    env.reset()
+    rest(env), rest(env)
+    put(env, Rotation.from_rotvec(0.4 * goal_axes(1, 2, 0)))
+    rest(env)
+    made = rest(env)
+    assert made.info.score.tolist() == [1] and not made.terminated.any()
+
+
+def test_what_is_dropped_ends_the_episode_for_good(tmp_path):
+    env = repose(tmp_path, 2, "episode: 20 s\n")
+    env.reset()
+    env.sim.qpos[:, 5] += torch.tensor([0.079, 0.081])
+    env.sim.qvel[:, 3:] = 0
+    made = rest(env)
+    assert made.terminated.tolist() == [False, True]
+    assert made.info.terms["drop"].tolist() == pytest.approx([0, -100 * env.control_step])
+
+
+def test_an_episode_that_has_lasted_is_truncated_and_leaves_the_others_alone(tmp_path):
+    env = repose(tmp_path, 3, "episode: 1 s\ngoal_hold: 1\n")
+    env.reset()
+    put(env, Rotation.from_rotvec(0.4 * goal_axes(3, 2, 0)))
+    rest(env)
+    env.steps[1] = env.max_steps - 1
+    before = {name: value.clone() for name, value in env.task.memory.items()}
+    made = rest(env)
+    assert made.truncated.tolist() == [False, True, False] and not made.terminated.any()
+    memory = env.task.memory
+    assert memory["episode"].tolist() == [2, 3, 2] and memory["reached"].tolist() == [1, 0, 1]
+    assert memory["waited"].tolist() == [1, 0, 1] and memory["held"].tolist() == [0, 0, 0]
+    assert torch.equal(memory["goal"][[0, 2]], before["goal"][[0, 2]])
+    goal = Rotation.from_rotvec(0.4 * goal_axes(3, 3, 0)[1]).as_matrix()[:, :2].T.reshape(6)
+    np.testing.assert_allclose(made.obs["goal"][1, :6], goal, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(made.obs["goal"][1, 6], 0.4, rtol=0, atol=1e-6)
+    assert made.info.final_obs["goal"][1, :6].tolist() != made.obs["goal"][1, :6].tolist()
+
+
+@pytest.mark.parametrize("kind", ["any", "vertical"])
+def test_axes_are_uniform_and_those_of_each_environment_whatever_the_batch(tmp_path, kind):
+    env = repose(tmp_path / "all", 300, axis=kind)
+    parts = [repose(tmp_path / str(i), 150, axis=kind, first_env=150 * i) for i in (0, 1)]
+    axes = []
+    for _ in range(4):
+        whole = env.reset()["goal"]
+        assert torch.equal(whole, torch.cat([part.reset()["goal"] for part in parts]))
+        quat = np.roll(env.task.goal.numpy(), -1, axis=1)
+        axes.append(Rotation.from_quat(quat).as_rotvec() / 0.4)
+    axis = np.concatenate(axes)
+    np.testing.assert_allclose(np.linalg.norm(axis, axis=1), 1.0, atol=1e-9)
+    if kind == "vertical":
+        assert not axis[:, :2].any()
+        assert abs(axis[:, 2].mean()) < 5 / math.sqrt(len(axis))
+        return
+    assert (np.abs(axis.mean(axis=0)) < 5 * math.sqrt(1 / 3 / len(axis))).all()
+    # Uniform on the sphere: each component uniform from −1 to 1, of variance 1/3, whose own variance is 4/45.
+    assert (np.abs((axis**2).mean(axis=0) - 1 / 3) < 5 * math.sqrt(4 / 45 / len(axis))).all()
+
+
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory):
+    """Environments in a state where no term is zero but those of events, which are set by hand."""
+    env = repose(tmp_path_factory.mktemp("busy"), 3, QUICK, "0 0 -9.81")
+    for i in range(10):
+        env.sim.qvel[:, 6:9] = 3.0
+        made = env.step(torch.tensor([[1.0, -1.0 if i % 3 else -0.8]] * 3))
+        assert torch.stack(list(made.info.terms.values())).sum(dim=0).tolist() == pytest.approx(made.reward.tolist())
+    env.task.is_reached.fill_(True), env.task.is_late.fill_(True), env.task.start_pos.fill_(9.0)
+    return env
+
+
+def changed_terms(env, **changes):
+    """Return the terms of the reward at an instant with some values of the document changed."""
+    task, spec = env.task, env.task.spec
+    task.spec = spec.model_copy(update=changes)
+    try:
+        return task.reward(env.now, task.is_over(env.now))
+    finally:
+        task.spec = spec
+
+
+def test_every_term_is_there(busy):
+    assert all(term.abs().max() > 1e-9 for term in changed_terms(busy).values())
+
+
+@pytest.mark.parametrize("name", list(Rewards.model_fields))
+def test_a_weight_scales_its_term_alone(busy, name):
+    weights = busy.spec.rewards
+    doubled = changed_terms(busy, rewards=weights.model_copy(update={name: 2 * getattr(weights, name)}))
+    for term, value in changed_terms(busy).items():
+        torch.testing.assert_close(doubled[term], value * (2 if term == name else 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "term", "grows"),
+    [
+        ("track_width", 0.6, "track_gaussian", True),
+        ("track_half", 0.3, "track_inverse", True),
+        ("near_width", 0.05, "near", True),
+        ("max_force", 0.02, "contact_force", False),
+        ("drop_distance", 99.0, "drop", True),
+    ],
+)
+def test_a_number_changes_its_term_alone(busy, name, value, term, grows):
+    other, plain = changed_terms(busy, **{name: value}), changed_terms(busy)
+    differs = {key for key in plain if not torch.equal(plain[key], other[key])}
+    assert differs == {term}
+    assert (other[term].sum() > plain[term].sum()) == grows
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"goal_step": 0.1}, "goal_step is 0.1 rad, expected more than goal_tolerance, 0.1 rad, and at most a half turn"),
+        ({"goal_step": "190 deg"}, "goal_step is 3.31613 rad"),
+        ({"goal_hold": 201}, "201 control steps of 0.025 s, takes longer than goal_timeout, 5 s"),
+        ({"goal_hold": 0}, "goal_hold"),
+        ({"goal_axis": "vertcal"}, "goal_axis"),
+        ({"goal_timeout": "-1 s"}, "goal_timeout"),
+        ({"randomise.friction": [-1, 1]}, "friction"),
+    ],
+)
+def test_a_goal_that_cannot_be_is_refused(changes, said):
+    with pytest.raises(SpecError) as error:
+        load_task(DOCUMENTS[0], changes)
+    assert said in str(error.value)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=["xhand1", "sharpa"])
+def test_the_documents_have_the_papers_numbers(document):
+    spec = load_task(document).spec
+    assert isinstance(spec, InHandReposeSpec)
+    random = spec.randomise
+    assert random.friction == (0.3, 2.0) and random.mass == (0.0, 0.1) and random.xy == (-0.02, 0.02)
+    assert random.yaw == pytest.approx((-math.pi, math.pi))
+    assert random.drive == PAPER
+    assert random.push.x == random.push.y == random.push.z == (-1, 1) and random.push.interval == (2, 4)
+    assert spec.episode == 20 and spec.physics.timestep == 0.005 and spec.physics.substeps == 5
+    weights = [500, 2, 2, 0.2, 0.5, -5, -100, -200, -1e-5, -20, -1e-3]
+    assert list(spec.rewards.model_dump().values()) == weights
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("document", "joints"), [(DOCUMENTS[0], 12), (DOCUMENTS[1], 22)], ids=["xhand1", "sharpa"])
+def test_each_hand_holds_all_objects_without_an_action(document, joints):
+    quiet = {"touch": "none", "goal_timeout": "1000 s", "randomise.push": {"x": 0}}
+    env = TouchEnv(document, 32, threads=1, overrides=quiet)
+    assert env.num_actions == joints
+    sizes = {tuple(env.sim.env_model(i).geom("item").size) for i in range(16)}
+    assert len(sizes) == 16
+    for _ in range(round(10 / env.control_step)):
+        made = rest(env)
+        assert not made.terminated.any(), f"{made.terminated.nonzero().flatten().tolist()} were lost"

@@ -1,0 +1,278 @@
+"""Sampling of grasps: a hand closes on an object at random, again and again, and what holds is kept.
+
+One trial, in simulation, nothing of the object's mass, friction or the drives being random:
+
+1. Joints start near the task's keyframe, by `spread` or a quarter of their range, the object is turned and moved at random and
+   held there.
+2. For `close` the joints that the policy moves go, each in a time of its own, from where they are to near the controls of the
+   keyframe `closed`; but a target never leads its joint by more than the trial's `squeeze`, so that a finger that has met the
+   object presses with that times its servo's gain. The other joints have the keyframe's controls.
+3. The object is let go. After `settle` its velocity and the hand's are set to zero: this is the grasp.
+4. For `hold` the object is pushed, in four random directions one after the other.
+
+A grasp is kept where the object is near where it was held, both at the end of 3. and of 4., and links press on it from opposite
+sides. All is counted, not drawn: trials are the same on every computer of one kind, however many threads it has.
+
+Shapes: `env` environments, trials side by side, `joint` joints that the policy moves, `link` links, `nq` and `nu` as in
+MuJoCo's model.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.console.progress import Progress
+from tgdsl.errors import SimulationError
+from tgdsl.rl import rotations
+from tgdsl.rl.actuation import Actuators
+from tgdsl.rl.draws import Draws
+from tgdsl.rl.grasps.grasps import Grasps, settings_of
+from tgdsl.rl.grasps.spec import GraspSpec, grasp_spec
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.sensed import Sensed, compile_sensed
+from tgdsl.rl.start import make_simulation, moved_joints
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.scene.digest import scene_digest
+
+SIDE_BY_SIDE = 256
+"""Most trials at once; of a few grasps there are twice as many."""
+PUSHES = 4
+"""Pushes of each trial."""
+SHARE = 0.25
+"""Most that `spread` may be, as a share of a joint's range, so that few grasps begin at a joint's limit."""
+LEAST_SHARE, ENOUGH = 0.01, 1000
+"""Share of trials that must be kept of a variant, once so many were made."""
+Found = Callable[[int, int], None]
+"""Called with how many grasps were found, and how many are wanted."""
+
+
+def sample(loaded: LoadedTask, found: Found, progress: Progress | None = None) -> Grasps:
+    """Sample a task's grasps, on the CPU.
+
+    Args:
+        loaded: The task's document.
+        found: Is told how many were found.
+        progress: Is told in a line what else is being done.
+
+    Raises:
+        SpecError: If there is no such keyframe, the object cannot be turned or moved as asked, or hardly any trial holds.
+    """
+    spec, sensed = grasp_spec(loaded.spec), compile_sensed(loaded, "cpu", progress, only=("link_contact",))
+    assert spec is not None
+    trials = _Trials(loaded, sensed, spec)
+    num = trials.num_variants
+    wanted = [spec.num // num + (v < spec.num % num) for v in range(num)]
+    kept: list[list[_Kept]] = [[] for _ in range(num)]
+    for round_ in itertools.count():
+        grasps = trials.made(round_)
+        for v in range(num):
+            kept[v] += [own for own in grasps if own.variant == v]
+            tried = (round_ + 1) * int((trials.variant == v).sum())
+            if len(kept[v]) < min(wanted[v], LEAST_SHARE * tried) and tried >= ENOUGH:
+                what = f"only {len(kept[v])} of {tried} grasps of variant {v} of {loaded.spec.object} hold: {trials.failures}"
+                raise loaded.error(("grasps",), what, "start the hand nearer to the object, or ask for less")
+        found(sum(min(len(own), most) for own, most in zip(kept, wanted, strict=True)), spec.num)
+        if all(len(own) >= most for own, most in zip(kept, wanted, strict=True)):
+            break
+    trials.sim.close()
+    chosen = [own for each, most in zip(kept, wanted, strict=True) for own in each[:most]]
+    return Grasps(
+        qpos=np.stack([own.qpos for own in chosen]),
+        ctrl=np.stack([own.ctrl for own in chosen]),
+        variant=np.array([own.variant for own in chosen], dtype=np.int64),
+        scene=scene_digest(sensed.touch.plan.scene),
+        object=loaded.spec.object,
+        settings=settings_of(loaded.spec, trials.joints),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """One grasp that holds."""
+
+    variant: int
+    qpos: Float[np.ndarray, " nq"]
+    ctrl: Float[np.ndarray, " nu"]
+
+
+class _Trials:
+    """Trials side by side, one per environment."""
+
+    def __init__(self, loaded: LoadedTask, sensed: Sensed, spec: GraspSpec):
+        """Make their simulation.
+
+        Raises:
+            SpecError: See `sample`.
+        """
+        inputs, task = sensed.touch.inputs, loaded.spec
+        self.spec, self.joints = spec, moved_joints(loaded, sensed)
+        self.num_variants = inputs.num_variants[inputs.objects.index(task.object)] if task.object in inputs.objects else 1
+        num_envs = max(self.num_variants, min(SIDE_BY_SIDE, 2 * spec.num))
+        sim = make_simulation(loaded, sensed, self.joints, num_envs, "cpu", "mujoco")
+        assert isinstance(sim, BatchSimulation)
+        self.sim, model = sim, sim.model
+        self.variant: Int[Tensor, " env"] = torch.arange(num_envs) % self.num_variants
+        try:
+            actuators = Actuators.of(model, self.joints)
+            closed = keyframe_id(model, spec.closed)
+        except SimulationError as error:
+            place = ("joints",) if "actuator" in str(error) else ("grasps", "closed")
+            raise loaded.error(place, str(error)) from error
+        self._actuator, self._joint = torch.from_numpy(actuators.actuator), torch.from_numpy(actuators.qpos)
+        self._low, self._high = torch.from_numpy(actuators.low), torch.from_numpy(actuators.high)
+        self._spread = (SHARE * (self._high - self._low)).clamp(max=spec.spread)
+        self._closed = torch.from_numpy(model.key_ctrl[closed])[self._actuator]
+        self._open, self._ctrl = sim.qpos[0].clone(), sim.ctrl[0].clone()
+        self._body = sensed.object
+        self._place = _Place(loaded, model, sensed.object)
+        self._pairs = [i for i, pair in enumerate(inputs.pairs) if pair.object == task.object]
+        self._draws = Draws(spec.seed, num_envs)
+        self._failed = dict.fromkeys(("diverged", "tilted", "moved away", "held by too few links or from one side"), 0)
+
+    @property
+    def failures(self) -> str:
+        """Why trials were not kept, in words."""
+        return ", ".join(f"{num} {what}" for what, num in self._failed.items())
+
+    def made(self, round_: int) -> list[_Kept]:
+        """Make a round of trials, and return the grasps that hold."""
+        sim, spec = self.sim, self.spec
+        count = torch.full((sim.num_envs,), round_)
+        qpos = self._start(count)
+        sim.reset(contacts="none", qpos=qpos, ctrl=self._ctrl)
+        begin_pos, begin_quat = self._object()
+        self._close(count, qpos)
+        self._steps(spec.settle)
+        sim.set_state(qvel=torch.zeros_like(sim.qvel))
+        grasp, ctrl = sim.qpos.clone(), sim.ctrl.clone()
+        presses, near = self._presses(), [self._strayed(begin_pos, begin_quat)]
+        self._push(count)
+        near.append(self._strayed(begin_pos, begin_quat))
+        tilted, moved = (near[0][i] | near[1][i] for i in (0, 1))
+        reasons = (sim.faults, tilted, moved, ~presses)
+        holds = torch.ones_like(presses)
+        for what, failed in zip(self._failed, reasons, strict=True):
+            self._failed[what] += int((holds & failed).sum())
+            holds &= ~failed
+        return [_Kept(int(self.variant[i]), grasp[i].numpy(), ctrl[i].numpy()) for i in torch.nonzero(holds).flatten().tolist()]
+
+    def _start(self, count: Int[Tensor, " env"]) -> Float[Tensor, "env nq"]:
+        """Return where trials start."""
+        spread = self._spread * self._draws.uniform("start", count, len(self.joints), -1.0, 1.0).double()
+        qpos = self._open.repeat(len(count), 1)
+        qpos[:, self._joint] = torch.minimum(torch.maximum(qpos[:, self._joint] + spread, self._low), self._high)
+        self._place.put(qpos, self._draws, count)
+        return qpos
+
+    def _close(self, count: Int[Tensor, " env"], start: Float[Tensor, "env nq"]) -> None:
+        """Close the hands while the objects are held."""
+        sim, spec, draws, num = self.sim, self.spec, self._draws, len(self.joints)
+        begin = start[:, self._joint]
+        end = self._closed + self._spread * draws.uniform("end", count, num, -1.0, 1.0).double()
+        end = torch.minimum(torch.maximum(end, self._low), self._high)
+        duration = spec.close * draws.uniform("duration", count, num, 0.4, 0.9).double()
+        lead = draws.uniform("squeeze", count, 1, *spec.squeeze).double()
+        sim.drive = lambda: self._place.keep(sim, start)
+        steps = max(1, round(spec.close / sim.control_step))
+        for i in range(steps):
+            share = ((i + 1) * sim.control_step / duration).clamp(max=1.0)
+            now, target = sim.qpos[:, self._joint], begin + share * (end - begin)
+            target = torch.minimum(torch.maximum(target, now - lead), now + lead)
+            sim.ctrl[:, self._actuator] = torch.minimum(torch.maximum(target, self._low), self._high)
+            sim.step()
+        sim.drive = None
+
+    def _steps(self, duration: float) -> None:
+        for _ in range(max(1, round(duration / self.sim.control_step))):
+            self.sim.step()
+
+    def _push(self, count: Int[Tensor, " env"]) -> None:
+        """Push the objects, and have them rest for a while after each push."""
+        sim, body = self.sim, int(self.sim.model.body(self._body).id)
+        applied = sim.arrays["xfrc_applied"]
+        for i in range(PUSHES):
+            direction = self._draws.normal(f"push {i}", count, 3).double()
+            applied[:, body, :3] = self.spec.push * direction / direction.norm(dim=1, keepdim=True)
+            self._steps(0.5 * self.spec.hold / PUSHES)
+            applied[:, body] = 0.0
+            self._steps(0.5 * self.spec.hold / PUSHES)
+
+    def _object(self) -> tuple[Float[Tensor, "env 3"], Float[Tensor, "env 4"]]:
+        found = self.sim.watched().body(self._body)
+        return found.pos.clone(), found.quat.clone()
+
+    def _strayed(
+        self, begin_pos: Float[Tensor, "env 3"], begin_quat: Float[Tensor, "env 4"]
+    ) -> tuple[Bool[Tensor, " env"], Bool[Tensor, " env"]]:
+        """Return which objects are tilted, and which are elsewhere."""
+        pos, quat = self._object()
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(pos)
+        tilt = rotations.swing(rotations.product(quat, rotations.inverse(begin_quat)), up)
+        return ~(tilt <= self.spec.max_tilt), ~((pos - begin_pos).norm(dim=1) <= self.spec.max_shift)
+
+    def _presses(self) -> Bool[Tensor, " env"]:
+        """Return which objects enough links press on, from opposite sides."""
+        force = self.sim.state().contact_netforce
+        assert force is not None
+        force = force[:, self._pairs]
+        size = force.norm(dim=2)
+        counts = size > self.spec.min_force
+        unit = torch.where(counts[..., None], force / size.clamp(min=1e-12)[..., None], 0.0)
+        cosines = unit @ unit.transpose(1, 2)
+        is_pair = counts[:, :, None] & counts[:, None, :]
+        opposite = (is_pair & (cosines <= np.cos(self.spec.opposite))).flatten(1).any(dim=1)
+        return (counts.sum(dim=1) >= self.spec.min_links) & opposite
+
+
+class _Place:
+    """Where an object is held while the hand closes."""
+
+    def __init__(self, loaded: LoadedTask, model: mujoco.MjModel, body: str):
+        """Look up its joints.
+
+        Raises:
+            SpecError: If it has no joints, or none that can turn or move it as asked.
+        """
+        spec = grasp_spec(loaded.spec)
+        assert spec is not None
+        own = model.body(body)
+        self._yaw, self._offset = spec.yaw, spec.offset
+        joints = range(int(own.jntadr[0]), int(own.jntadr[0]) + int(own.jntnum[0]))
+        free, ball = (
+            [j for j in joints if int(model.jnt_type[j]) == int(kind)]
+            for kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)
+        )
+        if not own.jntnum[0]:
+            raise loaded.error(("object",), f'the object\'s body "{body}" has no joint, and cannot be grasped')
+        if not (free or ball) and any(spec.yaw):
+            raise loaded.error(("grasps", "yaw"), f'the object\'s body "{body}" has neither a free nor a ball joint')
+        if not free and any(spec.offset):
+            raise loaded.error(("grasps", "offset"), f'the object\'s body "{body}" has no free joint')
+        first, dof = int(model.jnt_qposadr[joints[0]]), int(own.dofadr[0])
+        last = int(model.jnt_qposadr[joints[-1]]) + (7 if free else 4 if ball and ball[0] == joints[-1] else 1)
+        self._qpos, self._qvel = slice(first, last), slice(dof, dof + int(own.dofnum[0]))
+        self._pos = slice(first, first + 3) if free else None
+        self._quat = slice(last - 4, last) if free or ball else None
+
+    def put(self, qpos: Float[Tensor, "env nq"], draws: Draws, count: Int[Tensor, " env"]) -> None:
+        """Turn and move objects at random, in place."""
+        if self._quat is not None:
+            yaw = draws.uniform("yaw", count, 1, *self._yaw)[:, 0].double()
+            up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(qpos), 3)
+            qpos[:, self._quat] = rotations.product(rotations.about(up, yaw), qpos[:, self._quat])
+        if self._pos is not None:
+            qpos[:, self._pos] += draws.uniform("offset", count, 3, *self._offset).double()
+
+    def keep(self, sim: BatchSimulation, start: Float[Tensor, "env nq"]) -> None:
+        """Put objects back where they were, at rest."""
+        sim.qpos[:, self._qpos] = start[:, self._qpos]
+        sim.qvel[:, self._qvel] = 0.0

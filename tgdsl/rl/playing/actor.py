@@ -1,0 +1,23 @@
+"""Who acts in environments.
+
+Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+class Actor(ABC):
+    """Who acts in environments."""
+
+    @abstractmethod
+    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        """Return actions, from −1 to 1, for observations by group."""
+
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:  # noqa: B027
+        """Forget what is remembered of episodes that have ended; most remember nothing."""

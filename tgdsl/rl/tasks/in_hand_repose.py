@@ -1,0 +1,285 @@
+"""Turn an object on the palm to one orientation after another, with all fingers.
+
+An episode begins with the object upright on the palm, turned about the vertical by any angle. The first goal is a rotation by
+α = `goal_step` from there about an axis that is drawn, each other one such a rotation from the goal before, so that errors do
+not add up. With q the object's orientation, g_k goal k, a_k its axis of unit length in the world, and p and p_0 the object's
+position now and at the start,
+
+    g_0 = rot(a_0, α) q_0,   g_{k+1} = rot(a_{k+1}, α) g_k                goals
+    φ   = angle(g_k q⁻¹)                                                   angle to the goal, from 0 to π [rad]
+    k ← k + 1  where φ < ε for `goal_hold` control steps in a row          goal reached
+
+a_k is uniform on the sphere (`goal_axis: any`), or the vertical, up or down (`vertical`). Boxes and cylinders look alike from
+several sides; a goal is one orientation all the same.
+
+Groups: `goal` holds six numbers of the goal's orientation in the world and φ [rad]; `priv_obj_state` and `priv_obj_props` as in
+`groups`.
+
+The reward is the sum of these terms times Δt; weights are the paper's. φ and φ' are angles at the end and at the begin of the
+control step, both to the goal that it was made for.
+
+    success            w · (goal reached in this step)                           500 1/s
+    track_gaussian     w · exp(−φ²/(2 σ²))                                       2 1/s
+    track_inverse      w / (1 + (φ/φ_0)²)                                        2 1/s
+    progress           w · min((φ' − φ)/Δt, ω_max)                               0.2 1/rad
+    near               w · mean_p exp(−max(0, d_p)/λ)                            0.5 1/s
+    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max                       −5 1/s
+    drop               w · (dropped in this step)                                −100 1/s
+    goal_timeout       w · (too late in this step)                               −200 1/s
+    action_rate        w · |a_t − a_{t−1}|²                                      −1e-5 1/s
+    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −20 1/(rad s)
+    work               w · Σ_j |τ_j q̇_j|                                         −1e-3 1/J
+
+An episode ends for good where the object is further than `drop_distance` from p_0, or where a goal is not reached within
+`goal_timeout`: what has failed is not worth what would have come. Score: goals in a row, k.
+
+Nothing pays for turning the wrong way: a turn away makes both tracking terms smaller, and costs in `progress` what the way back
+pays at most, as a loss is not clipped. Nor does waiting beside a goal: at φ = ε tracking pays 13.8 until the timeout, which
+costs 5, and `success` 12.5 at once.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
+formulas, Δt as a factor of all terms, goals and how they are reached, α, ε, σ, φ_0, ω_max, λ and f_max are ours. Its text also
+speaks of penalties of grip and slip, which its table does not have, and which are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from pydantic import model_validator
+from torch import Tensor
+
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
+from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Time, Weight, Whole
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks.placing import placed
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    success: Weight = 500.0
+    """Goal reached [1/s]."""
+    track_gaussian: Weight = 2.0
+    """Orientation near the goal, a Gaussian of the angle to it [1/s]."""
+    track_inverse: Weight = 2.0
+    """Orientation near the goal, the inverse of the squared angle to it [1/s]."""
+    progress: Weight = 0.2
+    """Rate at which the angle to the goal gets smaller [1/rad]."""
+    near: Weight = 0.5
+    """How near fingers are to the object [1/s]."""
+    contact_force: Weight = -5.0
+    """Force on links beyond `max_force` [1/s]."""
+    drop: Weight = -100.0
+    """Object dropped [1/s]."""
+    goal_timeout: Weight = -200.0
+    """Goal not reached in time [1/s]."""
+    action_rate: Weight = -1e-5
+    """Change of the action [1/s]."""
+    joint_limit: Weight = -20.0
+    """Joints near the ends of their ranges [1/(rad s)]."""
+    work: Weight = -1e-3
+    """Power of the drives [1/J]."""
+
+
+class InHandReposeSpec(TaskSpec):
+    """Turn an object in the hand to one orientation after another."""
+
+    randomise: PlacedRandomSpec = PlacedRandomSpec()
+    """What is random."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    goal_step: Angle = 0.4
+    """α: how far a goal is from the one before [rad]."""
+    goal_axis: Literal["any", "vertical"] = "vertical"
+    """About what a goal is turned: any axis, or the vertical, either way."""
+    goal_tolerance: Angle = 0.1
+    """ε: a goal is reached this close to it [rad]."""
+    goal_hold: Whole = 4
+    """How many control steps in a row the object is that close before the goal counts."""
+    goal_timeout: Time = 5.0
+    """An episode ends where a goal is not reached within this [s]."""
+    track_width: Angle = 0.2
+    """σ, width of `track_gaussian` [rad]."""
+    track_half: Angle = 0.1
+    """φ_0, angle at which `track_inverse` is half of its most [rad]."""
+    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
+    """ω_max: what is faster pays no more [rad/s]."""
+    near_width: PositiveLength = 0.02
+    """λ, decay length of `near` [m]."""
+    drop_distance: PositiveLength = 0.08
+    """Further from where it started, the object is lost [m]."""
+    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
+    """f_max: less force on a link costs nothing [N]."""
+
+    @model_validator(mode="after")
+    def _within_reach(self) -> InHandReposeSpec:
+        control_step = self.physics.timestep * self.physics.substeps
+        if not self.goal_tolerance < self.goal_step <= math.pi:
+            expected = f"more than goal_tolerance, {self.goal_tolerance:g} rad, and at most a half turn"
+            raise ValueError(f"goal_step is {self.goal_step:g} rad, expected {expected}")
+        if self.goal_hold * control_step > self.goal_timeout:
+            what = f"goal_hold, {self.goal_hold} control steps of {control_step:g} s, takes longer than goal_timeout"
+            raise ValueError(f"{what}, {self.goal_timeout:g} s: no goal could be reached in time")
+        return self
+
+
+def reference(spec: InHandReposeSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
+            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, limits [rad];
+            `goal_axis` (goal, 3), axes of goals in turn.
+        dt: Δt [s].
+    """
+    weights, low, high, pos = spec.rewards, record["low"], record["high"], record["pos"]
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    rot = [_matrix(quat) for quat in record["quat"]]
+    reached, near_since, given = 0, 0, 0
+    goal = _turn(record["goal_axis"][0], spec.goal_step) @ rot[0]
+    rows = []
+    for t in range(1, len(pos)):
+        error = _angle_between(goal, rot[t])
+        near_since = near_since + 1 if error < spec.goal_tolerance else 0
+        is_reached = near_since >= spec.goal_hold
+        is_late = not is_reached and t - given >= round(spec.goal_timeout / dt)
+        force = np.linalg.norm(record["link_force"][t], axis=1)
+        is_dropped = np.linalg.norm(pos[t] - pos[0]) > spec.drop_distance
+        row = {
+            "success": weights.success * is_reached,
+            "track_gaussian": weights.track_gaussian * math.exp(-0.5 * (error / spec.track_width) ** 2),
+            "track_inverse": weights.track_inverse / (1 + (error / spec.track_half) ** 2),
+            "progress": weights.progress * min((_angle_between(goal, rot[t - 1]) - error) / dt, spec.max_spin),
+            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
+            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
+            "drop": weights.drop * is_dropped,
+            "goal_timeout": weights.goal_timeout * is_late,
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
+            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        }
+        if is_reached:
+            reached, near_since, given = reached + 1, 0, t
+            goal = _turn(record["goal_axis"][reached], spec.goal_step) @ goal
+        rows.append(row | {"is_over": is_dropped or is_late, "score": reached})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _matrix(quat: np.ndarray) -> np.ndarray:
+    angle = 2 * math.atan2(np.linalg.norm(quat[1:]), quat[0])
+    return _turn(quat[1:] / max(np.linalg.norm(quat[1:]), 1e-300), angle)
+
+
+def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
+    return 2 * math.asin(min(1.0, np.linalg.norm(one - other) / math.sqrt(8)))
+
+
+class InHandRepose(Task[InHandReposeSpec]):
+    """The task."""
+
+    Spec = InHandReposeSpec
+    score_unit = "goals in a row"
+
+    def __init__(self, spec: InHandReposeSpec, setup: Setup):
+        """Begin with all objects where the keyframe has them."""
+        super().__init__(spec, setup)
+        self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        self.step = torch.full((setup.num_envs,), spec.goal_step, dtype=setup.dtype, device=setup.device)
+        limits = (setup.actuators.low, setup.actuators.high)
+        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.most_steps = round(spec.goal_timeout / setup.control_step)
+        self.start_pos, self.goal = self.keep("start_pos", 3), self.keep("goal", 4)
+        self.error, self.rate = self.keep("error"), self.keep("rate")  # φ of the last step's goal, and how fast it got smaller
+        self.left = self.keep("left")  # φ of the present goal
+        self.episode, self.reached = self.keep("episode", dtype=torch.int64), self.keep("reached", dtype=torch.int64)
+        self.held, self.waited = self.keep("held", dtype=torch.int64), self.keep("waited", dtype=torch.int64)
+        self.is_reached, self.is_late = self.keep("is_reached", dtype=torch.bool), self.keep("is_late", dtype=torch.bool)
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Put objects upright on the palm, moved and turned at random, and give each a first goal."""
+        qpos, pos, quat = placed(self.setup, self.spec.randomise, episode)
+        for own in (self.reached, self.held, self.waited, self.is_reached, self.is_late):
+            own.masked_fill_(chosen, 0)
+        self.begin(chosen, start_pos=pos, episode=episode)
+        goal = self._goal_after(quat)
+        left = rotations.angle(rotations.product(goal, rotations.inverse(quat)))
+        self.begin(chosen, goal=goal, left=left, error=left, rate=0.0)
+        return Start({"qpos": qpos})
+
+    def advance(self, now: Now) -> None:
+        """Measure how far the goal is, and give another one where it was reached."""
+        spec, back = self.spec, rotations.inverse(now.object.quat)
+        error = rotations.angle(rotations.product(self.goal, back))
+        self.rate.copy_(((self.left - error) / self.setup.control_step).clamp(max=spec.max_spin))
+        self.error.copy_(error)
+        self.held.copy_(torch.where(error < spec.goal_tolerance, self.held + 1, 0))
+        self.waited += 1
+        self.is_reached.copy_(self.held >= spec.goal_hold)
+        self.is_late.copy_((self.waited >= self.most_steps) & ~self.is_reached)
+        self.reached += self.is_reached
+        for count in (self.held, self.waited):
+            count.masked_fill_(self.is_reached, 0)
+        self.goal.copy_(torch.where(self.is_reached[:, None], self._goal_after(self.goal), self.goal))
+        self.left.copy_(rotations.angle(rotations.product(self.goal, back)))
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object was dropped or the goal was not reached in time."""
+        return self._is_dropped(now) | self.is_late
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        spec, weights = self.spec, self.spec.rewards
+        return {
+            "success": weights.success * self.is_reached,
+            "track_gaussian": weights.track_gaussian * torch.exp(-0.5 * (self.error / spec.track_width).square()),
+            "track_inverse": weights.track_inverse / (1.0 + (self.error / spec.track_half).square()),
+            "progress": weights.progress * self.rate,
+            "near": weights.near * terms.near(now, spec.near_width),
+            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
+            "drop": weights.drop * self._is_dropped(now),
+            "goal_timeout": weights.goal_timeout * self.is_late,
+            "action_rate": weights.action_rate * terms.action_rate(now),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "work": weights.work * terms.work(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the goal, and what is privileged of the object."""
+        error = rotations.angle(rotations.product(self.goal, rotations.inverse(now.object.quat)))
+        return {
+            "goal": torch.cat([rotations.six_numbers(self.goal), error[:, None]], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return how many goals were reached."""
+        return self.reached.to(self.setup.dtype)
+
+    def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
+        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+
+    def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:
+        """Return orientations turned by a goal's step: those of goal `reached`."""
+        count = (self.episode << 32) | self.reached
+        if self.spec.goal_axis == "vertical":
+            side = self.setup.draws.integers("goal side", count, 1, 0, 1).to(quat.dtype)
+            axis = (2.0 * side - 1.0) * self.up
+        else:
+            axis = self.setup.draws.normal("goal axis", count, 3).to(quat.dtype)
+            axis = axis / axis.norm(dim=1, keepdim=True)
+        turned = rotations.product(rotations.about(axis, self.step), quat)
+        return turned / turned.norm(dim=1, keepdim=True)

@@ -1,0 +1,237 @@
+"""Spin a screwdriver about its long axis, its tip in a screw: a gait of thumb and fingers.
+
+An episode begins with a grasp that was sampled beforehand: see `tgdsl.rl.grasps`. The right way is clockwise as seen from the
+handle, which drives a screw in. With q the object's orientation, a its body's z in the world, from the tip to the handle, n the
+vertical, p the position of its body, which is the handle's middle, p_0 that of the keyframe, where it stands upright, s and s_0
+those of the site at its tip, and j the joints that the policy moves, j_0 at the start of the episode,
+
+    Δψ = −twist_z(q_{t−1}⁻¹ q_t)                                angle turned in a control step, about its own axis [rad]
+    θ  = ∠(a, n)                                                tilt [rad]
+
+Groups: `priv_obj_state` as in `groups`, and the distance from each probe to the object's surface [m]; `priv_obj_props` friction
+and mass [kg] alone. There is no goal.
+
+The reward is the sum of these terms times Δt; weights are the paper's. On the right what each is worth beside `spin` at 2
+rad/s, which is 20 1/s.
+
+    spin               w · min(Δψ/Δt, ω_max)                     10 1/rad
+    near               w · mean_p exp(−max(0, d_p)/λ)            1 1/s              1 1/s if all probes touch
+    alignment          w · (1 − cos θ)                           −400 1/s           −1.5 at 5°, −6 at 10°, −24 at 20°
+    object_distance    w · max(0, |p − p_0| − r)                 −300 1/(m s)       0 up to 6°, −4 at 10°, −14 at 20°
+    hand_pose          w · |j − j_0|²                            −1 1/(rad² s)      −0.7 for eight joints 0.3 rad away
+    drop               w · (dropped in this step)                −100 1/s           −2.5 in all
+    action_rate        w · |a_t − a_{t−1}|²                      −1e-2 1/s          −0.05 for random actions of eight joints
+    joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)    −40 1/(rad s)      −1.9 for a finger stretched out
+    work               w · Σ_j |τ_j q̇_j|                         −1e-3 1/J          −0.002 at 2 W
+
+So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where θ > `drop_tilt` or the tip is out of the screw,
+|s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
+a drop nothing is added.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
+formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what
+turning forth has paid, however fast: `spin` is bounded above alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
+from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl.grasps.spec import GraspSpec
+from tgdsl.rl.spec import TaskSpec, Weight
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.runtime.simulators.watch import Watch
+
+UPRIGHT = math.radians(20.0)
+"""Tilt below which a turn counts for the score [rad]; the paper's."""
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    spin: Weight = 10.0
+    """Angular velocity about the long axis, the right way [1/rad]."""
+    near: Weight = 1.0
+    """How near fingers are to the object [1/s]."""
+    alignment: Weight = -400.0
+    """1 − cos of the tilt [1/s]."""
+    object_distance: Weight = -300.0
+    """Distance of the handle from where it stands upright, beyond `free_distance` [1/(m s)]."""
+    hand_pose: Weight = -1.0
+    """Squared deviation of the joints from where they started [1/(rad² s)]."""
+    drop: Weight = -100.0
+    """Object dropped [1/s]."""
+    action_rate: Weight = -1e-2
+    """Change of the action [1/s]."""
+    joint_limit: Weight = -40.0
+    """Joints near the ends of their ranges [1/(rad s)]."""
+    work: Weight = -1e-3
+    """Power of the drives [1/J]."""
+
+
+class ScrewdriverSpec(TaskSpec):
+    """Spin a screwdriver about its long axis."""
+
+    episode: Annotated[float, Quantity("time", gt=0.0)] = 20.0
+    """Duration of an episode [s]."""
+    grasps: GraspSpec = GraspSpec()
+    """How the grasps are sampled that episodes begin from."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    tip: str = "tip"
+    """The scene's site at the tip."""
+    max_spin: Annotated[float, Quantity("number", gt=0.0)] = 6.0
+    """ω_max: what is faster pays no more [rad/s]."""
+    near_width: PositiveLength = 0.02
+    """λ, decay length of `near` [m]."""
+    free_distance: PositiveLength = 0.02
+    """r: closer to where it stands upright, the handle costs nothing [m]."""
+    drop_tilt: Angle = 0.8
+    """With a larger tilt the screwdriver has fallen over [rad]."""
+    engagement: PositiveLength = 0.005
+    """Further from where it was, the tip is out of the screw [m]."""
+
+
+def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `joint_vel`
+            [rad/s], `torque` [N·m], `action`, `distance` [m]; `low`, `high`, limits [rad]; `upright_pos`, `upright_tip` [m],
+            where body and tip are in the keyframe.
+        dt: Δt [s].
+    """
+    weights, low, high, quat = spec.rewards, record["low"], record["high"], record["quat"]
+    middle, half, turned, rows = 0.5 * (low + high), 0.5 * (high - low), 0.0, []
+    for t in range(1, len(quat)):
+        step = -_turned_about_z(quat[t - 1], quat[t])
+        _, x, y, _ = quat[t]
+        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
+        turned += step * (tilt < UPRIGHT)
+        distance = np.linalg.norm(record["pos"][t] - record["upright_pos"])
+        away = np.linalg.norm(record["tip"][t] - record["upright_tip"])
+        is_over = tilt > spec.drop_tilt or away > spec.engagement
+        joints = record["joint_pos"][t]
+        row = {
+            "spin": weights.spin * min(step / dt, spec.max_spin),
+            "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
+            "alignment": weights.alignment * (1.0 - math.cos(tilt)),
+            "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
+            "hand_pose": weights.hand_pose * np.sum((joints - record["joint_pos"][0]) ** 2),
+            "drop": weights.drop * is_over,
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+            "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(joints - middle) - 0.95 * half, 0.0)),
+            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        }
+        rows.append(row | {"is_over": is_over, "score": turned / spec.episode})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _turned_about_z(before: np.ndarray, after: np.ndarray) -> float:
+    """Return by how much a body has turned about its own z between two orientations [rad]."""
+    a, b, c, d = before
+    w, x, y, z = after
+    scalar, along = a * w + b * x + c * y + d * z, a * z - d * w - b * y + c * x  # of the conjugate of `before` times `after`
+    return 2.0 * math.atan2(along if scalar >= 0 else -along, abs(scalar))
+
+
+class Screwdriver(Task[ScrewdriverSpec]):
+    """The task."""
+
+    Spec = ScrewdriverSpec
+    score_unit = "rad/s"
+
+    def __init__(self, spec: ScrewdriverSpec, setup: Setup):
+        """Begin with all screwdrivers upright, as the keyframe has them.
+
+        Raises:
+            SimulationError: If there are no grasps.
+        """
+        super().__init__(spec, setup)
+        if setup.grasps is None:
+            raise SimulationError("this task begins with grasps, and there are none")
+        self.grasps = setup.grasps
+        self.axis = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        limits = (setup.actuators.low, setup.actuators.high)
+        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.joints = torch.from_numpy(setup.actuators.qpos).to(setup.device, torch.int64)
+        self.upright_pos, self.upright_tip = (own.to(setup.device, setup.dtype) for own in _upright(setup, spec.tip))
+        self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
+        self.rate, self.tilt, self.turned = self.keep("rate"), self.keep("tilt"), self.keep("turned")
+
+    @classmethod
+    def watch(cls, spec: ScrewdriverSpec) -> Watch:
+        """Return that it looks at the tip."""
+        return Watch(sites=(spec.tip,))
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Begin with a grasp of each environment's own handle."""
+        drawn = self.grasps.draw(episode)
+        joints = drawn.values["qpos"][:, self.joints]
+        self.begin(chosen, quat=drawn.quat, start_joints=joints, rate=0.0, turned=0.0)
+        self.begin(chosen, tilt=rotations.swing(drawn.quat, self.axis))
+        return Start(drawn.values, drawn.contacts)
+
+    def advance(self, now: Now) -> None:
+        """Add up what the screwdriver has turned."""
+        quat = now.object.quat
+        step = -rotations.twist(rotations.product(rotations.inverse(self.quat), quat), self.axis)
+        self.rate.copy_(step / self.setup.control_step)
+        self.tilt.copy_(rotations.swing(quat, self.axis))
+        self.turned += torch.where(self.tilt < UPRIGHT, step, 0.0)
+        self.quat.copy_(quat)
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the screwdriver has fallen over, or its tip is out of the screw."""
+        return (self.tilt > self.spec.drop_tilt) | (self._tip_distance(now) > self.spec.engagement)
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        spec, weights = self.spec, self.spec.rewards
+        distance = (now.object.pos - self.upright_pos).norm(dim=1)
+        return {
+            "spin": weights.spin * self.rate.clamp(max=spec.max_spin),
+            "near": weights.near * terms.near(now, spec.near_width),
+            "alignment": weights.alignment * 2.0 * (0.5 * self.tilt).sin().square(),
+            "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
+            "hand_pose": weights.hand_pose * (now.joint_pos - self.start_joints).square().sum(dim=1),
+            "drop": weights.drop * is_over,
+            "action_rate": weights.action_rate * terms.action_rate(now),
+            "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
+            "work": weights.work * terms.work(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what is privileged of the object."""
+        return {
+            "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
+            "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
+        }
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return what was turned while upright, over the duration of a whole episode [rad/s]."""
+        return self.turned / self.spec.episode
+
+    def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
+        """Return how far the tip is from where it was [m]."""
+        return (now.watched.site_pos[:, 0] - self.upright_tip).norm(dim=1)
+
+
+def _upright(setup: Setup, tip: str) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+    """Return where the object's body and its tip are in the keyframe [m]."""
+    state = mujoco.MjData(setup.model)
+    state.qpos[:] = setup.qpos.cpu().numpy()
+    mujoco.mj_kinematics(setup.model, state)
+    return tuple(torch.from_numpy(own.copy()) for own in (state.body(setup.object).xpos, state.site(tip).xpos))  # type: ignore[return-value]
