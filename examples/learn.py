@@ -127,7 +127,7 @@ def learn(condition: str, seed: int, num_envs: int, threads: int, minutes: float
         runner = OnPolicyRunner(env, settings(condition), device="cpu")
     for model in (runner.alg.actor, runner.alg.critic):
         assert isinstance(model.obs_normalizer, EmpiricalNormalization)
-        model.obs_normalizer.eps = 1e-6  # rsl_rl's 0.01 would hide depths, which are in metres
+        model.obs_normalizer.eps = 1e-5  # rsl_rl's 0.01 would hide depths, which are in metres
     begun, said, curve, done = time.monotonic(), 0.0, [], 0
     while not is_done(done, iterations, time.monotonic() - begun, 60.0 * minutes):
         before, well = env.ended, env.successes
