@@ -160,6 +160,7 @@ def line(condition: str, seed: int, curve: Sequence[tuple[float, int, float]], l
     """Return a line of progress: `left` [s] of the run, `rate` control steps per second."""
     recent = [share for _, _, share in curve[-5:]]
     success = sum(recent) / len(recent)
+    left = max(0.0, left)
     clock = f"{int(left // 60)}:{int(left % 60):02d} left"
     return f"{condition} {seed}: {clock}, {curve[-1][1]:,} episodes, {success:.0%} end on the ridge, {rate:,.0f} steps/s"
 
