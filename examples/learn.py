@@ -127,7 +127,7 @@ def learn(condition: str, seed: int, num_envs: int, threads: int, minutes: float
         runner = OnPolicyRunner(env, settings(condition), device="cpu")
     for model in (runner.alg.actor, runner.alg.critic):
         assert isinstance(model.obs_normalizer, EmpiricalNormalization)
-        model.obs_normalizer.eps = 1e-6  # rsl_rl's 0.01 would hide depths, which are in metres
+        model.obs_normalizer.eps = 1e-5  # rsl_rl's 0.01 would hide depths, which are in metres
     begun, said, curve, done = time.monotonic(), 0.0, [], 0
     while not is_done(done, iterations, time.monotonic() - begun, 60.0 * minutes):
         before, well = env.ended, env.successes
@@ -160,6 +160,7 @@ def line(condition: str, seed: int, curve: Sequence[tuple[float, int, float]], l
     """Return a line of progress: `left` [s] of the run, `rate` control steps per second."""
     recent = [share for _, _, share in curve[-5:]]
     success = sum(recent) / len(recent)
+    left = max(0.0, left)
     clock = f"{int(left // 60)}:{int(left % 60):02d} left"
     return f"{condition} {seed}: {clock}, {curve[-1][1]:,} episodes, {success:.0%} end on the ridge, {rate:,.0f} steps/s"
 

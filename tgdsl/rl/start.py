@@ -20,7 +20,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.warp import WarpSimulation
-from tgdsl.scene.scene import SceneModels
+from tgdsl.scene.scene import SceneModels, is_absent
 from tgdsl.schema.select import is_plain, matching
 
 SIMULATORS = ("mujoco", "warp")
@@ -164,7 +164,7 @@ def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]
     lowest = state.xpos[own.id, 2]
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     for geom in range(int(own.geomadr[0]), int(own.geomadr[0]) + int(own.geomnum[0])):
-        if model.geom_contype[geom] or model.geom_conaffinity[geom]:
+        if not is_absent(model, geom) and (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             center, half = np.split(model.geom_aabb[geom], 2)
             corners = state.geom_xpos[geom] + (center + signs * half) @ state.geom_xmat[geom].reshape(3, 3).T
             lowest = min(lowest, corners[:, 2].min())

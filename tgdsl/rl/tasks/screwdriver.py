@@ -179,7 +179,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Begin with a grasp of each environment's own handle."""
         drawn = self.grasps.draw(episode)
-        qpos = drawn.values["qpos"]
+        qpos = drawn.values.get("qpos")
         assert isinstance(qpos, Tensor)
         self.begin(chosen, quat=drawn.quat, start_joints=qpos[:, self.joints], rate=0.0, turned=0.0)
         self.begin(chosen, tilt=rotations.swing(drawn.quat, self.axis))

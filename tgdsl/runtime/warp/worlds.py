@@ -241,8 +241,8 @@ class Worlds:
         """
         arrays = {name: self.arrays[name] for name in _DERIVED if self.arrays[name].numel()}
         earlier = _copied(arrays)
-        self._mjw.fwd_kinematics(self.model, self.data)
-        self._mjw.com_vel(self.model, self.data)
+        for evaluate in (self._mjw.kinematics, self._mjw.com_pos, self._mjw.com_vel):
+            evaluate(self.model, self.data)
         self._give_back(self._is_reset, earlier, arrays)
         self._is_stale &= ~self._is_reset
 
