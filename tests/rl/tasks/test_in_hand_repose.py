@@ -192,7 +192,8 @@ def test_a_goal_that_is_left_too_early_is_not_reached(tmp_path):
 def test_a_goal_that_takes_too_long_ends_the_episode_for_good(tmp_path):
     env = repose(tmp_path, 2, "episode: 20 s\ngoal_hold: 1\ngoal_timeout: 0.1 s\n")
     env.reset()
-    rest(env), rest(env)
+    for _ in range(2):
+        rest(env)
     goal = Rotation.from_rotvec(0.4 * goal_axes(2, 2, 0)).as_rotvec()
     goal[1] = 0  # the second one stays where it was
     put(env, Rotation.from_rotvec(goal))
@@ -207,7 +208,8 @@ def test_a_goal_that_takes_too_long_ends_the_episode_for_good(tmp_path):
 def test_a_goal_reached_in_the_last_moment_is_not_late(tmp_path):
     env = repose(tmp_path, 1, "episode: 20 s\ngoal_hold: 2\ngoal_timeout: 0.1 s\n")
     env.reset()
-    rest(env), rest(env)
+    for _ in range(2):
+        rest(env)
     put(env, Rotation.from_rotvec(0.4 * goal_axes(1, 2, 0)))
     rest(env)
     made = rest(env)
@@ -272,7 +274,8 @@ def busy(tmp_path_factory):
         env.sim.qvel[:, 6:9] = 3.0
         made = env.step(torch.tensor([[1.0, -1.0 if i % 3 else -0.8]] * 3))
         assert torch.stack(list(made.info.terms.values())).sum(dim=0).tolist() == pytest.approx(made.reward.tolist())
-    env.task.is_reached.fill_(True), env.task.is_late.fill_(True), env.task.start_pos.fill_(9.0)
+    for own, value in ((env.task.is_reached, True), (env.task.is_late, True), (env.task.start_pos, 9.0)):
+        own.fill_(value)
     return env
 
 

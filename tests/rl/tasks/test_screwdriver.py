@@ -1,6 +1,7 @@
 """Spinning a screwdriver: rewards, ends and scores against the reference, what pays, what is observed."""
 
 import math
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -261,4 +262,20 @@ def test_every_kind_of_touch_begins_with_the_same_grasps(touch):
     assert obs["tactile_sensors"].abs().amax(dim=1).gt(0).all() and env.now.link_force.norm(dim=2).gt(0.1).sum(dim=1).min() >= 3
     made = env.step(torch.zeros(4, 8))
     assert all(value.isfinite().all() for value in made.obs.values())
+    env.close()
+
+
+@pytest.mark.slow
+def test_a_gait_spins_every_handle_the_right_way():
+    """What the examples bring, with all that is random: more than 2 rad/s on average, and most hold for three seconds."""
+    gait = runpy.run_path(str(DOCUMENT.with_name("screwdriver_gait.py")))["gait"]
+    env = TouchEnv(DOCUMENT, 32, threads=1, overrides={"touch": "none"})
+    obs, dropped, turned = env.reset(1), torch.zeros(32, dtype=torch.bool), torch.zeros(32)
+    for _ in range(120):
+        made = env.step(gait(env, obs))
+        obs, dropped = made.obs, dropped | made.terminated
+        turned += torch.where(dropped, 0.0, env.task.rate.float() * env.control_step)
+    assert dropped.sum() <= 16
+    rate = (turned / 3.0).view(-1, 4)  # one column per handle
+    assert rate.mean() > 2.0 and (rate.mean(dim=0) > 0.8).all()
     env.close()

@@ -152,6 +152,13 @@ def test_what_a_gpu_cannot_scale_or_has_not_of_its_own_is_named(tmp_path):
         plain.properties.set(friction={"cube": 1.0})
 
 
+def test_what_all_environments_share_can_be_read(tmp_path):
+    plain, own = warp(module(tmp_path), 2), warp(module(tmp_path), 2, per_env=OWN)
+    for what in ("mass", "friction"):
+        shared, each = (getattr(sim.properties, what)("cube") for sim in (plain, own))
+        assert shared.shape == (2,) and torch.equal(shared, each)
+
+
 def test_a_link_of_a_chain_weighs_what_it_is_given_on_the_cpu(tmp_path):
     sim = BatchSimulation(module(tmp_path), 2)
     own = float(sim.properties.mass("pad")[0])
