@@ -63,15 +63,30 @@ def by_command(spec, record, dt):
 
 ODD = {
     "episode": "0.6 s", "change": ["0.1 s", "0.2 s"], "settling": "0.06 s", "force": ["2 N", "6 N"], "force_width": 0.4,
-    "free_distance": "0.1 mm", "drop_distance": "6 mm", "max_force": "9 N", "action.scale": "0.02 rad",
+    "free_distance": "0.1 mm", "drop_distance": "6 mm", "max_force": "9 N", "start_force": "6 N", "action.scale": "0.02 rad",
     "randomise.push": {"z": ["-4 N", "-4 N"], "interval": ["0.2 s", "0.3 s"]},
     "rewards": {name: 1.5 * value for name, value in Rewards()},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
 
 
+def assert_started(env, force):
+    """Each object is where its keyframe has it, and the drives' lag is the keyframe's, times the command over its force."""
+    for i, (pos, target, wanted) in enumerate(zip(env.sim.qpos, env.actuation.target, env.task.command, strict=True)):
+        key = env.sim.model.key(f"hold-{i}")
+        np.testing.assert_allclose(pos, key.qpos, atol=1e-12)
+        lag = (key.ctrl - key.qpos[: len(key.ctrl)])[env.task.setup.actuators.actuator]
+        np.testing.assert_allclose(target - pos[: len(target)], float(wanted) / force * lag, atol=1e-12)
+
+
+def test_episodes_begin_with_keyframes(env):
+    env.reset(0)
+    assert_started(env, 5.0)
+
+
 def test_rewards_ends_and_scores_equal_the_reference():
     env = grip(**ODD)
+    assert_started(env, 6.0)
     recorder = Recorder(env, lambda: command(env))
     for i, action in enumerate(random_actions(env, 60)):
         recorder.step(torch.ones_like(action) if i % 30 > 20 else action)
