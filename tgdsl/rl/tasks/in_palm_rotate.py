@@ -13,7 +13,7 @@ and `priv_obj_props` as in `groups`.
 The reward is the sum of these terms times Δt; weights are the paper's.
 
     success            w · (goal reached in this step)                           150 1/s
-    spin               w · clip(Δψ/Δt, −ω_max, ω_max)                            2 1/rad
+    spin               w · min(Δψ/Δt, ω_max)                                     2 1/rad
     near               w · mean_p exp(−max(0, d_p)/λ)                            0.1 1/s
     tilt               w · θ                                                     −1 1/(rad s)
     object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
@@ -26,8 +26,8 @@ The reward is the sum of these terms times Δt; weights are the paper's.
 An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back counts against `spin` and
-pays nothing: goals that were reached stay reached.
+formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back
+costs what turning forth has paid, however fast, as `spin` is bounded above alone; goals that were reached stay reached.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
         is_over = distance > spec.drop_distance
         row = {
             "success": weights.success * is_reached,
-            "spin": weights.spin * min(max(step / dt, -spec.max_spin), spec.max_spin),
+            "spin": weights.spin * min(step / dt, spec.max_spin),
             "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
             "tilt": weights.tilt * tilt,
             "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
@@ -187,7 +187,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         distance = (now.object.pos - self.start_pos).norm(dim=1)
         return {
             "success": weights.success * self.is_reached,
-            "spin": weights.spin * self.rate.clamp(-spec.max_spin, spec.max_spin),
+            "spin": weights.spin * self.rate.clamp(max=spec.max_spin),
             "near": weights.near * terms.near(now, spec.near_width),
             "tilt": weights.tilt * self.tilt,
             "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
