@@ -5,8 +5,8 @@ equation; the spec; `reference`, the reward and the end of an episode in float64
 `is_over`, `reward`, `observe`, `score`.
 
 All methods take and return tensors of all environments, and change memory in place, so that on a GPU a whole step can be
-captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host. `is_over`, `reward`,
-`observe` and `score` are compiled by torch on a GPU, and change nothing: `reset` and `advance` do.
+captured as one CUDA graph: no Python branch depends on a tensor's value, and nothing is copied to the host. `is_over`,
+`reward`, `observe` and `score` are compiled by torch on a GPU, and change nothing: `reset` and `advance` do.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `link` links that carry the `link_contact` sensor, `probe`
 probes of the `surface_distance` sensor, `nq` and `nu` as in MuJoCo's model.
