@@ -32,7 +32,7 @@ def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
     sim = tgdsl.simulate(touch, 7, device="cuda:1", substeps=5, keyframe="home", nconmax=20, njmax=90)
     assert isinstance(sim, WarpSimulation)
     keys = {"substeps": 5, "keyframe": "home", "nconmax": 20, "njmax": 90, "on_fault": "raise"}
-    assert asked == {"num_envs": 7, "device": "cuda:1", "options": None, "watch": None, **keys}
+    assert asked == {"num_envs": 7, "device": "cuda:1", "options": None, "watch": None, "per_env": (), **keys}
     assert isinstance(tgdsl.simulate(touch, 1, device="cpu"), BatchSimulation)
 
 
