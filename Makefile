@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo learn test test-fast lint bench soak clean
+.PHONY: demo learn test test-fast lint bench docs soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
@@ -38,13 +38,18 @@ lint: $(READY)
 bench: $(READY)
 	@$(BIN)/python benchmarks/module.py
 
+# These pages and the reference that is generated from the code, as HTML: open build/docs/index.html. A warning is an error.
+docs: $(READY)
+	@$(BIN)/python -m sphinx -b html -W --keep-going --quiet docs build/docs
+	@echo "build/docs/index.html"
+
 # Ten minutes of reading an emulated hand at the highest rate that its line allows; SOAK_SECONDS=60 for one.
 SOAK_SECONDS ?= 600
 soak: $(READY)
 	@$(BIN)/python benchmarks/hand_soak.py --seconds $(SOAK_SECONDS)
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out build docs/generated
 
 # On a terminal pip shows what it downloads: torch alone may take minutes.
 $(READY): pyproject.toml constraints.txt
@@ -53,6 +58,6 @@ $(READY): pyproject.toml constraints.txt
 	@echo "installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX)): the largest part, once"
 	@$(PIP) $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -c constraints.txt torch
 	@echo "installing tgdsl and all else that its examples and tests need"
-	@$(PIP) -c constraints.txt -e '.[dev]'
+	@$(PIP) -c constraints.txt -e '.[dev,docs]'
 	@touch $(READY)
 	@echo "$(VENV) is ready"

@@ -40,17 +40,18 @@ PARTS = ("physics", "drive", "touch", "logic", "reset")
 
 
 class Clock:
-    """Times work on the CPU, or on a GPU by events."""
+    """Times work on the CPU, by the wall or what all threads of this process take, or on a GPU by events."""
 
-    def __init__(self, device: torch.device):
+    def __init__(self, device: torch.device, is_cpu_time: bool = False):
         self._is_cuda = device.type == "cuda"
+        self._now = time.process_time if is_cpu_time else time.perf_counter
 
     def seconds(self, work: Callable[[], object]) -> float:
         """Return what work takes [s]."""
         if not self._is_cuda:
-            start = time.perf_counter()
+            start = self._now()
             work()
-            return time.perf_counter() - start
+            return self._now() - start
         first, last = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         torch.cuda.synchronize()
         first.record()
@@ -124,6 +125,7 @@ def make(options: argparse.Namespace, task: Path, cone: str, **overrides: Any) -
         seed=options.seed,
         threads=options.threads,
         simulator=options.simulator,
+        compiled=options.compiled or None,
     )
     made.steps.copy_(torch.arange(options.envs) * made.max_steps // options.envs)
     return made
@@ -158,7 +160,7 @@ class Alone:
 
 def compare(options: argparse.Namespace, env: TouchEnv, others: list[Alone]) -> list[list[float]]:
     """Return what a step takes in each block, of the environments, and of physics and module alone [s]."""
-    clock, given, length = Clock(env.device), actions(env), options.steps
+    clock, given, length = Clock(env.device, options.cpu_time), actions(env), options.steps
     taken: list[list[float]] = [[] for _ in range(1 + len(others))]
     for block in range(1 + options.blocks):  # in the first of them all is captured
         state, targets, chosen = env.state_dict(), [], [next(given) for _ in range(max(length, 3))]
@@ -342,6 +344,8 @@ def main() -> None:
     parser.add_argument("--simulator", choices=("mujoco", "warp"))
     parser.add_argument("--envs", type=int, default=256)
     parser.add_argument("--threads", type=int, default=2, help="of physics and torch, on the CPU")
+    parser.add_argument("--cpu-time", action="store_true", help="of this process, which others disturb less")
+    parser.add_argument("--compiled", action="store_true", help="compile module and logic on a CPU too, alone and in the step")
     parser.add_argument("--cones", nargs="+", default=["elliptic", "pyramidal"])
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the documents")
     parser.add_argument("--blocks", type=int, default=20, help="0: time nothing")

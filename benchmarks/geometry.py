@@ -217,7 +217,9 @@ def median_time(call: Callable[[], Any], device: str, repeats: int = 9) -> float
 def write(rows: list[Row], reference: float, device: str, out: Path) -> None:
     """Write the table and the plot."""
     unit = "ns per probe" if device == "cuda" else "time per probe / box, analytic, float32"
-    lines = [f"| shape | way | dtype | bytes | max error mm | RMS mm | 95 % of normals within | {unit} |", "|" + "---|" * 8]
+    title = "Geometry on one GPU" if device == "cuda" else "Geometry on one CPU"
+    lines = [f"# {title}", "", f"| shape | way | dtype | bytes | max error mm | RMS mm | 95 % of normals within | {unit} |"]
+    lines.append("|" + "---|" * 8)
     for r in rows:
         cost = r.nanoseconds if device == "cuda" else r.nanoseconds / reference
         lines.append(

@@ -235,7 +235,7 @@ def plot(results: Sequence[Result], file: Path) -> None:
     axes.axhline(results[0].chance, color="black", ls=":", lw=1, label="chance: the best fixed place")
     axes.set(xscale="log", ylim=(0, 1), xlabel="episodes", ylabel="ends on the ridge")
     axes.set_title("lines: with exploration; dots: the policies that were learned, without", fontsize="medium")
-    axes.legend(loc="center left")
+    axes.legend(loc="upper left")
     figure.savefig(file, dpi=150)
     pyplot.close(figure)
 

@@ -2,8 +2,10 @@
 
 import sys
 import warnings
+from collections.abc import Generator
 from pathlib import Path
 
+import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
 
@@ -42,6 +44,15 @@ def here(monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("gpu"):
+            patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+        return (yield)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -20,6 +20,7 @@ FLOORS = (
     ("compiler", "runtime"),
     ("view",),
     ("calibrate", "rl"),
+    ("report",),
     ("commands",),
 )
 FLOOR_OF = {part: floor for floor, parts in enumerate(FLOORS) for part in parts}
@@ -127,14 +128,14 @@ def test_rooms_are_not_crowded():
     assert not {folder: count for folder, count in counts.items() if count > LARGEST_ROOM}
 
 
-@pytest.mark.parametrize("folder", ["tgdsl", "tests", "benchmarks", "examples", "robots"])
+@pytest.mark.parametrize("folder", ["tgdsl", "tests", "benchmarks", "examples", "robots", "docs"])
 def test_files_are_short(folder):
     lengths = {file: len(file.read_text(encoding="utf-8").splitlines()) for file in (REPOSITORY / folder).rglob("*.py")}
     assert not {file.name: length for file, length in lengths.items() if length > LONGEST_FILE}
 
 
 def test_tests_mirror_the_rooms():
-    beside = {"helpers", "benchmarks", "robots", "examples"}
+    beside = {"helpers", "benchmarks", "robots", "examples", "docs"}
     found = {path.parent.relative_to(REPOSITORY / "tests").as_posix() for path in (REPOSITORY / "tests").rglob("test_*.py")}
     assert {path for path in found if not (PACKAGE / path).is_dir()} <= beside
 
@@ -194,14 +195,21 @@ def test_pymeshlab_is_imported_in_one_function():
     assert found == [("surfaces.meshlab", True)]
 
 
-def test_what_learners_bring_is_imported_by_adapters_and_the_video():
-    """It is an extra; what is imported in no function is in a file that nothing else of tgdsl imports."""
+LEARNING, SETTINGS = ("rl.train.", "rl.students."), ("tgdsl.rl.train.spec", "tgdsl.rl.students.spec")
+
+
+TASKS = ("in_hand_repose", "in_palm_rotate", "screwdriver")
+"""Tasks whose numbers of learning are not the defaults."""
+
+
+def test_what_learners_bring_is_imported_by_adapters_learning_and_the_video():
+    """It is an extra; what is imported in no function is in files that the rest of tgdsl imports in functions alone."""
     learners = ("gymnasium", "rsl_rl", "tensordict", "imageio_ffmpeg", "skrl", "stable_baselines3")
     found = {
         (name, room_of(i), is_inside)
         for name, file in MODULES.items()
         for i, is_inside in imports(file)
-        if room_of(i) in learners
+        if room_of(i) in learners and not name.startswith(LEARNING)
     }
     assert found == {
         ("rl.adapters.gymnasium", "gymnasium", False),
@@ -209,4 +217,13 @@ def test_what_learners_bring_is_imported_by_adapters_and_the_video():
         ("rl.adapters.rsl_rl", "tensordict", False),
         ("rl.playing.video", "imageio_ffmpeg", True),
     }
-    assert not [name for name, file in MODULES.items() if any(i.startswith("rl.adapters") for i in own(file))]
+    others = {name: file for name, file in MODULES.items() if not name.startswith((*LEARNING, "commands."))}
+    places = tuple(f"tgdsl.{room}" for room in (*LEARNING, "rl.adapters"))
+    taken = [
+        (name, i) for name, file in others.items() for i, is_inside in imports(file) if i.startswith(places) and not is_inside
+    ]
+    assert set(taken) <= {
+        (name, settings) for name in ("rl.spec", *(f"rl.tasks.{task}" for task in TASKS)) for settings in SETTINGS
+    }
+    files = [MODULES[name.removeprefix("tgdsl.")] for name in SETTINGS]
+    assert not [i for file in files for i, _ in imports(file) if room_of(i) in learners]

@@ -19,6 +19,8 @@ def base(tmp_path):
 
 @pytest.fixture
 def without_opengl(monkeypatch):
+    import tgdsl.rl.playing.video  # noqa: F401  # its annotations are of the renderer that there is
+
     def renderer(*_, **__):
         raise mujoco.FatalError("gladLoadGL error")
 

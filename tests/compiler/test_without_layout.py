@@ -112,4 +112,4 @@ def test_commands(folder, here):
     code, _, err = here(folder, "render", "d.yaml")
     assert code != 0 and "there is nothing to draw: no layout has a taxel" in err
     code, out, _ = here(folder, "run", "d.yaml", "--seconds", "0.02")
-    assert code == 0 and out.endswith("nothing is drawn: no reading is of taxels or of the bodies that carry them\n")
+    assert code == 0 and out.endswith("nothing is drawn: no reading is of taxels, of the bodies that carry them, or of cells\n")

@@ -195,9 +195,7 @@ WRONG_QUANTITIES = {
     'quantity "magnetic_field": `plan` returns NoneType, expected its part, FieldPart': magnets(
         plan=lambda planning, uses: None
     ),
-    'quantity "magnetic_field" reads the field temperature; known fields: body_angvel': magnets(
-        fields=lambda _: {"temperature"}
-    ),
+    'quantity "magnetic_field" reads the field humidity; known fields: body_angvel': magnets(fields=lambda _: {"humidity"}),
     '`gather` of the quantity "magnetic_field" returns 0 values': magnets(gather=lambda part, scene: ()),
     '`gather` of the quantity "magnetic_field": expected a tuple': magnets(gather=lambda part, scene: None),
     'quantity "magnetic_field": its `part` is no frozen dataclass': magnets(part=dict),

@@ -21,7 +21,7 @@ def test_millimetres_are_thousandths(x):
 @pytest.mark.parametrize(("dimension", "unit"), [(d, u) for d, known in units.UNITS.items() for u in known])
 def test_every_unit_has_its_factor(dimension, unit):
     for text in (f"2.5{unit}", f"+2.5 {unit}", f"  25e-1  {unit} "):
-        assert units.parse(text, dimension) == 2.5 * units.UNITS[dimension][unit]
+        assert units.parse(text, dimension) == 2.5 * units.UNITS[dimension][unit] + (-273.15 if unit == "K" else 0.0)
 
 
 def test_units_agree_with_each_other():
@@ -29,6 +29,45 @@ def test_units_agree_with_each_other():
     assert units.parse("1 cm2", "area") == pytest.approx(units.parse("1 cm", "length") ** 2, rel=RTOL)
     assert units.parse("1 N*mm", "torque") == units.parse("1 mN*m", "torque") == 1e-3
     assert units.parse("1 µm", "length") == units.parse("1 um", "length") == 1e-6
+    assert units.parse("1 g/cm3", "mass_density") == 1e3 == pytest.approx(units.parse("1 g", "mass") / 1e-2**3, rel=RTOL)
+    assert units.parse("1 J/(g*K)", "specific_heat") == units.parse("1 kJ/(kg*K)", "specific_heat") == 1e3
+    assert units.parse("1 W/cm2", "heat_flux") == pytest.approx(1 / units.parse("1 cm2", "area"), rel=RTOL)
+
+
+def test_kelvin_have_another_zero():
+    assert (
+        units.parse("0 degC", "temperature") == units.parse("273.15 K", "temperature") == units.parse(0, "temperature") == 0.0
+    )
+    assert units.parse("318.15 K", "temperature") == pytest.approx(45.0, abs=1e-12)
+    assert units.parse("-40 degC", "temperature") == -40.0
+
+
+@pytest.mark.parametrize(
+    ("value", "dimension", "meant"),
+    [
+        ("45 °C", "temperature", "45 degC"),
+        ("60°", "angle", "60deg"),
+        ("15 W/(m·K)", "conductivity", "15 W/(m*K)"),
+        ("5 W/m²", "heat_flux", "5 W/m2"),
+        ("5 W/(m²·K)", "heat_transfer", "5 W/(m2*K)"),
+        ("1 kg/m³", "mass_density", "1 kg/m3"),
+        ("1 g/cm^3", "mass_density", "1 g/cm3"),
+        ("4 J/(kg⋅K)", "specific_heat", "4 J/(kg*K)"),
+    ],
+)
+def test_other_spellings_are_told_how_it_is_here(value, dimension, meant):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
+        units.parse(value, dimension)
+    assert str(caught.value) == f'"{value}" is not a quantity; did you mean "{meant}"?'
+    units.parse(meant, dimension)
+
+
+def test_a_temperature_in_kelvin_that_lacks_its_unit_is_doubted():
+    assert units.doubt(318.15, "temperature", 0.0, 250.0) == (
+        "found 318.15 degC, usually at most 250 degC",
+        'was "318.15 K" meant?',
+    )
+    assert units.doubt(-40.0, "temperature", 0.0, 250.0) is None
 
 
 @pytest.mark.parametrize("value", [2, 2.0, "2", "2.", "+2", "0.2e1", ".2e+1", "20E-1"])
@@ -48,6 +87,10 @@ def test_a_bare_number_is_si(value):
         ("", "angle", '"" is not a quantity, expected a number in rad or a string such as "4 deg"'),
         ("four", "force", '"four" is not a quantity, expected a number in N or a string such as "4 mN"'),
         ("٤ mm", "length", '"٤ mm" is not a quantity, expected a number in m or a string such as "4 µm"'),
+        ("4 degF", "temperature", '"degF" is not a unit of temperature, expected one of degC, K'),
+        ("hot", "temperature", '"hot" is not a quantity, expected a number in degC or a string such as "4 degC"'),
+        ("4 W/m/K", "conductivity", '"W/m/K" is not a unit of conductivity, expected one of W/(m*K)'),
+        ("4 W/(m*K", "conductivity", '"W/(m*K" is not a unit of conductivity, expected one of W/(m*K)'),
         ("4 m", "number", '"4 m" is not a quantity, expected a number'),
         (True, "number", "True is not a quantity, expected a number"),
         ([1], "time", '[1] is not a quantity, expected a number in s or a string such as "4 µs"'),

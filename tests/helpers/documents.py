@@ -72,7 +72,10 @@ def valid() -> dict:
                 "resolutions": {"low": {"a": grid, "b": {"method": "points", "points": [point]}}},
             },
         },
-        "objects": {"ball": {"body": "ball"}},
+        "objects": {
+            "ball": {"body": "ball", "material": "steel", "temperature": "45 degC", "cells": [2, 2, 2]},
+            "cube": {"body": "cube", "material": ["wood", {"like": "steel", "density": 7800}], "temperature": {"per_env": 30}},
+        },
         "resolution": "low",
         "sensors": {
             "touch": {"kind": "contact", "links": "tips", "feels": ["ball"], "noise": "mine"},

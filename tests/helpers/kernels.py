@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import cache
 
 import pytest
 import torch.library
@@ -37,3 +38,38 @@ def use_kernels() -> None:
     if os.environ.get("TRITON_INTERPRET"):
         torch.library.wrap_triton = lambda kernel: kernel  # only torch.compile wants it; older torch takes no interpreted one
     operations.are_kernel_inputs = lambda *tensors: all(tensor.dtype == torch.float32 for tensor in tensors)
+
+
+class AbsentGpu:
+    """What Triton asks of a driver when it compiles: an H200's kind of GPU, which need not be there."""
+
+    def get_current_target(self):
+        from triton.backends.compiler import GPUTarget
+
+        return GPUTarget("cuda", 90, 32)
+
+    def get_current_device(self) -> int:
+        return 0
+
+    def get_current_stream(self, device: int) -> int:
+        return 0
+
+
+@cache
+def assemble_kernels() -> list[str]:
+    """Have kernels of this process compiled to machine code where they are launched, and no more; return their names so far."""
+    from triton.runtime import driver
+    from triton.runtime.jit import JITFunction
+
+    assembled: list[str] = []
+    own = JITFunction.run
+
+    def run(self, *args, grid, warmup, **kwargs):
+        kernel = own(self, *args, grid=grid, warmup=True, **kwargs)
+        assert kernel.asm["cubin"]
+        assembled.append(self.fn.__name__)
+
+    driver.set_active(AbsentGpu())
+    JITFunction.run = run
+    use_kernels()
+    return assembled

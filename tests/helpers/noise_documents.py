@@ -14,7 +14,10 @@ SCENE = """
 </worldbody></mujoco>
 """
 LINKS = ("a_tip", "b_tip", "palm")
-DEFAULTS = {"proximity": {"backend": "points", "points": 100}}
+DEFAULTS = {
+    "proximity": {"backend": "points", "points": 100},
+    "temperature_grid": {"feels": [], "cells": [1, 1, 1], "material": "steel"},
+}
 """What keeps compiling fast."""
 
 

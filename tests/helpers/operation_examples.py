@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import heat_steps
 import meetings
 import moment_fields
 import pulling_points
@@ -89,6 +90,11 @@ EXAMPLES = {
         lambda dtype: shared_contacts.arguments(shared_contacts.cases()["several bodies"], dtype),
         lambda found, _: list(found),
         (1e-5, 1e-5, 1e-7),
+    ),
+    "heat_step": Example(
+        lambda dtype: heat_steps.arguments("five objects", dtype),
+        lambda found, _: [found.cells, found.nodes, torch.stack(found.got), torch.stack(found.nodes_got)],
+        (2e-5, 2e-5, 1e-5, 1e-5),
     ),
 }
 

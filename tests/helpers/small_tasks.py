@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import pytest
+import torch
+
 SCENE = """
 <mujoco model="small">
   <option timestep="0.005"/>
@@ -61,3 +64,20 @@ def small_task(folder: Path) -> Path:
     (folder / "sensors.yaml").write_text(SENSORS)
     (folder / "task.yaml").write_text(TASK)
     return folder / "task.yaml"
+
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")]),
+]
+"""Devices of a fixture."""
+
+
+def have_a_fault(env) -> None:
+    """Make a step in which an action of environment 0 is not finite; on a GPU, two more, by which it is told of."""
+    action = torch.zeros((env.num_envs, env.num_actions), device=env.device)
+    for value in (torch.nan, 0.0, 0.0) if env.device.type == "cuda" else (torch.nan,):
+        action[0, 0] = value
+        env.step(action)
+        if env.device.type == "cuda":
+            torch.cuda.synchronize()

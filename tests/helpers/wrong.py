@@ -78,6 +78,52 @@ WRONG = {
         instead("{body: ball}", "{}"),
         "hand.yaml:4:9: objects.ball: expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own",
     ),
+    "heat of nothing": (
+        instead("{body: ball}", "{body: ball, temperature: 45}"),
+        "hand.yaml:4:9: objects.ball: `temperature` is for the flow of heat, which needs `material`, such as `steel`",
+    ),
+    "heat of an unknown volume": (
+        instead("{body: ball}", "{body: ball, material: steel, size: per_env}"),
+        "hand.yaml:4:9: objects.ball: `material` with `size: per_env` is not supported: heat needs a volume known beforehand",
+    ),
+    "no temperature per environment": (
+        instead("{body: ball}", "{body: ball, material: steel, temperature: per_env}"),
+        "hand.yaml:4:52: objects.ball.temperature: found `per_env` alone, expected `{per_env: 45 degC}`, "
+        "the temperature to begin with",
+    ),
+    "colder than cold": (
+        instead("{body: ball}", "{body: ball, material: steel, temperature: -1 K}"),
+        "hand.yaml:4:52: objects.ball.temperature: -274.15 is out of range, expected at least -273.15",
+    ),
+    "unknown material": (
+        instead("{body: ball}", "{body: ball, material: [steel, stel]}"),
+        'hand.yaml:4:40: objects.ball.material[1]: unknown material "stel"; did you mean "steel"?',
+    ),
+    "unknown material that it is like": (
+        instead("{body: ball}", "{body: ball, material: {like: stel}}"),
+        'hand.yaml:4:39: objects.ball.material.like: unknown material "stel"; did you mean "steel"?',
+    ),
+    "half a material": (
+        instead("{body: ball}", "{body: ball, material: {density: 3 g/cm3}}"),
+        "hand.yaml:4:32: objects.ball.material: found no conductivity, specific_heat, emissivity; expected these, or `like`, "
+        "the name of a material",
+    ),
+    "no material": (
+        instead("{body: ball}", "{body: ball, material: []}"),
+        "hand.yaml:4:32: objects.ball.material: found a list of 0, expected at least 1 entry",
+    ),
+    "too many of a fraction": (
+        instead("{body: ball}", "{body: ball, material: {like: steel, emissivity: 28}}"),
+        "hand.yaml:4:58: objects.ball.material.emissivity: 28 is out of range, expected at most 1",
+    ),
+    "too few cells": (
+        instead("{body: ball}", "{body: ball, material: steel, cells: [4, 4]}"),
+        "hand.yaml:4:46: objects.ball.cells: found a list of 2, value 3 is missing",
+    ),
+    "no cells": (
+        instead("{body: ball}", "{body: ball, material: steel, cells: [4, 4, 0]}"),
+        "hand.yaml:4:53: objects.ball.cells[2]: found 0: input should be greater than or equal to 1",
+    ),
     "not a selection": (
         instead("links: tips", "links: 3"),
         "hand.yaml:10:12: sensors.touch.links: not a selection, "

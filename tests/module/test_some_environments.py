@@ -146,6 +146,56 @@ def test_compiled_equals_eager(folder, monkeypatch, with_grad):
                 torch.testing.assert_close(b[name], a[name], rtol=1e-4, atol=1e-5 * float(a[name].abs().max()) + 1e-12)
 
 
+@pytest.mark.parametrize(("keeps_last", "num_graphs"), [(False, 3), (True, 2)])
+def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder, monkeypatch, keeps_last, num_graphs):
+    """One graph of calls and one of masked ones; else calls before the first masked one have a graph of their own."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+    touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}, "c": {"kind": "contact", "history": 3}}))
+    eager, compiled = copy.deepcopy(touch), []
+    touch.memory.keeps_last = keeps_last
+    touch.compile(backend=lambda graph, _: compiled.append(graph) or graph)
+    mask = torch.tensor([True, False, True])
+    with torch.no_grad():
+        for call in range(6):
+            state, chosen = felt_state(touch, NUM_ENVS, call), {"mask": mask} if call % 2 else {}
+            found = touch(state, **chosen)
+            for name, reading in eager(state, **chosen).items():
+                torch.testing.assert_close(found[name], reading)
+    assert len(compiled) == num_graphs
+
+
+def test_what_has_room_but_was_not_handed_out_is_asked_for(touch):
+    """Room from the start holds nothing; it takes another batch as the module does."""
+    touch.memory.keeps_last = True
+    touch.peek(felt_state(touch, NUM_ENVS))
+    for num_envs in (NUM_ENVS, 2):
+        with pytest.raises(StateError, match="nothing was handed out yet for the environments left out"):
+            touch(felt_state(touch, num_envs), env_ids=[0])
+        before = clones(touch(felt_state(touch, num_envs, 1)))
+        found = touch(felt_state(touch, num_envs, 2), env_ids=[0])
+        assert all(torch.equal(found[name][1:], before[name][1:]) for name in found)
+        touch.free()
+
+
+def test_state_is_loaded_where_it_lies(touch):
+    """A captured graph reads and writes the same tensors before and after; of another number of environments there are others."""
+    source = copy.deepcopy(touch).seed(5)
+    for call in range(3):
+        source(felt_state(source, NUM_ENVS, call))
+    touch.memory.keeps_last = True
+    touch(felt_state(touch, NUM_ENVS, 9))
+    before = {name: buffer.data_ptr() for name, buffer in touch.memory.named_buffers()}
+    touch.load_state_dict(source.state_dict())
+    assert {name: buffer.data_ptr() for name, buffer in touch.memory.named_buffers()} == before
+    state = felt_state(touch, NUM_ENVS, 3)
+    expected = clones(source(state))
+    assert all(torch.equal(reading, expected[name]) for name, reading in touch(state).items())
+    source.free()
+    source(felt_state(source, 2))
+    touch.load_state_dict(source.state_dict())
+    assert touch(felt_state(touch, 2))["s"].shape[0] == 2
+
+
 def test_a_sensor_without_memory_takes_a_mask_too(folder, with_grad):
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}}), dtype=torch.float64)
     states = [felt_state(touch, 4, seed) for seed in range(3)]

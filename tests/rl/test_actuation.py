@@ -198,6 +198,31 @@ def test_relative_actions_add_up_within_the_range_and_are_smoothed(tmp_path):
 # What is drawn
 
 
+def test_slides_have_a_scale_of_their_own_and_none_of_what_is_an_angle():
+    """A slide of 2 kg beside a hinge: a target 1 cm away pulls with k_p · 1 cm, whatever bias, deadband and play hinges have."""
+    joints = '<body><joint name="{0}" type="{0}" axis="0 0 1" range="-1 1" limited="true"/><geom size=".1" mass="2"/></body>'
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><compiler angle="radian"/><option gravity="0 0 0"/><worldbody>'
+        + "".join(joints.format(name) for name in ("slide", "hinge"))
+        + "</worldbody><actuator>"
+        + "".join(f'<position joint="{name}" kp="50" forcerange="-9 9"/>' for name in ("slide", "hinge"))
+        + "</actuator></mujoco>"
+    )
+    own = Actuators.of(model, ["slide", "hinge"])
+    assert own.is_slide.tolist() == [True, False]
+    arrays = {name: torch.zeros(3, 2, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
+    drive = DriveSpec(bias=(0.05, 0.05), deadband=(0.02, 0.02), backlash=(0.04, 0.04), top_speed=1.0)
+    actuation = Actuation(own, arrays, ActionSpec(scale=0.1, slide_scale=0.01), drive, Draws(0, 3))
+    actuation.reset(torch.ones(3, dtype=torch.bool), torch.ones(3, dtype=torch.int64))
+    actuation.command(torch.ones(3, 2))
+    torch.testing.assert_close(actuation.target, torch.tensor([[0.01, 0.1]]).double().expand(3, 2))
+    actuation.drive()
+    torch.testing.assert_close(actuation.torque, 50 * torch.tensor([[0.01, 0.1 + 0.05 - 0.02 - 0.02]]).double().expand(3, 2))
+    arrays["qvel"].fill_(2.0)  # beyond the hinge's top speed
+    actuation.drive()
+    torch.testing.assert_close(actuation.torque, torch.tensor([[0.5, 0.0]]).double().expand(3, 2))
+
+
 def drawn(seed=0, num_envs=64, first_env=0, episode=1, spec=PAPER):
     arrays = {name: torch.zeros(num_envs, 3, dtype=torch.float64) for name in ("qpos", "qvel", "ctrl", "qfrc_applied")}
     model = mujoco.MjModel.from_xml_string(THREE)

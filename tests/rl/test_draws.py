@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tgdsl.rl.draws import Draws
+from tgdsl.rl.draws import Draws, within
+from tgdsl.sensors.noise.random import FACTORS, SHIFTS, UNIFORM_BITS, mix, mix_on_host, sensor_key
 
 COUNT = 200_000
 
@@ -56,3 +57,43 @@ def test_numbers_do_not_hang_on_batch_order_or_on_how_many_are_asked_for():
     late = Draws(3, 8)
     late.normal("y", ones(8), 5)
     assert torch.equal(late.uniform("x", torch.arange(8), 2), numbers[:, :2])
+
+
+def hashed(seed: int, what: str, env: int, count: int, index: int) -> float:
+    """Return a number between 0 and 1 by the definition, in whole numbers of any size."""
+    mask = 2**32 - 1
+
+    def mix(word: int) -> int:
+        for shift, factor in zip(SHIFTS, (*FACTORS, 1), strict=True):
+            word = ((word ^ (word >> shift)) * factor) & mask
+        return word
+
+    first, second = (
+        mix(mix(mix((env ^ key) & mask) ^ (count & mask)) ^ mix(count >> 32))
+        for key in (k & mask for k in sensor_key(seed, what))
+    )
+    word = mix(index ^ first) ^ second
+    return ((word >> (32 - UNIFORM_BITS)) + 0.5) / 2**UNIFORM_BITS
+
+
+def test_numbers_for_several_purposes_are_those_for_each():
+    """By the definition in plain Python, for counts beyond 32 bits too, before and after another seed."""
+    draws, counts = Draws(3, 5, first_env=7), torch.tensor([0, 1, (5 << 32) + 2, 2**40, 9])
+    for seed in (3, 4):
+        draws.reseed(seed)
+        found = draws.shares({"a": 3, "b": 1, "c": 2}, counts)
+        for what, share in found.items():
+            wanted = [[hashed(seed, what, 7 + e, int(counts[e]), i) for i in range(share.shape[1])] for e in range(5)]
+            np.testing.assert_array_equal(share.numpy(), np.float32(wanted))
+            assert torch.equal(draws.uniform(what, counts, share.shape[1], -1.0, 2.0), within(share, -1.0, 2.0))
+
+
+def test_words_are_mixed_alike_by_torch_and_by_numpy():
+    """Of all shapes, those without an element included, and of tensors that are not contiguous."""
+    generator = torch.Generator().manual_seed(0)
+    word = torch.randint(-(2**31), 2**31, (40, 30, 2), generator=generator).to(torch.int32)
+    for own in (word, word[:, 3:7].transpose(0, 1), word[..., 1], word[:0]):
+        found = mix_on_host(own.numpy().view(np.uint32))
+        assert found.dtype == np.uint32
+        np.testing.assert_array_equal(found.view(np.int32), mix(own).numpy())
+    assert word.min() < 0 < word.max()

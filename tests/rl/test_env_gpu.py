@@ -5,7 +5,11 @@ import torch
 from tiny_tasks import tiny_env
 
 NUM, LAST = 64, (0, 5, 63)
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU"),
+    pytest.mark.filterwarnings("ignore:Synchronization debug mode is a prototype"),
+]
 
 
 @pytest.fixture
@@ -51,3 +55,27 @@ def test_episodes_end_and_begin_within_a_captured_step(env):
     assert torch.equal((state == final).all(dim=1), ~made.info.ended)
     after = env.step(chosen[5])
     assert not after.info.faults.any() and all(bool(value.isfinite().all()) for value in after.obs.values())
+
+
+@pytest.mark.parametrize("noise", ["clean", "noisy"])
+def test_a_captured_step_goes_on_from_a_state_that_is_loaded(tmp_path, noise):
+    """Counts are those after as many steps, noise is drawn as it was, and memory that the graph writes is still the module's."""
+    env = tiny_env(tmp_path, num_envs=NUM, device="cuda", seed=1, more=f"noise: {noise}\ntouch: bool\n")
+    chosen = actions(env, 12)
+    for action in chosen[:6]:
+        env.step(action)
+    saved = env.state_dict()
+    expected = [env.step(action) for action in chosen[6:]]
+    counts = {name: value.clone() for name, value in env.touch.memory.named_buffers() if not value.is_floating_point()}
+    env.load_state_dict(saved)
+    canary = [torch.zeros(NUM, 4, device="cuda") for _ in range(200)]  # where freed memory would be handed out again
+    for action, before in zip(chosen[6:], expected, strict=True):
+        made = env.step(action)
+        assert torch.equal(made.info.ended, before.info.ended)
+        differ = (made.obs["tactile_sensors"] != before.obs["tactile_sensors"]).float().mean()
+        assert differ <= 0.02  # physics on a GPU adds up in any order: a bit at its threshold may fall on the other side
+        torch.testing.assert_close(made.obs["proprio"], before.obs["proprio"], rtol=1e-3, atol=1e-3)
+    after = dict(env.touch.memory.named_buffers())
+    assert all(torch.equal(after[name], value) for name, value in counts.items())
+    assert not any(value.any() for value in canary)
+    env.close()

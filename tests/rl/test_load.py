@@ -16,7 +16,9 @@ from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 REPOSITORY = Path(__file__).parents[2]
 DOCUMENTS = sorted(
-    path for path in (REPOSITORY / "examples" / "tasks").glob("*.yaml") if "task:" in path.read_text(encoding="utf-8")
+    path
+    for path in (REPOSITORY / "examples" / "tasks").glob("*.yaml")
+    if "\ntask:" in (text := path.read_text(encoding="utf-8")) and "\nmatrix:" not in text  # that is a sweep
 )
 
 

@@ -126,6 +126,9 @@ def test_good_documents_are_accepted():
 BEYOND_A_SCHEMA = {
     "out of range",
     "two keys at odds",
+    "colder than cold",
+    "heat of nothing",
+    "heat of an unknown volume",
     "missing layout",
     "duplicate key",
     "huge number",

@@ -36,6 +36,18 @@ CASES = {
         DOCUMENT.replace(BALL, "ball: {variants: [{geoms: [{type: box, size: [1, 1, 60]}]}]}"),
         '4:55: objects.ball.variants[0].geoms[0].size[2]: found 60 m, usually at most 5 m; was "60 cm" or "60 mm" meant?',
     ),
+    "a temperature in kelvin": (
+        DOCUMENT.replace(BALL, "ball: {body: ball, material: steel, temperature: 318}"),
+        '4:52: objects.ball.temperature: found 318 degC, usually at most 250 degC; was "318 K" meant?',
+    ),
+    "a temperature per environment": (
+        DOCUMENT.replace(BALL, "ball: {body: ball, material: steel, temperature: {per_env: 318}}"),
+        '4:62: objects.ball.temperature.per_env: found 318 degC, usually at most 250 degC; was "318 K" meant?',
+    ),
+    "a material": (
+        DOCUMENT.replace(BALL, "ball: {body: ball, material: [steel, {like: wood, density: 0.7}]}"),
+        '4:62: objects.ball.material[1].density: found 0.7 kg/m3, usually at least 5 kg/m3; was "0.7 g/cm3" meant?',
+    ),
     "history": (
         DOCUMENT.replace(TOUCH, TOUCH + "    history: 100000\n"),
         "12:14: sensors.touch.history: found 100000, usually at most 1000",
@@ -49,7 +61,7 @@ CASES = {
             TOUCH,
             TOUCH + "    kernel: half_space\n    normal_stiffness: 1e8\n    youngs_modulus: 0.2\n",
         ),
-        '14:21: sensors.touch.youngs_modulus: found 0.2 Pa, usually at least 1000 Pa; was "0.2 MPa" meant?',
+        '14:21: sensors.touch.youngs_modulus: found 0.2 Pa, usually at least 1000 Pa; was "0.2 MPa" or "0.2 GPa" meant?',
     ),
 }
 

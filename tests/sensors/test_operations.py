@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from kernels import as_script, interpreted, needs_triton, use_kernels
+from kernels import as_script, assemble_kernels, interpreted, needs_triton, use_kernels
 from operation_examples import EXAMPLES, mapped
 
 from tgdsl.sensors.operations import OPERATIONS
@@ -64,6 +64,14 @@ def interpret(name):
     return error_of(name, OPERATION[name](*arguments), arguments)
 
 
+def assemble(name):
+    """Return "" if a GPU's kernel compiles to machine code."""
+    assembled = assemble_kernels()
+    (kernel,) = (Path(file).stem for file in KERNEL_FILES if name in operators(file))
+    OPERATION[name](*EXAMPLES[name].arguments(torch.float32))
+    return "" if any(own.startswith(kernel) for own in assembled) else f"no {kernel} among {assembled}"
+
+
 def trace(name):
     """Return "" if one graph of Dynamo holds the operator, whatever the device."""
     use_kernels()
@@ -98,6 +106,7 @@ def launch(name, is_compiled):
 
 MODES = {
     "interpret": interpret,
+    "assemble": assemble,
     "trace": trace,
     "eager": partial(launch, is_compiled=False),
     "compiled": partial(launch, is_compiled=True),
@@ -119,6 +128,12 @@ def errors():
 @pytest.mark.parametrize("name", NAMES)
 def test_an_interpreted_kernel_is_the_definition(errors, name):
     assert errors("interpret")[name] == ""
+
+
+@needs_triton
+@pytest.mark.parametrize("name", NAMES)
+def test_a_kernel_compiles_for_a_gpu_that_is_not_here(errors, name):
+    assert errors("assemble")[name] == ""
 
 
 @needs_triton

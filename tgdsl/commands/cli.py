@@ -19,9 +19,15 @@ from tgdsl.commands.grasps import Grasps
 from tgdsl.commands.hand.hand import Hand
 from tgdsl.commands.import_ import Import
 from tgdsl.commands.layout.layout import Layout
+from tgdsl.commands.learning.distill import Distill
+from tgdsl.commands.learning.evaluate import Evaluate
+from tgdsl.commands.learning.sweep import Sweep
+from tgdsl.commands.learning.train import Train
 from tgdsl.commands.links import Links
 from tgdsl.commands.play import Play
 from tgdsl.commands.render import Render
+from tgdsl.commands.report.bench import Bench
+from tgdsl.commands.report.doctor import Doctor
 from tgdsl.commands.run import Run
 from tgdsl.commands.schema import Schema
 from tgdsl.errors import SpecError, TgdslError
@@ -32,12 +38,18 @@ Command = (
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Play, tyro.conf.subcommand("play")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Distill, tyro.conf.subcommand("distill")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Links, tyro.conf.subcommand("links")]
     | Annotated[Layout, tyro.conf.subcommand("layout")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[ExportUsd, tyro.conf.subcommand("export-usd")]
     | Annotated[Cache, tyro.conf.subcommand("cache")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Grasps, tyro.conf.subcommand("grasps")]
     | Annotated[Hand, tyro.conf.subcommand("hand")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]

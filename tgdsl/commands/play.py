@@ -27,10 +27,10 @@ class Play:
 
     task: Task
     policy: OptionalFile = None
-    """A learned policy that acts: a TorchScript file, as rsl_rl's export_policy_to_jit writes it."""
+    """A learned policy that acts: a TorchScript file, as tgdsl train and rsl_rl's export_policy_to_jit write it."""
     groups: tuple[str, ...] = ()
-    """Groups of observations that the policy takes, in its order; default: those of proprio, tactile_sensors and goal that the
-    task has."""
+    """Groups of observations that the policy takes, in its order; default: those of its card; of one that has none, those of
+    proprio, tactile_sensors and goal that the task has."""
     actions: Annotated[str, tyro.conf.arg(metavar="ACTIONS")] = "zero"
     """Who acts where there is no policy: zero, random, script (the task's own, if it has one), or FILE.py:FUNCTION, which takes
     the environment and its observations by group and returns actions (env, joint) from −1 to 1."""
@@ -87,12 +87,11 @@ class Play:
 
     def _actor(self, env: TouchEnv) -> Actor:
         from tgdsl.rl.playing.actions import actor_of
-        from tgdsl.rl.playing.policy import Policy, actor_groups
+        from tgdsl.rl.playing.policy import policy_for
 
         if self.policy is None:
             return actor_of(env, self.actions, self.seed)
-        groups = {name: env.groups[name] for name in actor_groups(env.groups, self.groups)}
-        return Policy(self.policy, groups, env.num_envs, env.num_actions, env.device)
+        return policy_for(env, self.policy, self.groups)
 
     def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> None:
         """Make all steps."""

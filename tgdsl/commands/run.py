@@ -44,14 +44,19 @@ class Run:
     view: str | None = None
     """From where the pictures are seen: front (what the taxels face), back, left, right, top (from beyond the fingertips),
     bottom, iso, or AZIMUTH,ELEVATION in degrees, front being about 0,0; default: the one that shows most of what is touched."""
+    temperatures: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="LOW HIGH")] = None
+    """Ends of the colours of temperatures [°C]; default: the lowest and the highest that are read."""
     set: Overrides = ()
 
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
         from tgdsl.files.write import check_writable, with_folder
         from tgdsl.runtime.rollout import Recorder, is_touched
-        from tgdsl.view.cameras import angles_of
+        from tgdsl.view.cameras import ViewError, angles_of
 
+        if self.temperatures is not None and not self.temperatures[0] < self.temperatures[1]:
+            low, high = self.temperatures
+            raise ViewError(f"--temperatures {low:g} {high:g}: expected the lower one first")
         if self.view is not None:
             angles_of(self.view)
         files = {name: check_writable(self.out / f"{name}.{ending}") for name, ending in _FILES.items()}
@@ -71,37 +76,17 @@ class Run:
 
     def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
-        from tgdsl.runtime.rollout import default_keyframes, recorded_controls, scripted_controls
+        from tgdsl.runtime.rollout import recorded_controls
+        from tgdsl.runtime.scripted import script_of
         from tgdsl.runtime.simulate import simulate
-        from tgdsl.scene.scene import scene_model
 
-        if self.controls is None and self.keyframes is None and not default_keyframes(scene_model(touch.plan.scene)):
-            progress("finding out how the hand closes")
-            return self._closing(touch)
-        sim = simulate(touch, self.num_envs, substeps=self.substeps)
         if self.controls is not None:
-            return sim, recorded_controls(self.controls)
-        keyframes = default_keyframes(sim.model) if self.keyframes is None else self.keyframes
-        controls = scripted_controls(sim.model, keyframes, self.seconds, sim.control_step)
-        sim.close()
-        return simulate(touch, self.num_envs, substeps=self.substeps, keyframe=keyframes[0]), controls
-
-    def _closing(self, touch: TactileModule) -> tuple[BatchSimulation, Controls]:
-        """Return a scene without keyframes whose hand closes on an object, or, if it cannot, its initial state, held."""
-        from tgdsl.runtime.batch.simulation import BatchSimulation
-        from tgdsl.runtime.closing.closing import START, closing_of
-        from tgdsl.runtime.rollout import controls_between, held_controls
-        from tgdsl.runtime.simulate import simulate
-
-        closing = closing_of(touch)
-        if isinstance(closing, str):
-            why = f"no keyframes rest and squeeze, and the hand does not close ({closing})"
-            print(f"{why}: its initial state is held for {self.seconds:g} s")
-            sim = simulate(touch, self.num_envs, substeps=self.substeps)
-            return sim, held_controls(sim.model, self.seconds, sim.control_step)
-        print(f"no keyframes rest and squeeze: {closing}")
-        sim = BatchSimulation(touch, self.num_envs, substeps=self.substeps, keyframe=START, prepare=closing.prepare)
-        return sim, controls_between(closing.targets(sim.model.nu), self.seconds, sim.control_step)
+            return simulate(touch, self.num_envs, substeps=self.substeps), recorded_controls(self.controls)
+        script = script_of(touch, self.keyframes, progress)
+        if script.note:
+            held = "" if script.closing else f": its initial state is held for {self.seconds:g} s"
+            print(f"{script.note}{held}")
+        return script.begin(touch, self.num_envs, self.substeps, self.seconds)
 
     def _steps(self, touch: TactileModule, sim: BatchSimulation, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
         """Make all steps, and return the last readings."""
@@ -124,18 +109,18 @@ class Run:
         return readings
 
     def _draw(self, touch: TactileModule, sim: BatchSimulation, readings: dict[str, Tensor], files: dict[str, Path]) -> None:
-        from tgdsl.view.overview import overview
+        from tgdsl.view.overview import drawn_outputs, overview
         from tgdsl.view.picture import picture
-        from tgdsl.view.table import outputs_on_taxels
 
         drawn = []
         with StatusLine() as progress:
-            rows = [output.rows for output in outputs_on_taxels(touch)]
+            rows = [output.rows for output in drawn_outputs(touch)]
             if "taxel" in rows:
                 progress("drawing the picture")
                 drawn.append(f"picture:  {picture(touch, sim, readings, files['picture'], view=self.view)}")
             if len(rows) > 1 or (rows and "taxel" not in rows):
                 progress("drawing the overview")
-                path = overview(touch, sim, readings, files["overview"], title=self.document.stem, view=self.view)
+                options = {"title": self.document.stem, "view": self.view, "temperatures": self.temperatures}
+                path = overview(touch, sim, readings, files["overview"], **options)
                 drawn.append(f"overview: {path}")
-        print("\n".join(drawn or ["nothing is drawn: no reading is of taxels or of the bodies that carry them"]))
+        print("\n".join(drawn or ["nothing is drawn: no reading is of taxels, of the bodies that carry them, or of cells"]))

@@ -30,7 +30,7 @@ from tgdsl.plan.sensors import (
     PlannedReading,
     PlannedSensor,
 )
-from tgdsl.quantities.base import Planning, Quantity, Request
+from tgdsl.quantities.base import Planning, Quantity, Request, heated_objects
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
@@ -42,6 +42,7 @@ Parts = Mapping[str, Any]
 FIELDS = (
     *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
     *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
+    *("object_temperature", "object_material"),
 )
 """Fields of the state that quantities read, in the order in which a module wants them."""
 
@@ -78,7 +79,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
     made = Plan(
         origin=origin,
-        inputs=_inputs(sensors, pruned, numbered, shared, parts, asked, touched, seen),
+        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, asked, touched, seen),
         layout=resolved.layout,
         objects=numbered.objects,
         pairs=numbered.table,
@@ -212,6 +213,7 @@ def _check_parts(parts: Parts, asked: Sequence[Quantity]) -> None:
 
 
 def _inputs(
+    resolved: Resolved,
     sensors: Sequence[LoweredSensor],
     pruned: Pruned,
     numbered: Numbered,
@@ -226,6 +228,8 @@ def _inputs(
     varied = sorted((target for target in numbered.objects if target.varied >= 0), key=lambda target: target.varied)
     read |= {"variant"} if any(target.num_variants > 1 for target in varied) else set()
     read |= {"object_size"} if any(target.is_sized for target in varied) else set()
+    heated = heated_objects(numbered.objects, resolved.objects) if {"object_temperature", "object_material"} & read else ()
+    heats = [heat for name in heated if (heat := resolved.objects[name].heat) is not None]
     body_of = {target.name: target.body for target in numbered.objects}
     fields = [name for name in FIELDS if name in read] + [reading.name for reading in seen.proprioception]
     return Inputs(
@@ -236,6 +240,9 @@ def _inputs(
         slots=max((use.request.num_slots for uses in shared.uses.values() for use in uses), default=0),
         objects=tuple(target.name for target in varied),
         num_variants=tuple(target.num_variants for target in varied),
+        heated=heated,
+        num_materials=tuple(len(heat.materials) for heat in heats),
+        start_temperatures=tuple(heat.temperature if heat.is_per_env else None for heat in heats),
         joints=seen.joints,
         actuators=seen.actuators,
         contacts_of=touched.objects,
@@ -255,7 +262,8 @@ def _sensor(
 ) -> PlannedSensor[np.ndarray]:
     """Return a sensor as the Plan has it."""
     lowered, spec, bodies = sensor.lowered, sensor.spec, body_axis(sensor.layout)
-    reports = [_reading(f"{sensor.sensor}/{key}", bodies, channels, 0) for key, channels in lowered.reports.items()]
+    own = {key: lowered.report_rows.get(key, bodies) for key in lowered.reports}
+    reports = [_reading(f"{sensor.sensor}/{key}", own[key], channels, 0) for key, channels in lowered.reports.items()]
     readings = [_reading(name, sensor.rows, lowered.channels, _steps(sensor)) for name in sensor.readings]
     signal = tuple(channel.name for channel in lowered.signal or lowered.channels)
     noise = sensor.noise
@@ -272,7 +280,7 @@ def _sensor(
         state=_state(sensor, shared, parts, asked, (len(signal), sensor.rows.size)),
         signal=signal,
         readings=(*readings, *reports),
-        axes=(*[_axis(sensor.rows)] * len(readings), *[_axis(bodies)] * len(reports)),
+        axes=(*[_axis(sensor.rows)] * len(readings), *[_axis(rows) for rows in own.values()]),
         noise=None if noise is None else PlannedNoise(noise.terms, noise.streams, dict(sorted(noise.constants.items()))),
         period=0.0 if spec.rate is None else 1.0 / spec.rate,
         history=None if spec.history is None else PlannedHistory(spec.history.length, spec.history.reduce, spec.history.view),

@@ -12,7 +12,7 @@ from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError, Problem, SampleError, did_you_mean, listed
+from tgdsl.errors import LowerError, Problem, RobotError, SampleError, did_you_mean, listed
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
 from tgdsl.files.find import is_file, robot_names
@@ -65,9 +65,16 @@ class Resolved:
         """Return the triangles of a link, or of a region of it, in its body's frame.
 
         Raises:
-            LowerError: If the region holds nothing of the link.
+            LowerError: If the link has no geoms, one of them has no bounded surface, or the region holds nothing of it.
         """
-        surface = self.robot.surface(self.patches[link].geoms, self.patches[link].as_collided)
+        patch = self.patches.get(link)
+        geoms = self.robot.touchable(link) if patch is None else patch.geoms
+        if not geoms:
+            raise LowerError(f'link "{link}" has no geoms', field="links")
+        try:
+            surface = self.robot.surface(geoms, patch is not None and patch.as_collided)
+        except RobotError as error:
+            raise LowerError(str(error), field="links") from error
         try:
             return clip(surface, region) if region else surface
         except SampleError as error:

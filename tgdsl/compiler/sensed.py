@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Collection, Sequence, Set
+
+import numpy as np
 
 from tgdsl.formats.model import Model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.inputs import ContactPart
-from tgdsl.schema.objects import NUM_SIZES, ObjectSpec
+from tgdsl.schema.objects import NUM_SIZES, ObjectSpec, TemperaturePerEnv
 from tgdsl.schema.select import matching
+from tgdsl.surfaces.bulk import PRIMITIVES, bulk
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
-from tgdsl.surfaces.sensed import DistanceOptions, SensedObject
+from tgdsl.surfaces.sensed import DistanceOptions, ObjectHeat, SensedObject
 
 Report = Callable[[str, str], None]
 """Called with what is wrong with an object, and a hint."""
@@ -65,6 +69,34 @@ def sensed_object(
         bodies=bodies,
         touched=frozenset(geom.id for geom in touched),
         distance=DistanceOptions(target.query, target.tolerance, target.max_bytes),
+        heat=_heat(felt, body, target, report),
+    )
+
+
+def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, report: Report) -> ObjectHeat | None:
+    """Return what the flow of heat needs to know of an object; None if the document does not say what it is made of."""
+    if target.material is None or not all(felt):
+        return None
+    for own in itertools.chain(*felt):
+        if own.shape not in ("mesh", *PRIMITIVES):
+            hint = f"give `material` to bodies of {', '.join(PRIMITIVES)}, mesh"
+            report(f'{own.geom.shown} of body "{body}" has no volume that could hold heat', hint)
+            return None
+    each = [bulk(geoms) for geoms in felt]
+    if not all(one.volume > 0 for one in each):
+        report(f'the geoms of body "{body}" enclose no volume that could hold heat', "")
+        return None
+    start = target.temperature
+    return ObjectHeat(
+        temperature=start.per_env if isinstance(start, TemperaturePerEnv) else start,
+        is_per_env=isinstance(start, TemperaturePerEnv),
+        materials=target.material,
+        cells=target.cells,
+        volume=np.array([one.volume for one in each]),
+        area=np.array([one.area for one in each]),
+        box_center=np.array([one.center for one in each]),
+        box_size=np.array([one.high - one.low for one in each]),
+        curvature=np.array([one.curvature for one in each]),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -48,11 +49,13 @@ class Quantity:
         dimension: A key of `units.UNITS`.
         ge: Least value.
         gt: Bound that the value must exceed.
+        le: Largest value.
     """
 
     dimension: str
     ge: float | None = None
     gt: float | None = None
+    le: float | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         """Read a number or a string, then look at the bounds."""
@@ -65,7 +68,9 @@ class Quantity:
             number["exclusiveMinimum"] = self.gt
         if self.ge is not None:
             number["minimum"] = self.ge
-        names = "|".join(name.replace("*", r"\*") for name in units.UNITS[self.dimension])
+        if self.le is not None:
+            number["maximum"] = self.le
+        names = "|".join(re.sub(r"([*()])", r"\\\1", name) for name in units.UNITS[self.dimension])
         return {"anyOf": [number, {"type": "string", "pattern": PATTERN % names}]} if names else number
 
     def _read(self, found: object) -> float:
@@ -74,6 +79,8 @@ class Quantity:
             raise ValueError(f"{value:g} is out of range, expected more than {self.gt:g}")
         if self.ge is not None and not value >= self.ge:
             raise ValueError(f"{value:g} is out of range, expected at least {self.ge:g}")
+        if self.le is not None and not value <= self.le:
+            raise ValueError(f"{value:g} is out of range, expected at most {self.le:g}")
         return value
 
 
@@ -129,6 +136,8 @@ Area = Annotated[float, Quantity("area", gt=0.0)]
 Angle = Annotated[float, Quantity("angle", gt=0.0)]
 Frequency = Annotated[float, Quantity("frequency", gt=0.0)]
 Pressure = Annotated[float, Quantity("pressure", gt=0.0)]
+Temperature = Annotated[float, Quantity("temperature", ge=units.ZEROS["K"])]
+"""[°C], from absolute zero on."""
 Number = Annotated[float, Quantity("number")]
 NonNegative = Annotated[float, Quantity("number", ge=0.0)]
 Positive = Annotated[float, Quantity("number", gt=0.0)]

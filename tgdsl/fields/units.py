@@ -4,42 +4,52 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
     "area": {"m2": 1.0, "cm2": 1e-4, "mm2": 1e-6},
     "density": {"/m2": 1.0, "/cm2": 1e4, "/mm2": 1e6},
     "angle": {"rad": 1.0, "deg": math.pi / 180.0},
-    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6},
+    "pressure": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9},
     "force": {"N": 1.0, "mN": 1e-3},
     "torque": {"N*m": 1.0, "N*mm": 1e-3, "mN*m": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6},
     "frequency": {"Hz": 1.0, "kHz": 1e3},
     "mass": {"kg": 1.0, "g": 1e-3},
     "speed": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "temperature": {"degC": 1.0, "K": 1.0},
+    "power": {"W": 1.0, "mW": 1e-3},
+    "heat_flux": {"W/m2": 1.0, "kW/m2": 1e3, "W/cm2": 1e4},
+    "heat_transfer": {"W/(m2*K)": 1.0},
+    "conductivity": {"W/(m*K)": 1.0},
+    "specific_heat": {"J/(kg*K)": 1.0, "kJ/(kg*K)": 1e3, "J/(g*K)": 1e3},
+    "mass_density": {"kg/m3": 1.0, "g/cm3": 1e3},
     "number": {},
 }
-"""Factor to SI of every unit, by dimension; the first of a dimension is the SI unit."""
+"""Factor to SI of every unit, by dimension; the first of a dimension is the unit inside tgdsl: SI, but of temperatures degC."""
+ZEROS: dict[str, float] = {"K": -273.15}
+"""Where the scale of a unit begins, in the first unit of its dimension; all others begin at 0."""
 
-_QUANTITY = re.compile(r"\s*+([-+]?(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?)\s*+([A-Za-zµ/][\w*/µ]*+)?\s*+\Z")
+_QUANTITY = re.compile(r"\s*+([-+]?(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?)\s*+([A-Za-zµ/][\w*/µ()]*+)?\s*+\Z")
 """A number and a unit; possessive, so that nothing is read twice and a long text takes no long time."""
 
-_SPELLINGS = str.maketrans({"^": "", "²": "2", "·": "*", "⋅": "*", "×": "*", "μ": "µ"})
+_SPELLINGS = str.maketrans({"^": "", "²": "2", "³": "3", "°": "deg", "·": "*", "⋅": "*", "×": "*", "μ": "µ"})
 """How units may be spelled elsewhere, and how they are here."""
 
 
 def parse(value: object, dimension: str) -> float:
-    """Return a quantity in SI units.
+    """Return a quantity in SI units; a temperature in °C.
 
     Args:
-        value: A number (taken as SI) or a string such as `"4 mm"`.
+        value: A number (taken as SI, or °C) or a string such as `"4 mm"`.
         dimension: A key of `UNITS`.
 
     Raises:
         ValueError: If the value is no finite number, or its unit is not one of the dimension.
     """
     known = UNITS[dimension]
-    wanted = f'a number in {next(iter(known))} or a string such as "4 {list(known)[-1]}"' if known else "a number"
+    wanted = f'a number in {next(iter(known))} or a string such as "4 {_example(known)}"' if known else "a number"
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{value!r} is not a quantity, expected {wanted}")
     if isinstance(value, str):
@@ -51,7 +61,7 @@ def parse(value: object, dimension: str) -> float:
             raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
         if match[2] and match[2] not in known:
             raise ValueError(f'"{match[2]}" is not a unit of {dimension}, expected one of {", ".join(known)}')
-        value = float(match[1]) * known.get(match[2] or "", 1.0)
+        value = float(match[1]) * known.get(match[2] or "", 1.0) + ZEROS.get(match[2] or "", 0.0)
     try:
         value = float(value)
     except OverflowError:  # a whole number of more than 308 digits
@@ -59,6 +69,11 @@ def parse(value: object, dimension: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{value} is not finite, expected {wanted}")
     return value
+
+
+def _example(known: Mapping[str, float]) -> str:
+    """Return the last of some units whose scale begins at 0."""
+    return [unit for unit in known if unit not in ZEROS][-1]
 
 
 def doubt(value: float, dimension: str, low: float, high: float) -> tuple[str, str] | None:
@@ -75,6 +90,7 @@ def doubt(value: float, dimension: str, low: float, high: float) -> tuple[str, s
     known = UNITS[dimension]
     si = f" {next(iter(known))}" if known else ""
     bound = f"usually at least {low:g}{si}" if abs(value) < low else f"usually at most {high:g}{si}"
-    units = {factor: unit for unit, factor in known.items() if low <= abs(value) * factor <= high}
+    scales = {(factor, ZEROS.get(unit, 0.0)): unit for unit, factor in known.items()}
+    units = {scale: unit for scale, unit in scales.items() if low <= abs(value * scale[0] + scale[1]) <= high}
     meant = " or ".join(f'"{value:g} {unit}"' for unit in units.values())
     return f"found {value:g}{si}, {bound}", f"was {meant} meant?" if meant else ""

@@ -119,11 +119,12 @@ def transpose_times(a: Rot, b: Rot) -> Rot:
 
 def rotation(quat: Tensor) -> Rot:
     """Return the rotation of a `(..., 4)` quaternion w, x, y, z, which need not have unit length."""
-    w, x, y, z = quat[..., 0], quat[..., 1], quat[..., 2], quat[..., 3]
+    w, x, y, z = quat.unbind(-1)
     two = 2.0 / (w * w + x * x + y * y + z * z)
-    xx, yy, zz = two * x * x, two * y * y, two * z * z
-    xy, xz, yz = two * x * y, two * x * z, two * y * z
-    wx, wy, wz = two * w * x, two * w * y, two * w * z
+    tw, tx, ty = two * w, two * x, two * y
+    xx, yy, zz = tx * x, ty * y, two * z * z
+    xy, xz, yz = tx * y, tx * z, ty * z
+    wx, wy, wz = tw * x, tw * y, tw * z
     return 1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy
 
 

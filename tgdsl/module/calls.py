@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from tgdsl.module.state import CHOICES
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.base import Quantity
 from tgdsl.tensors import torch_internals
@@ -66,19 +67,20 @@ class Calls:
 def inductor_options(plan: Plan, quantities: Sequence[Quantity]) -> dict[str, bool]:
     """Return what is asked of Inductor for a plan and the quantities that it asks for.
 
-    Kernels look at each index whether it is in range only where some index is given by the user: a variant's number. Where
-    taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and taxels: what
-    there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more to find a
-    tile takes too many registers.
+    Kernels look at each index whether it is in range only where some index is given by the user: a variant's or a material's
+    number. Where taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and
+    taxels: what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more
+    to find a tile takes too many registers.
     """
     is_slight = (
         all(quantity.is_light(plan.quantities[quantity.name]) for quantity in quantities)
         and not any(sensor.noise for sensor in plan.sensors)
         and all(target.num_pairs == 1 for target in plan.objects)
     )
-    return torch_internals.inductor_options("variant" in plan.inputs.fields, is_slight)
+    return torch_internals.inductor_options(any(name in plan.inputs.fields for name in CHOICES), is_slight)
 
 
-def has_cpp_compiler() -> bool:
-    """Return whether there is a C++ compiler, which Inductor needs for a CPU."""
-    return any(shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
+def cpp_compiler() -> str | None:
+    """Return the C++ compiler that Inductor needs for a CPU; None if there is none."""
+    found = (shutil.which(name) for name in (os.environ.get("CXX", ""), "g++", "clang++") if name)
+    return next((path for path in found if path), None)

@@ -40,6 +40,10 @@ def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, 
             value = torch.arange(num_envs)[:, None] % torch.tensor(inputs.num_variants)
         elif name == "object_size":
             value = 0.015 + 0.01 * value.clamp(-1, 1)
+        elif name == "object_temperature":
+            value = 30.0 + 15.0 * value.clamp(-1, 1)
+        elif name == "object_material":
+            value = torch.arange(num_envs)[:, None] % torch.tensor(inputs.num_materials)
         values[name] = value
     if "contact_force" in values:
         values |= _contacts(values, inputs, spread)

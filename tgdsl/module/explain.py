@@ -74,12 +74,13 @@ def operations_per_env(touch: Explained) -> int:
     counts = []
     for num_envs in (2, 4):
         state = example_state(touch.plan.inputs, num_envs, 0, torch.float64, 0.03).to(touch.constants.device)
-        memory = Memory(touch.plan.sensors).tensors(num_envs, state.dt, touch.constants.dtype, touch.constants.device)
+        memory = Memory(touch.plan.sensors, touch.plan.readings())
+        held = memory.tensors(num_envs, state.dt, touch.constants.dtype, touch.constants.device)
         tensors = {name: torch.as_tensor(getattr(state, name)) for name in touch.plan.inputs.fields}
         for i, part in enumerate(state.substeps):
             tensors |= {f"substep/{i}/{name}": getattr(part, name) for name in touch.plan.inputs.fields if name != "dt"}
         with torch.no_grad(), _OperationCounter() as counter:
-            touch.core(tensors, memory)
+            touch.core(tensors, held)
         counts.append(counter.elements)
     return (counts[1] - counts[0]) // 2
 
@@ -251,6 +252,8 @@ def _inputs(touch: Explained) -> list[str]:
         lines.append(f"  contacts with {name} are those on {', '.join(f'{part.kind} {part.name}' for part in parts)}")
     if inputs.slots:
         lines.append(f"  slots   {inputs.slots} contacts of each pair")
+    if inputs.heated:
+        lines.append(f"  heated  {', '.join(inputs.heated)}")
     if inputs.joints:
         lines.append(f"  joints  {', '.join(inputs.joints)}")
     if inputs.actuators:

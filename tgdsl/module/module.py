@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
 from tgdsl.errors import StateError, TgdslError
-from tgdsl.module.calls import Calls, has_cpp_compiler, inductor_options
+from tgdsl.module.calls import Calls, cpp_compiler, inductor_options
 from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
@@ -69,7 +69,7 @@ class TactileModule(HookedModule):
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
-        self.memory = Memory(plan.sensors)
+        self.memory = Memory(plan.sensors, plan.readings())
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
         self.calls = Calls()
@@ -207,7 +207,7 @@ class TactileModule(HookedModule):
     def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
         """Return which environments are read, and see to it that there is something to read of the others."""
         chosen = self.incoming.chosen(mask, env_ids, num_envs, self.device)
-        self.memory.keep_last(num_envs, {r.name for sensor in self.plan.sensors for r in sensor.windows if r.steps})
+        self.memory.keep_last(num_envs)
         return chosen
 
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -342,7 +342,7 @@ class TactileModule(HookedModule):
         """
         if graph and self.device.type != "cuda":
             raise TgdslError(f"`graph` needs a module on a GPU, this one is on {self.device}")
-        if self.device.type == "cpu" and not has_cpp_compiler():
+        if self.device.type == "cpu" and cpp_compiler() is None:
             warnings.warn("no C++ compiler (g++, clang++ or $CXX) was found: the module stays eager", stacklevel=2)
             return self
         defaults: dict[str, Any] = {"fullgraph": True, "dynamic": True}

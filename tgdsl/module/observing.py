@@ -65,13 +65,13 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
     num_envs = _checked(plan, readings)
     groups: dict[str, list[Tensor]] = {}
     for term in plan.observations:
-        features = torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)
+        found = [torch.empty((num_envs, 0), dtype=constants.dtype, device=constants.device)]
         if term.reading is not None:
             folded = constants.tree["observations"][term.key]
             reading = readings[term.reading]
             steps = reading.unbind(1) if reading.ndim == 4 else [reading]  # stacked calls: the oldest one's features first
-            features = torch.cat([observations.observe(term.type, step, term.channels, folded) for step in steps], dim=1)
-        groups.setdefault(term.group, []).append(features)
+            found = [observations.observe(term.type, step, term.channels, folded) for step in steps]
+        groups.setdefault(term.group, []).extend(found)
     return {group: torch.cat(parts, dim=1) for group, parts in groups.items()}
 
 

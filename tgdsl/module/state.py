@@ -1,12 +1,13 @@
 """The state of a scene: what a module reads of simulators and hardware.
 
 Shapes: `env` environments, `body` bodies of a module's `inputs.bodies`, `pair` pairs of its `inputs.pairs`, `slot` contacts per
-pair, `object` objects of its `inputs.objects`, `joint` joints of its `inputs.joints`, `actuator` actuators of its
-`inputs.actuators`.
+pair, `object` objects of its `inputs.objects`, `heated` objects of its `inputs.heated`, `joint` joints of its `inputs.joints`,
+`actuator` actuators of its `inputs.actuators`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -30,12 +31,16 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "contact_netforce": ("pair", 3),
     "variant": ("object",),
     "object_size": ("object", 3),
+    "object_temperature": ("heated",),
+    "object_material": ("heated",),
     "joint_pos": ("joint",),
     "joint_vel": ("joint",),
     "joint_effort": ("joint",),
     "last_action": ("actuator",),
 }
 """Shape of each tensor of a `SceneState`, after the leading `env`."""
+CHOICES = ("variant", "object_material")
+"""Fields that say which of several things an object is: integers."""
 
 
 @dataclass
@@ -64,6 +69,9 @@ class SceneState:
         contact_netforce: The pair's whole force on the link [N]. What the slots lack of it acts at the centre of those.
         variant: Which of its variants each object has, from 0; 0 for one that has none.
         object_size: Size of each object as MuJoCo defines it [m], such as half-lengths; read of those with `size: per_env`.
+        object_temperature: Temperature at which each object that holds heat begins an episode [°C]; read of those with
+            `temperature: {per_env: …}`.
+        object_material: Which of its materials each of these is of, from 0; 0 for one that has just one.
         joint_pos: Position of each joint, of the same instant as the bodies' poses [rad; slides: m].
         joint_vel: Velocity of each joint, of that instant [rad/s; slides: m/s].
         joint_effort: What the actuators exert on each joint at that instant [N·m; slides: N].
@@ -85,6 +93,8 @@ class SceneState:
     contact_netforce: Float[Tensor, "env pair 3"] | None = None
     variant: Int[Tensor, "env object"] | None = None
     object_size: Float[Tensor, "env object 3"] | None = None
+    object_temperature: Float[Tensor, "env heated"] | None = None
+    object_material: Int[Tensor, "env heated"] | None = None
     joint_pos: Float[Tensor, "env joint"] | None = None
     joint_vel: Float[Tensor, "env joint"] | None = None
     joint_effort: Float[Tensor, "env joint"] | None = None
@@ -96,8 +106,9 @@ class SceneState:
         """Return the state with `torch.Tensor.to` applied to every tensor; a dtype applies to what is not an integer."""
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
         moved: dict[str, Any] = {n: v.to(*args, **kwargs) if isinstance(v, Tensor) else v for n, v in values.items()}
-        if moved["variant"] is not None:
-            moved["variant"] = moved["variant"].to(values["variant"].dtype)
+        for name in CHOICES:
+            if moved[name] is not None:
+                moved[name] = moved[name].to(values[name].dtype)
         moved["substeps"] = tuple(part.to(*args, **kwargs) for part in self.substeps)
         return SceneState(**moved)
 
@@ -125,19 +136,18 @@ class SceneState:
         for name, count in num_envs.items():
             if count != num_envs["body_pos"]:
                 raise StateError(f"SceneState.{name} holds {count} environments, body_pos {num_envs['body_pos']}")
-        if (
-            "variant" in tensors and device.type == "cpu"
-        ):  # a look at a GPU's numbers would wait for it; there the kernel asserts
-            _check_variants(tensors["variant"], inputs)
+        if device.type == "cpu":  # a look at a GPU's numbers would wait for it; there the kernel asserts
+            _check_choices("variant", tensors, inputs.objects, inputs.num_variants)
+            _check_choices("object_material", tensors, inputs.heated, inputs.num_materials)
         return tensors
 
 
-def _check_variants(variant: Tensor, inputs: Inputs) -> None:
-    for i, (name, num) in enumerate(zip(inputs.objects, inputs.num_variants, strict=True)):
-        own = variant[:, i]
+def _check_choices(field: str, tensors: Mapping[str, Tensor], names: Sequence[str], counts: Sequence[int]) -> None:
+    for i, (name, num) in enumerate(zip(names, counts, strict=True) if field in tensors else ()):
+        own = tensors[field][:, i]
         if ((own < 0) | (own >= num)).any():
             found = sorted({int(v) for v in own.tolist() if not 0 <= v < num})
-            raise StateError(f"SceneState.variant of object {name} is {found[0]}, expected 0 to {num - 1}")
+            raise StateError(f"SceneState.{field} of object {name} is {found[0]}, expected 0 to {num - 1}")
 
 
 def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
@@ -153,9 +163,9 @@ def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device)
         raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected})")
     if value.device != device:
         raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
-    if name == "variant":
+    if name in CHOICES:
         if value.dtype not in (torch.int64, torch.int32):
-            raise StateError(f"SceneState.variant is {value.dtype}, expected torch.int64 or torch.int32")
+            raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.int64 or torch.int32")
     elif name != "contact_found" and value.dtype not in (torch.float32, torch.float64):
         raise StateError(f"SceneState.{name} is {value.dtype}, expected torch.float32 or torch.float64")
     return value

@@ -40,6 +40,9 @@ class Inputs:
         slots: Contacts per pair of the slotted contact fields; 0 if none is read.
         objects: Objects that differ between environments: those of the fields `variant` and `object_size`.
         num_variants: How many variants each of these objects has; 1 if only its size differs.
+        heated: Objects that hold heat: those of the fields `object_temperature` and `object_material`, if either is read.
+        num_materials: Of how many materials each of these may be.
+        start_temperatures: What the temperature of each is to begin with [°C], where it is part of the state; else None.
         joints: Joints of the fields `joint_pos`, `joint_vel` and `joint_effort`: hinges and slides.
         actuators: Actuators of the field `last_action`.
         contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
@@ -54,6 +57,9 @@ class Inputs:
     slots: int
     objects: tuple[str, ...] = ()
     num_variants: tuple[int, ...] = ()
+    heated: tuple[str, ...] = ()
+    num_materials: tuple[int, ...] = ()
+    start_temperatures: tuple[float | None, ...] = ()
     joints: tuple[str, ...] = ()
     actuators: tuple[str, ...] = ()
     contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
@@ -68,6 +74,7 @@ class Inputs:
             "pair": len(self.pairs),
             "slot": self.slots,
             "object": len(self.objects),
+            "heated": len(self.heated),
             "joint": len(self.joints),
             "actuator": len(self.actuators),
         }

@@ -135,6 +135,14 @@ class Planning:
         """Return the place of an object among those that have pairs; None if it has none."""
         return next((i for i, target in enumerate(self.objects) if target.name == name), None)
 
+    @property
+    def heated(self) -> tuple[str, ...]:
+        """The objects that hold heat, in the order of the fields `object_temperature` and `object_material` of a state.
+
+        A quantity that reads these says so by its `fields`, and an index into them goes by `plan.inputs.heated`.
+        """
+        return heated_objects(self.objects, self.sensed)
+
     def own_pairs(self, name: str) -> list[Pair]:
         """Return an object's pairs, in order."""
         return [pair for pair in self.pairs if pair.object == name]
@@ -169,6 +177,11 @@ class Scene:
     pairs: Pairs | None
     radius_shifts: Mapping[str, Tensor]
     dtype: torch.dtype
+
+
+def heated_objects(objects: Sequence[PairedObject], sensed: Mapping[str, SensedObject]) -> tuple[str, ...]:
+    """Return those of some objects of which the document says what they are made of."""
+    return tuple(target.name for target in objects if sensed[target.name].heat is not None)
 
 
 def pairs_for(scene: Scene, is_gated: bool) -> Pairs:

@@ -17,9 +17,10 @@ from tgdsl.quantities.contact_depth import CONTACT_DEPTH
 from tgdsl.quantities.contacts import CONTACTS
 from tgdsl.quantities.moments import MOMENTS
 from tgdsl.quantities.motion import MOTION
+from tgdsl.quantities.patches import PATCHES
 from tgdsl.quantities.points import POINTS
 
-QUANTITIES: tuple[Quantity, ...] = (CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION)
+QUANTITIES: tuple[Quantity, ...] = (CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION, PATCHES)
 """The quantities that come with tgdsl, in the order in which they are planned and gathered."""
 GROUP = "tgdsl.quantities"
 """Group of the entry points by which packages bring quantities."""

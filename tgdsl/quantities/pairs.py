@@ -126,7 +126,7 @@ def relate(
     Returns:
         The pairs, in `dtype`.
     """
-    link_rotation, target_rotation = planes.rotation(quat[:, link]), planes.rotation(quat[:, target])
+    link_rotation, target_rotation = (planes.rotation(quat.index_select(1, own)) for own in (link, target))
     apart = planes.sub(planes.split(pos[:, link]), planes.split(pos[:, target]))
     rotation = planes.transpose_times(target_rotation, link_rotation)
     offset = planes.rotate_back(target_rotation, apart)
@@ -140,7 +140,7 @@ def relate(
     is_moving = len(parts) > 12
     parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
     # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
-    parts = torch.stack([part.to(dtype) for part in parts], dim=1).unbind(1)
+    parts = torch.stack(parts, dim=1).to(dtype).unbind(1)
     motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])
 
@@ -152,8 +152,8 @@ def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:
 
 def at_probes(part: Float[Tensor, "env pairs"], own: slice, pair: Int[Tensor, " taxel"]) -> Float[Tensor, "env taxel"]:
     """Return a plane of the pairs for each probe; where an object has one pair alone, nothing is looked up."""
-    part = part[:, own]
-    return part.expand(-1, pair.shape[0]) if part.shape[1] == 1 else part[:, pair]
+    part = part if own == slice(None) else part[:, own]
+    return part.expand(-1, pair.shape[0]) if part.shape[1] == 1 else part.index_select(1, pair)  # on a CPU 5 × part[:, pair]
 
 
 def gates(found: Tensor, place: Int[Tensor, " pair"], dtype: torch.dtype) -> Float[Tensor, "env pair"]:

@@ -4,7 +4,7 @@ An action a ∈ [−1, 1] per joint becomes a target once per control step; befo
 the drive makes a torque of it:
 
     absolute    w = q_low + (a + 1)/2 (q_high − q_low)
-    relative    w = clip(w' + s a, q_low, q_high)                  w' the target before, s the action's scale [rad]
+    relative    w = clip(w' + s a, q_low, q_high)                  w' the target before, s the action's scale [rad, m]
     smoothed    w ← (1 − σ) w + σ w'
     delayed     w of `delay` control steps ago
     play        u = clip(u', w + b − β/2, w + b + β/2)             u' before, b position bias, β backlash [rad]
@@ -24,6 +24,9 @@ Source of gains, strength, bias, deadband, backlash, kick and noise: Chung et al
 Randomization". There the bias is printed in metres, and neither deadband, backlash nor kick are defined: the above is ours.
 Delay and top speed are ours.
 
+Joints are hinges, and slides with m for rad and N for N·m. Angles that a document gives (b, δ, β, a `top_speed`) are of hinges
+alone: slides have none, and a scale of their own.
+
 Shapes: `env` environments, `joint` actuated joints.
 """
 
@@ -40,7 +43,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
-from tgdsl.fields.models import NonNegative, Quantity, Range, RangeOf, SpecModel
+from tgdsl.fields.models import NonNegative, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl.draws import Draws
 
 BREAKAWAY_SPEED = 0.05
@@ -56,7 +59,9 @@ class ActionSpec(SpecModel):
     mode: Literal["relative", "absolute"] = "relative"
     """Whether an action moves the target, or is the target, −1 and 1 being the ends of the joint's range."""
     scale: Annotated[float, Quantity("angle", gt=0.0)] = 0.05
-    """s, what an action of 1 moves a target by in a control step [rad]; relative actions alone."""
+    """s, what an action of 1 moves a hinge's target by in a control step [rad]; relative actions alone."""
+    slide_scale: PositiveLength = 0.01
+    """The same of slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
     """σ, share of the target before in the new one, less than 1."""
 
@@ -120,6 +125,7 @@ class Actuators:
         damping: k_d of the actuator, not of the joint [N·m·s/rad].
         limit: τ_max [N·m]; infinite where there is none.
         top_speed: Speed at which joint damping takes all of τ_max [rad/s]; infinite where there is none.
+        is_slide: Whether a joint is a slide: m for rad and N for N·m in all of these.
     """
 
     names: tuple[str, ...]
@@ -132,6 +138,7 @@ class Actuators:
     damping: Float[np.ndarray, " joint"]
     limit: Float[np.ndarray, " joint"]
     top_speed: Float[np.ndarray, " joint"]
+    is_slide: Bool[np.ndarray, " joint"]
 
     @classmethod
     def of(cls, model: mujoco.MjModel, names: Sequence[str]) -> Actuators:
@@ -174,7 +181,8 @@ def _actuator_row(model: mujoco.MjModel, name: str) -> tuple[int | float, ...]:
     passive = float(model.dof_damping[dof])
     low, high = model.jnt_range[joint.id].tolist()
     top_speed = limit / passive if passive and np.isfinite(limit) else np.inf
-    return (i, int(model.jnt_qposadr[joint.id]), dof, low, high, float(stiffness), -float(damper), limit, top_speed)
+    is_slide = bool(model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE)
+    return (i, int(model.jnt_qposadr[joint.id]), dof, low, high, float(stiffness), -float(damper), limit, top_speed, is_slide)
 
 
 class Actuation:
@@ -217,19 +225,29 @@ class Actuation:
         if unlimited and (drive.torque_noise or drive.top_speed or drive.strength != ONE):
             raise SimulationError(f"joints {listed(unlimited)} have no largest torque, of which this drive's is a share")
         self._index = {f: torch.from_numpy(getattr(actuators, f)).to(device, torch.int64) for f in ("actuator", "qpos", "dof")}
-        values = [f.name for f in fields(actuators) if f.name not in ("names", *self._index)]
+        self._is_slide = actuators.is_slide
+        scale = np.where(actuators.is_slide, action.slide_scale, action.scale)
+        self._scale = torch.from_numpy(scale).to(device, dtype)
+        values = [f.name for f in fields(actuators) if f.name not in ("names", "is_slide", *self._index)]
         self._values = {name: torch.from_numpy(getattr(actuators, name)).to(device, dtype) for name in values}
         ideal = DriveSpec()
         shape = (num_envs, num)
         self.drawn = {name: torch.full(shape, getattr(ideal, name)[0], device=device, dtype=dtype) for name in _DRAWN}
-        self._ranges = {name: getattr(drive, name) for name in _DRAWN if getattr(drive, name) != getattr(ideal, name)}
+        self._random = tuple(name for name in _DRAWN if getattr(drive, name) != getattr(ideal, name))
+        self._drawn = torch.zeros((len(self._random), *shape), device=device, dtype=dtype)
+        for name, own in zip(self._random, self._drawn, strict=True):
+            self.drawn[name] = own.copy_(self.drawn[name])
+        low, high = (self._ends(i) for i in (0, 1))
+        self._low, self._span = low.float().to(device), (high - low).float().to(device)
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
         self._play = torch.zeros_like(self.target)
         self._count = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of physics steps, above them of episodes
         self.is_ideal = drive.is_ideal
         """Whether the robot's own actuators do all; if not, `drive` has to be called before each physics step."""
-        self._top_speed = drive.top_speed if isinstance(drive.top_speed, float) else self._values["top_speed"]
+        self._top_speed = self._values["top_speed"]
+        if isinstance(drive.top_speed, float):
+            self._top_speed = torch.from_numpy(np.where(actuators.is_slide, np.inf, drive.top_speed)).to(device, dtype)
         self.place(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"], at_controls: bool = False) -> None:
@@ -240,13 +258,13 @@ class Actuation:
             episode: How often each was reset.
             at_controls: Whether targets are the present controls instead, as those of a hand that presses.
         """
-        for name, (low, high) in self._ranges.items():
-            own = self.drawn[name]
-            if name == "delay":
-                new = self._draws.integers(name, episode, own.shape[1], int(low), int(high))
-            else:
-                new = self._draws.uniform(name, episode, own.shape[1], low, high)
-            own.copy_(torch.where(chosen[:, None], new.to(own.dtype), own))
+        if self._random:
+            num = self.target.shape[1]
+            share = self._draws.side_by_side(dict.fromkeys(self._random, num), episode, chosen).view(len(episode), -1, num)
+            new = self._low + self._span * share
+            if self._random[-1] == "delay":
+                new = torch.cat([new[:, :-1], new[:, -1:].floor().clamp(max=int(self.spec.delay[1]))], dim=1)
+            self._drawn.copy_(torch.where(chosen[:, None], new.transpose(0, 1).to(self._drawn.dtype), self._drawn))
         self._count.copy_(torch.where(chosen, episode << 32, self._count))
         self.place(chosen, at_controls)
 
@@ -254,9 +272,8 @@ class Actuation:
         """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
         name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
         now = self._arrays[name][:, self._index[which]]
-        for held in (self.target, self._play, *self._past):
-            held.copy_(torch.where(chosen[:, None], now, held))
-        self._play.copy_(torch.where(chosen[:, None], now + self.drawn["bias"], self._play))
+        for held, new in ((self.target, now), (self._past, now), (self._play, now + self.drawn["bias"])):
+            held.copy_(torch.where(chosen[:, None], new, held))
         self.torque.masked_fill_(chosen[:, None], 0.0)
 
     def command(self, action: Float[Tensor, "env joint"]) -> None:
@@ -268,7 +285,7 @@ class Actuation:
         if self.action.mode == "absolute":
             wanted = low + 0.5 * (action + 1.0) * (high - low)
         else:
-            wanted = torch.minimum(torch.maximum(self.target + self.action.scale * action, low), high)
+            wanted = torch.minimum(torch.maximum(self.target + self._scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
         self.target.copy_(torch.where(action.isfinite(), wanted, self.target))
         self._past.copy_(torch.cat([self.target[None], self._past[:-1]]))
@@ -305,6 +322,15 @@ class Actuation:
         own = {"target": self.target, "torque": self.torque, "play": self._play, "past": self._past, "count": self._count}
         return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
+    def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:
+        """Return the lower or upper ends of what is drawn; of delays, which are rounded down, that of the last one's share."""
+        ends = torch.zeros((len(self._random), len(self._is_slide)), dtype=torch.float64)
+        for name, own in zip(self._random, ends, strict=True):
+            own += getattr(self.spec, name)[which] + (which if name == "delay" else 0)
+            if name in _ANGLES:
+                own[torch.from_numpy(self._is_slide)] = 0.0
+        return ends
+
     def _arrived(self) -> Float[Tensor, "env joint"]:
         """Return the targets that have arrived at the drives."""
         if len(self._past) == 1:
@@ -313,7 +339,9 @@ class Actuation:
 
 
 _DRAWN = ("gain", "damping", "strength", "bias", "deadband", "backlash", "kick", "delay")
-"""What is drawn for each drive."""
+"""What is drawn for each drive; whole numbers last."""
+_ANGLES = ("bias", "deadband", "backlash")
+"""Those that are angles, and so of hinges alone."""
 
 
 def _within(value: Tensor, limit: Tensor) -> Tensor:

@@ -10,12 +10,25 @@ Shapes: `env` environments, `num` numbers of one environment.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.sensors.noise.random import Stream, mix, normal_pair, sensor_key, uniform, words
+from tgdsl.sensors.noise.random import mix, mix_on_host, normal_pair, sensor_key, uniform
+from tgdsl.tensors.env_ids import few_ids
 from tgdsl.tensors.fused import FusedCall
+
+
+class _Streams(NamedTuple):
+    """What the numbers of some purposes begin from: of each purpose a hash with its environments, of each number its place."""
+
+    begun: Int[Tensor, "env purpose half"]
+    purpose: Int[Tensor, " num"]
+    index: Int[Tensor, " num"]
 
 
 class Draws:
@@ -45,15 +58,39 @@ class Draws:
         """
         self.seed, self._device = seed, torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
-        self._keys: dict[str, Int[Tensor, " half"]] = {}
-        self._index: dict[int, Int[Tensor, " num"]] = {}
+        self._is_on_host = self._device.type == "cpu" and not is_compiled
+        self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
         self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
         """Choose another seed, in place: graphs that were captured draw its numbers."""
         self.seed = seed
-        for what, key in self._keys.items():
-            key.copy_(torch.tensor(sensor_key(seed, what), dtype=torch.int32))
+        for sizes, streams in self._known.items():
+            streams.begun.copy_(self._begun([what for what, _ in sizes]))
+
+    def shares(
+        self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
+    ) -> dict[str, Float[Tensor, "env num"]]:
+        """Return numbers between 0 and 1 for several purposes: see `side_by_side`."""
+        return dict(zip(sizes, self.side_by_side(sizes, counter, chosen).split(list(sizes.values()), dim=1), strict=True))
+
+    def side_by_side(
+        self, sizes: Mapping[str, int], counter: Int[Tensor, " env"], chosen: Bool[Tensor, " env"] | None = None
+    ) -> Float[Tensor, "env num"]:
+        """Return numbers between 0 and 1 for several purposes in turn, of the few operations that one of them takes.
+
+        Args:
+            sizes: How many each environment has, by what they are for, such as "friction".
+            counter: A count of each environment's own: other numbers at each count.
+            chosen: The environments whose numbers are wanted; those of the others mean nothing. Default: all.
+        """
+        streams = self._streams(sizes)
+        rows = None if chosen is None or not self._is_on_host else few_ids(chosen)
+        if rows is None:
+            return self._shares(*streams, counter)
+        found = torch.zeros((len(counter), len(streams.index)), device=self._device)
+        found[rows] = self._share(streams.begun[rows], streams.purpose, streams.index, counter[rows])
+        return found
 
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
@@ -67,34 +104,74 @@ class Draws:
             low: Lower bound.
             high: Upper bound.
         """
-        return low + (high - low) * self._shares(*self._stream(what, num), counter)
+        return within(self.shares({what: num}, counter)[what], low, high)
 
     def normal(self, what: str, counter: Int[Tensor, " env"], num: int) -> Float[Tensor, "env num"]:
         """Return numbers of mean 0 and variance 1, float32: see `uniform`."""
-        first, second = normal_pair(self._words(*self._stream(what, (num + 1) // 2), counter), torch.float32)
+        first, second = normal_pair(self._words(*self._streams({what: (num + 1) // 2}), counter), torch.float32)
         return torch.cat([first, second], dim=1)[:, :num]
 
     def integers(self, what: str, counter: Int[Tensor, " env"], num: int, low: int, high: int) -> Int[Tensor, "env num"]:
         """Return whole numbers from `low` to `high`, both included: see `uniform`."""
-        share = self._shares(*self._stream(what, num), counter)
-        return low + (share * (high - low + 1)).to(torch.int64).clamp(max=high - low)
+        return whole(self.shares({what: num}, counter)[what], low, high)
 
-    def _stream(self, what: str, num: int) -> tuple[Int[Tensor, " half"], Int[Tensor, " num"]]:
-        """Return the key of what numbers are for, and their places in the stream."""
-        if what not in self._keys:  # at the first call: a graph that is captured later copies nothing from the host
-            self._keys[what] = torch.tensor(sensor_key(self.seed, what), dtype=torch.int32, device=self._device)
-        if num not in self._index:
-            self._index[num] = torch.arange(num, dtype=torch.int32, device=self._device)
-        return self._keys[what], self._index[num]
+    def _streams(self, sizes: Mapping[str, int]) -> _Streams:
+        """Return what the numbers of some purposes begin from."""
+        asked = tuple(sizes.items())
+        if asked not in self._known:  # at the first call: a graph that is captured later copies nothing from the host
+            purpose = torch.tensor([i for i, (_, num) in enumerate(asked) for _ in range(num)], device=self._device)
+            index = torch.tensor([i for _, num in asked for i in range(num)], dtype=torch.int32, device=self._device)
+            self._known[asked] = _Streams(self._begun(list(sizes)), purpose, index)
+        return self._known[asked]
+
+    def _begun(self, names: list[str]) -> Int[Tensor, "env purpose half"]:
+        keys = torch.tensor([sensor_key(self.seed, what) for what in names], dtype=torch.int32, device=self._device)
+        return mix(self._envs.to(torch.int32)[:, None, None] ^ keys)
 
     def _share(
-        self, key: Int[Tensor, " half"], index: Int[Tensor, " num"], counter: Int[Tensor, " env"]
+        self,
+        begun: Int[Tensor, "env purpose half"],
+        purpose: Int[Tensor, " num"],
+        index: Int[Tensor, " num"],
+        counter: Int[Tensor, " env"],
     ) -> Float[Tensor, "env num"]:
-        return uniform(self._hash(key, index, counter), torch.float32)
+        return uniform(self._hash(begun, purpose, index, counter), torch.float32)
 
     def _hash(
-        self, key: Int[Tensor, " half"], index: Int[Tensor, " num"], counter: Int[Tensor, " env"]
+        self,
+        begun: Int[Tensor, "env purpose half"],
+        purpose: Int[Tensor, " num"],
+        index: Int[Tensor, " num"],
+        counter: Int[Tensor, " env"],
     ) -> Int[Tensor, "env num"]:
-        low, high = counter.to(torch.int32)[:, None], mix((counter >> 32).to(torch.int32))[:, None]
-        begun = mix(mix(mix(self._envs.to(torch.int32)[:, None] ^ key) ^ low) ^ high)
-        return words(Stream(begun[:, :1], begun[:, 1:]), index)
+        if self._is_on_host:
+            return torch.from_numpy(_hash_on_host(*(own.numpy() for own in (begun, purpose, index, counter))))
+        low, high = (half.to(torch.int32)[:, None, None] for half in (counter, counter >> 32))
+        mixed = mix(torch.cat([begun ^ low, high.expand(-1, 1, 2)], dim=1))  # both at once
+        first, second = mix(mixed[:, :-1] ^ mixed[:, -1:])[:, purpose].unbind(-1)
+        return mix(index ^ first) ^ second
+
+
+def _hash_on_host(
+    begun: Int[np.ndarray, "env purpose half"],
+    purpose: Int[np.ndarray, " num"],
+    index: Int[np.ndarray, " num"],
+    counter: Int[np.ndarray, " env"],
+) -> Int[np.ndarray, "env num"]:
+    """Return the same words, by NumPy."""
+    low, high = counter.astype(np.uint32)[:, None, None], (counter >> 32).astype(np.uint32)[:, None, None]
+    keys = mix_on_host(mix_on_host(begun.view(np.uint32) ^ low) ^ mix_on_host(high))
+    own = keys if keys.shape[1] == 1 else keys[:, purpose]
+    word = mix_on_host(index.view(np.uint32) ^ own[:, :, 0])
+    word ^= own[:, :, 1]
+    return word.view(np.int32)
+
+
+def within(share: Float[Tensor, "env num"], low: float, high: float) -> Float[Tensor, "env num"]:
+    """Return shares, from 0 to 1, as numbers between two bounds."""
+    return low + (high - low) * share
+
+
+def whole(share: Float[Tensor, "env num"], low: int, high: int) -> Int[Tensor, "env num"]:
+    """Return shares, from 0 to 1, as whole numbers from `low` to `high`, both included."""
+    return low + (share * (high - low + 1)).to(torch.int64).clamp(max=high - low)

@@ -10,7 +10,7 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -27,9 +27,10 @@ from tgdsl.rl.episodes import Episodes
 from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
-from tgdsl.rl.sensed import GROUP, compile_sensed
+from tgdsl.rl.sensed import Felt, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
+from tgdsl.tensors.env_ids import may_hold
 from tgdsl.tensors.fused import FusedCall
 
 PREPARING_STEPS = 3
@@ -93,6 +94,7 @@ class TouchEnv:
         actuation: The drives of the joints that the policy moves.
         pushes: Forces that push the object.
         groups: Size of each group of observations.
+        felt: Where those of what is felt come from.
         steps: Control steps of each environment's present episode; may be written.
     """
 
@@ -108,6 +110,7 @@ class TouchEnv:
         threads: int = 0,
         compiled: bool | None = None,
         first_env: int = 0,
+        feels: Sequence[Felt] | None = None,
         progress: Progress | None = None,
     ):
         """Make the environments and begin an episode in each.
@@ -122,6 +125,8 @@ class TouchEnv:
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
             first_env: Number of the first environment among those of all processes.
+            feels: What several policies feel, each a group of observations `Felt.group`, in place of the document's `touch`,
+                `placement` and `noise`, and of `tactile_sensors`.
             progress: Is told in a line what is being done.
 
         Raises:
@@ -130,11 +135,13 @@ class TouchEnv:
         """
         chosen = simulator_of(device, simulator)
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
-        self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress)
-        self.touch, self._sensed = sensed.touch, sensed
-        is_compiled = compiled if compiled is not None else self.touch.device.type == "cuda"
+        self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress, feels=feels)
+        self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
+        is_cuda = self.touch.device.type == "cuda"
+        is_compiled = is_cuda if compiled is None else compiled
+        self.touch.memory.keeps_last = True  # of environments that do not begin anew while others do
         if is_compiled:
-            self.touch.compile()
+            self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
         self._joints = moved_joints(loaded, sensed)
         self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
@@ -195,6 +202,11 @@ class TouchEnv:
         return self._episodes.steps
 
     @property
+    def resets(self) -> Int[Tensor, " env"]:
+        """How often each environment was reset, from which its random numbers follow: a live tensor; may be written."""
+        return self._episodes.number
+
+    @property
     def now(self) -> Now:
         """The instant that the last observations are of; its tensors hold until the next step."""
         return self._instant
@@ -239,10 +251,10 @@ class TouchEnv:
         """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
 
         Raises:
-            SimulationError: If it feels nothing.
+            SimulationError: If it feels nothing, or there are several.
         """
         if self._sensed.felt is None:
-            raise SimulationError("the policy feels nothing: touch is none")
+            raise SimulationError("the policy feels nothing: touch is none; or there are several policies")
         return self.touch.images(self._sensed.felt, self._readings)
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
@@ -260,8 +272,8 @@ class TouchEnv:
         Raises:
             SimulationError: If they were others; nothing has changed.
         """
-        names = [name.partition("/")[2] for name in state.get("episodes", {}) if name.startswith("sums/")]
-        self._episodes.expect(names)
+        names = (name.partition("/") for name in state.get("episodes", {}))
+        self._episodes.expect(tuple(name for part, _, name in names if part == "sums"))
         for part, memory in self._memory().items():
             saving.refuse_other(memory, state.get(part, {}), part)
         self.sim.load_state_dict(state["sim"])
@@ -306,7 +318,7 @@ class TouchEnv:
         now = self._now(sim.read())
         self.task.advance(now)
         made = self._judged(now, sim.faults)
-        if made.info.ended.is_cuda or bool(made.info.ended.any()):
+        if may_hold(made.info.ended):
             self._begin(made.info.ended)
             now = self._now(sim.read(made.info.ended))
             made = made._replace(obs=self._observed(now))
@@ -325,13 +337,15 @@ class TouchEnv:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.reward(now, terminated)
-        terms = {name: torch.where(faults, 0.0, rate * self.control_step).float() for name, rate in rates.items()}
-        reward = torch.stack(list(terms.values())).sum(dim=0)
-        self._episodes.add(terms, reward)
+        earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self.control_step).float()
+        reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
+        self._episodes.add(tuple(rates), earned, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
-        obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in self._observe(now).items()}
+        obs = self._observe(now)
+        if may_hold(faults):
+            obs = {name: torch.where(faults[:, None], 0.0, value) for name, value in obs.items()}
         episodes = self._episodes
-        sums = {name: total.clone() for name, total in episodes.sums.items()}
+        sums = dict(zip(rates, episodes.sums.clone(), strict=True))
         score, total = self.task.score().float().clone(), episodes.total.clone()
         ended = terminated | truncated
         info = StepInfo(ended, obs, terms, score, total, episodes.steps.clone(), sums, faults.clone())
@@ -341,12 +355,14 @@ class TouchEnv:
         """Return the instant that readings are of."""
         self._readings, sim, num = readings, self.sim, self.num_actions
         watched = sim.watched()
-        dtype, device = self._used.dtype, self._used.device
-        none = torch.zeros((self.num_envs, 0), device=device, dtype=dtype)
+        none = self._used[:, :0]
         contact, distance = self._sensed.contact, self._sensed.distance
-        forces = {f"force_{axis}": none for axis in "xyz"}
+        force, normal_force = none[:, :, None].expand(-1, -1, 3), none
         if contact:
-            forces = dict(zip(self._sensed.channels, readings[contact].to(device, dtype).unbind(2), strict=True))
+            of_links, channels = readings[contact].to(none), self._sensed.channels
+            first = channels.index("force_x")
+            force = of_links[:, :, first : first + 3].contiguous()
+            normal_force = of_links[:, :, channels.index("normal_force")] if "normal_force" in channels else none
         self._instant = Now(
             watched=watched,
             object=watched.body(self._sensed.object),
@@ -356,9 +372,9 @@ class TouchEnv:
             torque=watched.joint_effort[:, :num] if self.actuation.is_ideal else self.actuation.torque,
             action=self._used,
             last_action=self._before,
-            link_force=torch.stack([forces[f"force_{axis}"] for axis in "xyz"], dim=2),
-            normal_force=forces.get("normal_force", none),
-            distance=readings[distance].to(device, dtype).amin(dim=2) if distance else none,
+            link_force=force,
+            normal_force=normal_force,
+            distance=readings[distance].amin(dim=2).to(none) if distance else none,
             friction=self._episodes.friction,
             mass=self._episodes.mass,
             readings=readings,
@@ -367,8 +383,9 @@ class TouchEnv:
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""
-        felt = {} if self._sensed.felt is None else {GROUP: self.touch.observe(now.readings)[GROUP]}
-        own = {"proprio": groups.proprio(now)} | felt | {"priv_proprio": groups.priv_proprio(now)} | self.task.observe(now)
+        felt = self._sensed.observe(now.readings)
+        proprio = groups.proprio(now)
+        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, proprio)} | self.task.observe(now)
         return {name: value.to(self.device, torch.float32) for name, value in own.items()}
 
 

@@ -5,19 +5,21 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.rl.actuation import ONE, ZERO, Actuation
-from tgdsl.rl.draws import Draws
+from tgdsl.rl.draws import Draws, within
 from tgdsl.rl.pushes import Pushes
 from tgdsl.rl.spec import RandomSpec
 from tgdsl.rl.start import EnvSimulation
 from tgdsl.rl.task import Start, Task
+from tgdsl.tensors.env_ids import put_rows
 from tgdsl.tensors.fused import FusedCall
+
+REST = {"friction": ONE, "mass": ZERO}
+"""What of an object can be random, and the ranges in which it is not."""
 
 
 class Episodes:
@@ -29,7 +31,8 @@ class Episodes:
         friction: Coefficient of sliding friction of each object.
         mass: Mass of each object [kg].
         total: Rewards, summed over each present episode.
-        sums: Terms of the reward, summed over each present episode.
+        terms: Names of the reward's terms; none before the first step.
+        sums: These terms, summed over each present episode.
     """
 
     number: Int[Tensor, " env"]
@@ -37,7 +40,8 @@ class Episodes:
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
     total: Float[Tensor, " env"]
-    sums: dict[str, Float[Tensor, " env"]]
+    terms: tuple[str, ...]
+    sums: Float[Tensor, "term env"]
 
     def __init__(
         self,
@@ -70,7 +74,7 @@ class Episodes:
         self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
         self.friction, self.mass = task.setup.friction, task.setup.mass
         self.total = torch.zeros(sim.num_envs, device=device)
-        self.sums = {}
+        self.terms, self.sums = (), torch.zeros((0, sim.num_envs), device=device)
         self._restarted = FusedCall(self._restart, is_compiled)
 
     def begin(self, chosen: Bool[Tensor, " env"]) -> None:
@@ -84,34 +88,34 @@ class Episodes:
         """Begin to count episodes from 0, so that random numbers are those of environments just made."""
         self.number.zero_()
 
-    def add(self, terms: Mapping[str, Float[Tensor, " env"]], reward: Float[Tensor, " env"]) -> None:
+    def add(self, terms: tuple[str, ...], earned: Float[Tensor, "term env"], reward: Float[Tensor, " env"]) -> None:
         """Add a control step and what it brought."""
         self.expect(terms)
-        for name, term in terms.items():
-            self.sums[name] += term
+        self.sums += earned
         self.total += reward
         self.steps += 1
 
-    def expect(self, names: Iterable[str]) -> None:
+    def expect(self, terms: tuple[str, ...]) -> None:
         """Begin to add up terms of the reward, if that was not begun."""
-        if not self.sums:
-            self.sums = {name: torch.zeros_like(self.total) for name in names}
+        if not self.terms:
+            self.terms, self.sums = terms, torch.zeros((len(terms), len(self.total)), device=self.total.device)
 
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
         own = {name: getattr(self, name) for name in ("number", "steps", "friction", "mass", "total")}
-        return own | {f"sums/{name}": total for name, total in self.sums.items()}
+        return own | {f"sums/{name}": total for name, total in zip(self.terms, self.sums, strict=True)}
 
     def _draw(self, chosen: Bool[Tensor, " env"]) -> Start:
         """Draw friction, mass and how the task begins."""
         self.number += chosen
-        random = self._random
-        for name, rest, own in (("friction", ONE, self.friction), ("mass", ZERO, self.mass)):
-            low, high = getattr(random, name)
-            if (low, high) != rest:
-                drawn = self._draws.uniform(name, self.number, 1, low, high)[:, 0].to(own.dtype)
-                new = self._friction * drawn if name == "friction" else self._mass + drawn
-                own.copy_(torch.where(chosen, new, own))
+        ranges = {name: getattr(self._random, name) for name, rest in REST.items() if getattr(self._random, name) != rest}
+        found = self._draws.shares(dict.fromkeys(ranges, 1), self.number, chosen) if ranges else {}
+        for name, share in found.items():
+            drawn = within(share, *ranges[name])[:, 0]
+            if name == "friction":
+                put_rows(self.friction, chosen, self._friction * drawn)
+            else:
+                put_rows(self.mass, chosen, self._mass + drawn)
         return self._task.reset(chosen, self.number)
 
     def _set_properties(self, chosen: Bool[Tensor, " env"]) -> None:
@@ -126,6 +130,5 @@ class Episodes:
         """Draw drives and pushes anew, and begin to add up."""
         self._actuation.reset(chosen, self.number, at_controls)
         self._pushes.reset(chosen, self.number)
-        self.steps.masked_fill_(chosen, 0)
-        for total in (self.total, *self.sums.values()):
-            total.masked_fill_(chosen, 0.0)
+        for counted in (self.steps, self.total, self.sums):
+            counted.masked_fill_(chosen, 0)

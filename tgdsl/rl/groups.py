@@ -20,9 +20,9 @@ def proprio(now: Now) -> Float[Tensor, "env feature"]:
     return torch.cat([now.joint_pos, now.joint_vel, now.action], dim=1)
 
 
-def priv_proprio(now: Now) -> Float[Tensor, "env feature"]:
-    """Return `proprio` and the object's force on each link, in its frame [N], link by link."""
-    return torch.cat([proprio(now), now.link_force.flatten(1)], dim=1)
+def priv_proprio(now: Now, own: Float[Tensor, "env shared"]) -> Float[Tensor, "env feature"]:
+    """Return `proprio`, which is `own`, and the object's force on each link, in its frame [N], link by link."""
+    return torch.cat([own, now.link_force.flatten(1)], dim=1)
 
 
 def object_state(now: Now) -> Float[Tensor, "env feature"]:

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl.draws import Draws
+from tgdsl.rl.draws import Draws, whole
+from tgdsl.tensors.env_ids import may_hold
 
 ZERO: Range = (0.0, 0.0)
 Force = Annotated[Range, RangeOf("force")]
@@ -89,26 +90,30 @@ class Pushes:
             episode: How often each was reset.
         """
         self._count.copy_(torch.where(chosen, episode << 32, self._count))
-        self._left.copy_(torch.where(chosen, self._interval(), self._left))
+        _, interval = self._next(chosen)
+        self._left.copy_(torch.where(chosen, interval, self._left))
         self._exert(torch.where(chosen[:, None], 0.0, self.force))
 
     def advance(self) -> None:
         """Begin and end pushes: once per control step, before its physics."""
         self._left -= 1
         begins, ends = self._left == 0, self._left == -self._length
-        share = self._draws.uniform("push", self._count, 3).to(self.force.dtype)
-        force = torch.where(begins[:, None], self._low + share * (self._high - self._low), self.force)
-        self._exert(torch.where(ends[:, None], 0.0, force))
+        if not may_hold(changes := begins | ends):
+            return
         self._count += ends
-        self._left.copy_(torch.where(ends, self._interval(), self._left))
+        force, interval = self._next(changes)
+        self._left.copy_(torch.where(ends, interval, self._left))
+        self._exert(torch.where(ends[:, None], 0.0, torch.where(begins[:, None], force, self.force)))
 
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
         return {"force": self.force, "left": self._left, "count": self._count}
 
-    def _interval(self) -> Int[Tensor, " env"]:
-        """Return after how many control steps the next push begins."""
-        return self._draws.integers("push interval", self._count, 1, self._first, self._last)[:, 0]
+    def _next(self, chosen: Bool[Tensor, " env"]) -> tuple[Float[Tensor, "env 3"], Int[Tensor, " env"]]:
+        """Return the force of some environments' next push, or the present one, and how many control steps before it begins."""
+        found = self._draws.shares({"push": 3, "push interval": 1}, self._count, chosen)
+        force = self._low + found["push"].to(self.force.dtype) * (self._high - self._low)
+        return force, whole(found["push interval"], self._first, self._last)[:, 0]
 
     def _exert(self, force: Float[Tensor, "env 3"]) -> None:
         self.force.copy_(force)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tgdsl.geometry.rotations import Quat, Vector, product, rotated
 
-__all__ = ["about", "angle", "inverse", "product", "rotated", "six_numbers", "swing", "twist"]
+__all__ = ["about", "between", "inverse", "product", "rotated", "six_numbers", "swing", "twist"]
 
 
 def inverse(quat: Quat) -> Quat:
@@ -25,9 +25,13 @@ def about(axis: Vector, angle: Float[Tensor, "*n"]) -> Quat:
     return torch.cat([half.cos(), half.sin() * axis], dim=-1)
 
 
-def angle(quat: Quat) -> Float[Tensor, "*n"]:
-    """Return by how much a rotation turns, from 0 to π [rad]."""
-    return 2.0 * torch.atan2(quat[..., 1:].norm(dim=-1), quat[..., 0].abs())
+def between(one: Quat, other: Quat) -> Float[Tensor, "*n"]:
+    """Return by how much one rotation differs from another, from 0 to π [rad]: the angle θ of the turn between them.
+
+    Of unit length they are 2 |sin θ/4| and 2 |cos θ/4| apart, as q and −q are the same rotation.
+    """
+    apart, against = (one - other).norm(dim=-1), (one + other).norm(dim=-1)
+    return 4.0 * torch.atan2(torch.minimum(apart, against), torch.maximum(apart, against))
 
 
 def twist(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
@@ -38,8 +42,9 @@ def twist(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
 
 def swing(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
     """Return the angle by which a rotation tilts an axis, from 0 to π [rad]."""
-    turned = rotated(quat, axis)
-    return torch.atan2(torch.linalg.cross(axis, turned).norm(dim=-1), (axis * turned).sum(dim=-1))
+    turn = quat[..., 1:]
+    along = (turn * axis).sum(dim=-1, keepdim=True)
+    return 2.0 * torch.atan2((turn - along * axis).norm(dim=-1), torch.hypot(quat[..., 0], along[..., 0]))
 
 
 def six_numbers(quat: Quat) -> Float[Tensor, "*n 6"]:
@@ -47,6 +52,6 @@ def six_numbers(quat: Quat) -> Float[Tensor, "*n 6"]:
 
     Source: Zhou et al., On the Continuity of Rotation Representations in Neural Networks, CVPR 2019.
     """
-    x, y = torch.eye(3, dtype=quat.dtype, device=quat.device)[:2]
-    shape = quat[..., 1:].shape
-    return torch.cat([rotated(quat, x.expand(shape)), rotated(quat, y.expand(shape))], dim=-1)
+    axes = torch.eye(3, dtype=quat.dtype, device=quat.device)[:2]
+    shape = (*quat.shape[:-1], 2)
+    return rotated(quat[..., None, :].expand(*shape, 4), axes.expand(*shape, 3)).flatten(-2)

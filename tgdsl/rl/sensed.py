@@ -2,23 +2,66 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from tgdsl.compiler.pipeline import compile as compile_document
 from tgdsl.console.progress import Progress
 from tgdsl.errors import listed
+from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.load import LoadedTask
 from tgdsl.rl.spec import SENSED
 from tgdsl.schema.load import load
+from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.select import matching
 from tgdsl.sensors.known import known_kinds
 
 GROUP = "tactile_sensors"
 """The observation group of what a policy feels."""
+PER_LINK = ("agg_bool", "agg_force")
+"""Types that have numbers of links, not of taxels."""
+CLEAN = "clean"
+"""The noise profile that has none."""
+
+
+class Felt(NamedTuple):
+    """One of several things that policies feel in one simulation.
+
+    Attributes:
+        type: What is felt, a `TouchType` but "none".
+        placement: Links that feel: a link group, or a link's name, with shell wildcards.
+        noise: A noise profile.
+    """
+
+    type: str
+    placement: str
+    noise: str
+
+    @property
+    def group(self) -> str:
+        """Its group of observations."""
+        return f"{GROUP}/{self.type}/{self.placement}/{self.noise}"
+
+
+class Source(NamedTuple):
+    """Where a group of observations comes from.
+
+    Attributes:
+        observation: The module's observation.
+        columns: Those of its numbers that are taken; None: all.
+        layout: The taxels that they are of.
+    """
+
+    observation: str
+    columns: Int[Tensor, " feature"] | None
+    layout: Layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +75,8 @@ class Sensed:
         channels: Names of its channels: those of the force, and of the normal force if the task wants it, among them.
         distance: Name of the `surface_distance` sensor; None if the task takes none.
         object: Body of the task's object in the scene.
+        by_kind: Name of the sensor of each kind that the task looks at.
+        groups: Groups of observations of what is felt.
     """
 
     touch: TactileModule
@@ -40,10 +85,24 @@ class Sensed:
     channels: tuple[str, ...]
     distance: str | None
     object: str
+    by_kind: Mapping[str, str]
+    groups: Mapping[str, Source] = field(default_factory=dict)
+
+    def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the groups of observations of what is felt."""
+        if not self.groups:
+            return {}
+        made = self.touch.observe(readings)
+        chosen = {name: (made[own.observation], own.columns) for name, own in self.groups.items()}
+        return {name: value if own is None else value.index_select(1, own) for name, (value, own) in chosen.items()}
 
 
 def compile_sensed(
-    loaded: LoadedTask, device: torch.device | str, progress: Progress | None = None, only: Sequence[str] | None = None
+    loaded: LoadedTask,
+    device: torch.device | str,
+    progress: Progress | None = None,
+    only: Sequence[str] | None = None,
+    feels: Sequence[Felt] | None = None,
 ) -> Sensed:
     """Compile what a task's environments feel.
 
@@ -52,11 +111,134 @@ def compile_sensed(
         device: Where the module lives.
         progress: Is told in a line what is being done.
         only: Kinds of sensors that are taken instead of those that the policy feels and the task looks at.
+        feels: What policies feel, in place of the document's `touch`, `placement` and `noise`.
 
     Raises:
         SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
             of the sensors' document.
         RobotError: If a robot or scene file cannot be read.
+    """
+    spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, _document(loaded)
+    kinds = _kinds(document)
+    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
+    overrides: dict[str, Any] = {"observations": {}}
+    if spec.resolution is not None:
+        overrides["resolution"] = spec.resolution
+    felt, felts = None, {}
+    if feels is not None:
+        felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}
+        overrides |= _overrides(loaded, felts)
+    elif spec.touch != "none" and only is None:
+        kind, observed = SENSED[spec.touch]
+        felt = _sensor_of(loaded, kinds, kind, ("touch",))
+        overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
+        overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
+    contact = by_kind.get("link_contact")
+    if contact:
+        own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
+        wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
+        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
+    kept = {*by_kind.values(), *felts.values(), *([felt] if felt else [])}
+    touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
+    body = document.spec.objects[spec.object].body_of(spec.object)
+    channels = next((own.channels for own in touch.outputs if own.name == contact), ())
+    groups = {each.group: _source(loaded, touch, each, sensor) for each, sensor in felts.items()}
+    if felt:
+        groups[GROUP] = Source(GROUP, None, _layout(touch, felt))
+    return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body, by_kind, groups)
+
+
+def _overrides(loaded: LoadedTask, felts: Mapping[Felt, str]) -> dict[str, Any]:
+    """Return what of the sensors' document is set for policies that feel several things: each sensor is computed once.
+
+    It is on all links that are asked for, of which a policy takes its own columns, and gives readings with and without noise.
+
+    Raises:
+        SpecError: If there are two profiles of noise beside `clean`.
+    """
+    found: dict[str, Any] = {"observations": {}}
+    for sensor in dict.fromkeys(felts.values()):
+        own = [felt for felt, carrier in felts.items() if carrier == sensor]
+        noises = list(dict.fromkeys(felt.noise for felt in own if felt.noise != CLEAN))
+        if len(noises) > 1:
+            what = f"noise {listed(noises)} of one sensor in one simulation, expected one beside {CLEAN}"
+            raise loaded.error(("noise",), what)
+        is_both = bool(noises) and any(felt.noise == CLEAN for felt in own)
+        found[f"sensors.{sensor}.links"] = list(dict.fromkeys(felt.placement for felt in own))
+        found[f"sensors.{sensor}.noise"] = noises[0] if noises else CLEAN
+        found[f"sensors.{sensor}.readout"] = "both" if is_both else "measured"
+        for felt in own:
+            reading = f"{sensor}/clean" if is_both and felt.noise == CLEAN else sensor
+            found["observations"][_observation(felt)] = [{"type": SENSED[felt.type][1], "of": reading}]
+    return found
+
+
+def _observation(felt: Felt) -> str:
+    return f"{GROUP}_{felt.type}_{felt.noise}"
+
+
+def _layout(touch: TactileModule, sensor: str) -> Layout:
+    return touch.plan.layout_of(next(own for own in touch.plan.sensors if own.name == sensor))
+
+
+def _source(loaded: LoadedTask, touch: TactileModule, felt: Felt, sensor: str) -> Source:
+    """Return where a group of observations comes from: of the sensor's taxels or links those of the placement.
+
+    Raises:
+        SpecError: If it feels on some of the links alone, and its numbers are not of taxels or links.
+    """
+    observation, layout = _observation(felt), _layout(touch, sensor)
+    links = [link.name for link in layout.links]
+    names = layout.groups.get(felt.placement) or tuple(matching(felt.placement, links))
+    if set(names) == set(links):
+        return Source(observation, None, layout)
+    taxels = layout.taxels_of(names)
+    size = sum(term.num_features for term in touch.plan.observations if term.group == observation)
+    is_per_link = felt.type in PER_LINK
+    rows = np.flatnonzero([name in names for name in links]) if is_per_link else taxels
+    num_rows = len(links) if is_per_link else layout.num_taxels
+    if not num_rows or size % num_rows:
+        what = f'"{felt.type}" cannot be felt at {felt.placement} beside other links: its numbers are not of taxels'
+        raise loaded.error(("placement",), what)
+    columns = (np.arange(size // num_rows)[:, None] * num_rows + rows).ravel()
+    return Source(observation, torch.from_numpy(columns).to(touch.device), layout.take(taxels))
+
+
+def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
+    """See that the sensors' document has a sensor for each of several things that are felt.
+
+    Raises:
+        SpecError: If not, or all mistakes of the sensors' document.
+    """
+    kinds = _kinds(_document(loaded))
+    for each in feels:
+        _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",))
+
+
+def types_of(loaded: LoadedTask) -> list[str]:
+    """Return the types that the sensors' document has sensors for, and none.
+
+    Raises:
+        SpecError: All mistakes of the sensors' document.
+    """
+    kinds = _kinds(_document(loaded)).values()
+    return ["none", *(name for name, (kind, _) in SENSED.items() if kind in kinds)]
+
+
+def num_variants(loaded: LoadedTask) -> int:
+    """Return how many variants the task's object has; 1 if it has none.
+
+    Raises:
+        SpecError: All mistakes of the sensors' document.
+    """
+    return len(_document(loaded).spec.objects[loaded.spec.object].variants or ()) or 1
+
+
+def _document(loaded: LoadedTask) -> Loaded:
+    """Return the sensors' document.
+
+    Raises:
+        SpecError: All its mistakes, or if it is not there, or lacks the task's object.
     """
     spec = loaded.spec
     file = loaded.folder / spec.document
@@ -68,27 +250,11 @@ def compile_sensed(
     if spec.object not in document.spec.objects:
         what = f'"{spec.document}" has no object "{spec.object}", only {listed(list(document.spec.objects))}'
         raise loaded.error(("object",), what)
-    kinds = {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
-    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
-    overrides: dict[str, Any] = {"observations": {}}
-    if spec.resolution is not None:
-        overrides["resolution"] = spec.resolution
-    felt = None
-    if spec.touch != "none" and only is None:
-        kind, observed = SENSED[spec.touch]
-        felt = _sensor_of(loaded, kinds, kind, ("touch",))
-        overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
-        overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
-    contact = by_kind.get("link_contact")
-    if contact:
-        own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
-        wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
-        overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
-    kept = {*by_kind.values(), *([felt] if felt else [])}
-    touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
-    body = document.spec.objects[spec.object].body_of(spec.object)
-    channels = next((own.channels for own in touch.outputs if own.name == contact), ())
-    return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body)
+    return document
+
+
+def _kinds(document: Loaded) -> dict[str, str]:
+    return {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
 
 
 def _sensor_of(loaded: LoadedTask, kinds: dict[str, str], kind: str, place: tuple[str, ...]) -> str:

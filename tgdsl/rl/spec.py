@@ -9,11 +9,14 @@ from pydantic import Field, StrictInt
 from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.pushes import PushSpec
+from tgdsl.rl.students.spec import DistillSpec
+from tgdsl.rl.train.spec import TrainSpec
 
 TouchType = Literal[
-    "none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel"
-]
-"""What a policy feels, by one word: none, the paper's eight types, and forces that match the load."""
+    "none", "bool", "agg_bool", "depth", "agg_force", "force", "force_torque", "elastomer", "proximity", "force_taxel",
+    "temperature",
+]  # fmt: skip
+"""What a policy feels, by one word: none, the paper's eight types, forces that match the load, and temperatures."""
 SENSED: dict[str, tuple[str, str]] = {
     "bool": ("contact", "bool"),
     "agg_bool": ("contact", "agg_bool"),
@@ -24,6 +27,7 @@ SENSED: dict[str, tuple[str, str]] = {
     "elastomer": ("elastomer", "elastomer"),
     "proximity": ("proximity", "proximity"),
     "force_taxel": ("force_taxel", "force"),
+    "temperature": ("temperature_grid", "reading"),
 }
 """The kind of sensor that each type reads, and the observation that is made of it."""
 Time = Annotated[float, Quantity("time", gt=0.0)]
@@ -124,3 +128,7 @@ class TaskSpec(SpecModel):
     """How an action is understood."""
     randomise: RandomSpec = RandomSpec()
     """What is random at each reset."""
+    train: TrainSpec = TrainSpec()
+    """How a policy is learned: `tgdsl train`."""
+    distill: DistillSpec = DistillSpec()
+    """How students are taught by a policy that is there: `tgdsl distill`."""

@@ -131,6 +131,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
         mass=sim.properties.mass(sensed.object).to(sim.qpos).clone(),
         draws=draws,
+        rows={kind: (name, sensed.touch.rows[name]) for kind, name in sensed.by_kind.items()},
     )
 
 

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from tgdsl.console.tables import TaxelTable
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.table import GraspTable
@@ -58,6 +59,7 @@ class Setup:
         friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
         mass: Mass of each object [kg], likewise.
         draws: Random numbers.
+        rows: By kind of sensor that the task looks at: its reading's name in `Now.readings`, and a table of that one's rows.
         grasps: Grasps that episodes begin from; None if the task's document has none.
     """
 
@@ -77,6 +79,7 @@ class Setup:
     friction: Float[Tensor, " env"]
     mass: Float[Tensor, " env"]
     draws: Draws
+    rows: Mapping[str, tuple[str, TaxelTable]]
     grasps: GraspTable | None = None
 
 
@@ -203,6 +206,10 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+
+    def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
+        """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""
+        return {}
 
     @abstractmethod
     def score(self) -> Float[Tensor, " env"]:

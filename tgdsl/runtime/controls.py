@@ -28,6 +28,29 @@ def control_tensor(control: Tensor | np.ndarray, num_envs: int, num_actuators: i
     return values
 
 
+def write_controls(
+    control: Tensor | np.ndarray, ctrl: Float[Tensor, "env actuator"], refuses_unfinite: bool
+) -> Bool[Tensor, "*env"]:
+    """Write controls in place where they are finite; return the environments where they are not, or for all whether they are.
+
+    Args:
+        control: Controls, as for `control_tensor`.
+        ctrl: A simulator's controls.
+        refuses_unfinite: Whether the host's own are refused if they are not finite. Those on a GPU are looked at there.
+
+    Raises:
+        SimulationError: If they do not fit, or are the host's and not finite.
+    """
+    values = control_tensor(control, *ctrl.shape)
+    is_read_here = not (values.is_cuda and ctrl.is_cuda)
+    values = values.to(ctrl.device, ctrl.dtype)
+    if is_read_here and refuses_unfinite:
+        refuse_unfinite(values)
+    is_bad = is_unfinite(values)
+    ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
+    return is_bad
+
+
 def is_unfinite(values: Float[Tensor, "*env actuator"]) -> Bool[Tensor, "*env"]:
     """Return which environments' controls hold a number that is not finite; of controls for all alike, whether these do."""
     return ~torch.isfinite(values).all(dim=-1)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, StrictInt, Tag, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, model_validator
 
-from tgdsl.fields.models import Number, Position, Positive, PositiveLength, SpecModel, Usual
+from tgdsl.fields.materials import MaterialField
+from tgdsl.fields.models import Number, Position, Positive, PositiveLength, SpecModel, Temperature, Usual
+from tgdsl.sensors.base import Alternative
 
 NUM_SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
 """How many sizes a primitive has, as MuJoCo defines them: radius; radius and half-length; half-lengths."""
@@ -85,6 +87,37 @@ Variant = Annotated[
 CompoundGeoms.model_rebuild()
 
 
+class TemperaturePerEnv(SpecModel):
+    """A temperature at which each environment begins its episodes: see `SceneState.object_temperature`."""
+
+    per_env: Annotated[Temperature, Usual("temperature", high=250.0)]
+    """The temperature that all environments have to begin with [°C]."""
+
+
+def _is_per_env(value: Any) -> str:
+    return "per environment" if isinstance(value, (dict, TemperaturePerEnv)) else "the same in all"
+
+
+def _not_bare(value: Any) -> Any:
+    if value == "per_env":
+        raise ValueError("found `per_env` alone, expected `{per_env: 45 degC}`, the temperature to begin with")
+    return value
+
+
+def _as_tuple(value: Any) -> Any:
+    return value if isinstance(value, (list, tuple)) else (value,)
+
+
+ObjectTemperature = Annotated[
+    Annotated[Temperature, Tag("the same in all")] | Annotated[TemperaturePerEnv, Tag("per environment")],
+    Discriminator(_is_per_env),
+    BeforeValidator(_not_bare),
+]
+_Materials = Annotated[tuple[MaterialField, ...], Field(min_length=1)]
+ObjectMaterials = Annotated[_Materials, BeforeValidator(_as_tuple, json_schema_input_type=MaterialField | _Materials)]
+Cells = Annotated[StrictInt, Field(ge=1)]
+
+
 class ObjectSpec(SpecModel):
     """Something that taxels can feel: a body of the scene as it is, with other geoms, or a body of its own."""
 
@@ -117,6 +150,25 @@ class ObjectSpec(SpecModel):
     max_bytes: Annotated[StrictInt, Field(ge=1)] = 64 * 2**20
     """Largest size of a grid [bytes]."""
 
+    temperature: Annotated[ObjectTemperature | None, Usual("temperature", high=250.0)] = None
+    """Its temperature when an episode begins, `45 degC`; `{per_env: 45 degC}` if that is part of the state, beginning with it:
+    see `SceneState.object_temperature`. Default: that of the surroundings [°C]."""
+    material: ObjectMaterials | None = None
+    """What it is made of, for the flow of heat: a name such as `steel`, `{like: steel, emissivity: 0.8}`, or all numbers. Of a
+    list each environment takes one: see `SceneState.object_material`."""
+    cells: tuple[Cells, Cells, Cells] | None = None
+    """Numbers of cells along x, y, z in which its temperature is resolved, a grid over the box of its geoms in its body's
+    frame; default: it has one temperature."""
+
+    @model_validator(mode="after")
+    def _check_heat(self) -> ObjectSpec:
+        given = [key for key in ("temperature", "cells") if getattr(self, key) is not None]
+        if given and self.material is None:
+            raise ValueError(f"`{given[0]}` is for the flow of heat, which needs `material`, such as `steel`")
+        if self.material is not None and self.size == "per_env":
+            raise ValueError("`material` with `size: per_env` is not supported: heat needs a volume known beforehand")
+        return self
+
     @model_validator(mode="after")
     def _check(self) -> ObjectSpec:
         if self.geom is not None and self.variants is not None:
@@ -141,3 +193,11 @@ class ObjectSpec(SpecModel):
     def body_of(self, name: str) -> str:
         """Return its body, its own name being this."""
         return name if self.body is None else self.body
+
+
+def query_alternatives() -> list[Alternative]:
+    """Return how distances to meshes may be found, from coarse to fine; to primitives they are exact."""
+    grids = [
+        Alternative(f"grid, {1e3 * error:g} mm", {"query": "sdf", "tolerance": error}) for error in (1e-3, 2e-4, 5e-5, 1e-5)
+    ]
+    return [*grids, Alternative("raycast", {"query": "raycast"})]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from typing import get_type_hints
 
 from pydantic import BaseModel
 
+from tgdsl.fields.materials import Material
 from tgdsl.fields.models import Usual
 from tgdsl.schema.yaml import Path, Source
 
@@ -30,11 +32,11 @@ def warn_of_unusual(source: Source, spec: BaseModel) -> None:
 
 def _marked(value: object, path: Path) -> Iterator[tuple[Path, Usual, float]]:
     """Yield the numbers of all fields that are marked, their places and marks."""
-    if isinstance(value, BaseModel):
-        for name, field in type(value).model_fields.items():
+    if isinstance(value, (BaseModel, Material)):
+        for name, metadata in _fields(value):
             inner = getattr(value, name)
-            usual = next((part for part in field.metadata if isinstance(part, Usual)), None)
-            if usual is None:
+            usual = next((part for part in metadata if isinstance(part, Usual)), None)
+            if usual is None or isinstance(inner, BaseModel):
                 yield from _marked(inner, (*path, name))
             else:
                 yield from ((place, usual, number) for place, number in _numbers(inner, (*path, name)))
@@ -44,6 +46,15 @@ def _marked(value: object, path: Path) -> Iterator[tuple[Path, Usual, float]]:
     elif isinstance(value, Mapping):
         for name, part in value.items():
             yield from _marked(part, (*path, name))
+
+
+def _fields(value: BaseModel | Material) -> Iterator[tuple[str, Sequence[object]]]:
+    """Yield the fields of a model, or of a material that it was read as, and what is said of each."""
+    if isinstance(value, BaseModel):
+        yield from ((name, field.metadata) for name, field in type(value).model_fields.items())
+    else:
+        hints = get_type_hints(type(value), include_extras=True)
+        yield from ((name, getattr(hint, "__metadata__", ())) for name, hint in hints.items())
 
 
 def _numbers(value: object, path: Path) -> Iterator[tuple[Path, float]]:

@@ -11,6 +11,7 @@ from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.sensors.link_contact import LINK_CONTACT
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
+from tgdsl.sensors.temperature_grid.kind import TEMPERATURE_GRID
 
 KINDS: tuple[Kind, ...] = (
     CONTACT_DEPTH,
@@ -21,6 +22,7 @@ KINDS: tuple[Kind, ...] = (
     ELASTOMER,
     FORCE_TAXEL,
     LINK_CONTACT,
+    TEMPERATURE_GRID,
 )
 """The kinds that come with tgdsl."""
 
@@ -35,5 +37,6 @@ __all__ = [
     "LINK_CONTACT",
     "PROXIMITY",
     "SURFACE_DISTANCE",
+    "TEMPERATURE_GRID",
     "Kind",
 ]

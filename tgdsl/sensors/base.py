@@ -173,6 +173,7 @@ class Lowered:
         requests: What is asked of the scene, at most one of each type.
         rows: What the reading has one row of; None: of each taxel, or of each body if the kind is not on taxels.
         reports: Further readings: `<sensor>/<name>` holds these channels, with a row per body.
+        report_rows: What the rows of a report are, where they are not bodies.
         notes: What an account of the sensor says of its parameters, line by line.
         signal: What `forward` returns, if the kind decides: what noise acts on.
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
@@ -186,6 +187,7 @@ class Lowered:
     requests: tuple[Request, ...] = ()
     rows: Axis | None = None
     reports: Mapping[str, tuple[Channel, ...]] = field(default_factory=dict)
+    report_rows: Mapping[str, Axis] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     signal: tuple[Channel, ...] | None = None
     substeps: int = 0
@@ -233,6 +235,23 @@ Planes = Mapping[str, Tensor]
 Reading = Float[np.ndarray, "row channel"]
 
 
+class Alternative(NamedTuple):
+    """Another choice of a sensor's or an object's fields that reads the same thing, at another error and another cost.
+
+    Attributes:
+        label: What to call it: `svd, 0.1 %`.
+        changes: Fields and what they are then, as a document has them; None: left out.
+    """
+
+    label: str
+    changes: Mapping[str, Any]
+
+
+def no_alternatives(spec: Any) -> Sequence[Alternative]:
+    """Return no alternatives: nothing in a spec trades speed for error."""
+    return ()
+
+
 def no_indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> Mapping[str, int]:
     """Return of how many things constants are indices: none is one."""
     return {}
@@ -261,6 +280,8 @@ class Kind:
         is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
         quantities: Quantities of its own that it asks for, which no installed package brings.
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
+        alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
+            measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
     """
 
     spec: type[SensorSpec]
@@ -275,6 +296,7 @@ class Kind:
     is_timed: bool = False
     quantities: tuple[Quantity, ...] = ()
     indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
+    alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives
 
     @property
     def name(self) -> str:

@@ -9,6 +9,7 @@ from tgdsl.quantities.moments.nearby import FELT_MOMENTS
 from tgdsl.quantities.points.points import LINK_POINTS
 from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, SHEAR_LOADS
 from tgdsl.sensors.force_taxel.footprint import SHARED_FORCES
+from tgdsl.sensors.temperature_grid.step import HEAT_STEP
 from tgdsl.tensors.link_products import LINK_PRODUCTS
 from tgdsl.tensors.operations import Operation
 
@@ -20,4 +21,5 @@ OPERATIONS: tuple[Operation[..., Any], ...] = (
     LINK_POINTS,
     POINT_SUM,
     SHARED_FORCES,
+    HEAT_STEP,
 )

@@ -37,6 +37,7 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.moments import MomentsRequest, SurfaceMoments
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Alternative,
     Channel,
     Constants,
     Context,
@@ -170,4 +171,12 @@ def _slip(felt: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
     return planes.add(planes.scale(near.mass, velocity), planes.cross(omega, near.first))
 
 
-PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE)
+def alternatives(spec: ProximitySpec) -> list[Alternative]:
+    """Return sums over points, and fields of several tolerances."""
+    clouds = [Alternative(f"{num} points", {"backend": "points", "points": num}) for num in (1000, 5000)]
+    fields = [Alternative(f"field, {100 * e:g} %", {"backend": "field", "tolerance": e}) for e in (0.05, 0.02, 0.005)]
+    finest = {"backend": "field", "tolerance": 0.002, "max_bytes": 2**28}
+    return [*clouds, *fields, Alternative("field, 0.2 %", finest)]
+
+
+PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives)

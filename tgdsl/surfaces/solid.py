@@ -18,6 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tgdsl.errors import BakeError
+from tgdsl.surfaces.holes import hole_caps, merged
 from tgdsl.surfaces.surface import Surface
 
 SHARP = np.deg2rad(30.0)
@@ -74,10 +75,8 @@ class Solid:
     """
 
     def __init__(self, surface: Surface, leaf: float):
-        vertices, same = np.unique(np.asarray(surface.vertices, float) + 0.0, axis=0, return_inverse=True)
-        faces = same.reshape(-1)[np.asarray(surface.faces, np.int64)]
-        faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-        vertices, caps = _hole_caps(vertices, faces)
+        vertices, faces = merged(surface)
+        vertices, caps = hole_caps(vertices, faces)
         self.is_watertight = not len(caps)
         faces, caps = (part[_has_area(vertices[part])] for part in (faces, caps))
         if not len(faces):
@@ -194,34 +193,6 @@ def bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
     a, b, c = np.take_along_axis(corners, turn[:, :, None], axis=1).swapaxes(0, 1)
     middle = (a + b) / 2
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-
-
-def _hole_caps(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices with a centre for each boundary loop, and the triangle fans that close the loops.
-
-    An edge is open where its faces do not run along it as often one way as the other. What is open is a boundary and has
-    none itself, so every walk along open edges comes back, whatever the mesh.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    pairs, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
-    net = np.bincount(which.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(pairs)).astype(int)
-    onward: dict[int, list[int]] = {}
-    for (low, high), times in zip(pairs[net != 0].tolist(), net[net != 0].tolist(), strict=True):
-        start, end = (high, low) if times > 0 else (low, high)
-        onward.setdefault(start, []).extend([end] * abs(times))
-    middles, caps = [], []
-    for first in onward:
-        path = [first]
-        while onward[first] or len(path) > 1:
-            path.append(onward[path[-1]].pop())
-            at = path.index(path[-1])
-            if at < len(path) - 1:
-                loop = path[at:-1]
-                path = path[: at + 1]
-                middle = len(vertices) + len(middles)
-                middles.append(vertices[loop].mean(axis=0))
-                caps.extend((start, end, middle) for start, end in zip(loop, loop[1:] + loop[:1], strict=True))
-    return np.concatenate([vertices, np.reshape(middles, (-1, 3))]), np.array(caps, np.int64).reshape(-1, 3)
 
 
 def _creases(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ from tgdsl.errors import SimulationError, TgdslError, listed
 
 EnvIds = Tensor | np.ndarray | Sequence[int]
 """Environments: indices, or a boolean mask over all of them."""
+FEW = 0.5
+"""With more of the environments than this share, something is done for all of them."""
 
 
 def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] = SimulationError) -> Int[np.ndarray, " n"]:
@@ -93,6 +95,17 @@ def broadcast_over(mask: Bool[Tensor, " env"], values: Tensor) -> Bool[Tensor, "
     return mask.view(-1, *[1] * (values.ndim - 1))
 
 
+def few_ids(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
+    """Return the environments of a mask, if they are few enough on a CPU that what is done for them alone takes less.
+
+    None too where a mask's values are not to be looked at: see `may_hold`.
+    """
+    if mask.is_cuda or torch.compiler.is_compiling():
+        return None
+    ids = mask.nonzero()[:, 0]
+    return ids if len(ids) <= FEW * len(mask) else None
+
+
 def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) -> None:
     """Write new values into chosen environments of a tensor (env, …), by one kernel.
 
@@ -106,3 +119,16 @@ def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) 
         torch.where(mask, new, target, out=target)
     else:
         target.masked_fill_(mask, new)
+
+
+def may_look(values: Tensor) -> bool:
+    """Return whether Python may branch on values: not on a GPU, in code that is compiled, or where derivatives are wanted."""
+    return not (values.is_cuda or torch.is_grad_enabled() or torch.compiler.is_compiling())
+
+
+def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
+    """Return whether a mask holds anywhere, or its values are not to be looked at: on a GPU, and in code that is compiled.
+
+    What is done only where a mask holds can be left out if this is False; the result must be the same bytes.
+    """
+    return mask.is_cuda or torch.compiler.is_compiling() or bool(mask.any())

@@ -5,7 +5,9 @@ Nothing else in tgdsl touches a name of torch that begins with an underscore (`t
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import FunctionType, MethodType
 from typing import Any
 
@@ -95,6 +97,13 @@ def copy_each(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
 def add_each(targets: Sequence[Tensor], numbers: Sequence[int]) -> None:
     """Add a number to each of some tensors in place, by one kernel on a GPU and without a copy from the host."""
     torch.ops.aten._foreach_add_.ScalarList(list(targets), numbers)
+
+
+def inductor_cache() -> Path:
+    """Return the folder of what torch.compile has compiled: there is a public variable for it, but no public default."""
+    from torch._inductor.runtime.cache_dir_utils import default_cache_dir
+
+    return Path(os.environ.get("TORCHINDUCTOR_CACHE_DIR") or default_cache_dir())
 
 
 def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:

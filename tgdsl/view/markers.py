@@ -142,7 +142,7 @@ def touched(
     if (clean := readings.get(f"{sensor.name}/clean")) is not None:
         return np.array(last_step(clean)[env].detach().cpu().numpy().any(axis=1))
     state = sim.state()
-    memory = Memory(touch.plan.sensors).tensors(sim.num_envs, state.dt, touch.dtype, touch.device)
+    memory = Memory(touch.plan.sensors, touch.plan.readings()).tensors(sim.num_envs, state.dt, touch.dtype, touch.device)
     tensors = {name: torch.as_tensor(getattr(state, name), device=touch.device) for name in touch.inputs.fields}
     with torch.no_grad():
         signal = touch.core(tensors, memory)[0][f"{sensor.name}/signal"]

@@ -15,18 +15,29 @@ from torch import Tensor
 
 from tgdsl.files.write import atomic_open, with_folder
 from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
 from tgdsl.runtime.source import Simulator
+from tgdsl.view.boxes import Boxes, boxes_of, draw_boxes, is_boxed
 from tgdsl.view.cameras import ViewError
 from tgdsl.view.markers import Markers, markers_of, touched
 from tgdsl.view.picture import chosen_output
-from tgdsl.view.scene import RenderedScene, draw_markers, render_scene
+from tgdsl.view.scene import RenderedScene, draw_markers, rendered, seen
 from tgdsl.view.style import DPI, FAINT, INK, SUPERSAMPLING
 from tgdsl.view.table import outputs_on_taxels
+from tgdsl.view.taxels import Pose
 
 PANEL = (3.9, 3.7)
 """Width and height of a panel [inch]."""
+ALONE = 1.6
+"""How much larger a panel is that stands alone."""
 ARROW = 0.09
 """Length of the longest arrow, as a part of the panel's width."""
+
+
+def drawn_outputs(touch: TactileModule) -> list[Output]:
+    """Return the readings that an overview has panels of: of taxels, of bodies that carry them, and of boxes of links."""
+    on_taxels = outputs_on_taxels(touch)
+    return [output for output in touch.outputs if output in on_taxels or is_boxed(touch, output)]
 
 
 def overview(
@@ -38,11 +49,12 @@ def overview(
     env: int = 0,
     title: str = "",
     view: str | None = None,
+    temperatures: tuple[float, float] | None = None,
 ) -> Path:
     """Draw every reading of one environment, and write the picture.
 
     Each panel has a scale of its own. An arrow is a vector as it is, in the plane of the picture; the longest is as long in
-    every panel. Readings of bodies have one large marker per body.
+    every panel. Readings of bodies have one large marker per body; those of boxes, such as temperatures of cells, colour these.
 
     Args:
         touch: The module.
@@ -52,6 +64,7 @@ def overview(
         env: Which environment.
         title: What to write above it all.
         view: From where, as in `view.picture`.
+        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read, in each panel.
 
     Returns:
         The path.
@@ -60,7 +73,7 @@ def overview(
         ViewError: If there is no such environment or view, or nothing to draw.
         FileError: If the file cannot be written.
     """
-    figure = drawing(touch, sim, readings, env=env, title=title, view=view)
+    figure = drawing(touch, sim, readings, env=env, title=title, view=view, temperatures=temperatures)
     with atomic_open(with_folder(path)) as file:
         figure.savefig(file, format="png")
     return path
@@ -74,41 +87,64 @@ def drawing(
     env: int = 0,
     title: str = "",
     view: str | None = None,
+    temperatures: tuple[float, float] | None = None,
 ) -> Figure:
     """Return what `overview` writes; its axes are the panels, one for each reading of taxels or bodies."""
-    outputs = [output for output in outputs_on_taxels(touch) if output.name in readings]
+    outputs = [output for output in drawn_outputs(touch) if output.name in readings]
     if not outputs:
         raise ViewError("there is nothing to draw: the readings given hold none of this module's sensors")
     if not 0 <= env < sim.num_envs:
         raise ViewError(f"environment {env} does not exist, expected 0 to {sim.num_envs - 1}")
-    markers = [markers_of(touch, sim, output, readings[output.name], env) for output in outputs]
+    boxes = {o.name: boxes_of(touch, o, readings[o.name], env, temperatures) for o in outputs if is_boxed(touch, o)}
+    markers = {o.name: markers_of(touch, sim, o, readings[o.name], env) for o in outputs if o.name not in boxes}
     columns = min(len(outputs), 4)
     rows = -(-len(outputs) // columns)
-    width, height = (SUPERSAMPLING * round(0.94 * size * DPI) for size in (PANEL[0], 0.82 * PANEL[1]))
-    has_taxels = any(output.rows == "taxel" for output in outputs)
-    lead = outputs.index(chosen_output(touch, readings)) if has_taxels else 0
-    markers[lead] = replace(markers[lead], would_read=touched(touch, sim, outputs[lead], readings, env))
-    scene = render_scene(touch, sim, markers[lead], env, width, height, view)
-    figure = Figure(figsize=(columns * PANEL[0], rows * PANEL[1] + 0.5), dpi=DPI, facecolor="white")
+    panel = [(ALONE if len(outputs) == 1 else 1.0) * side for side in PANEL]
+    width, height = (SUPERSAMPLING * round(0.94 * size * DPI) for size in (panel[0], 0.82 * panel[1]))
+    lead = _lead(touch, sim, readings, markers, boxes, env)
+    view_of = seen(touch, sim, lead, env, width, height, view, [own.layout for own in boxes.values()])
+    scene = rendered(view_of) if markers else None
+    figure = Figure(figsize=(columns * panel[0], rows * panel[1] + 0.5), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(
         rows,
         columns,
         left=0.01,
         right=0.99,
-        bottom=0.34 / figure.get_figheight(),
+        bottom=(0.5 if boxes else 0.34) / figure.get_figheight(),
         top=1 - 1.0 / figure.get_figheight(),
         wspace=0.06,
         hspace=0.3,
     )
-    for i, (output, own) in enumerate(zip(outputs, markers, strict=True)):
+    for i, output in enumerate(outputs):
         axes = figure.add_subplot(grid[i])
-        draw_markers(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
-        _draw_arrows(axes, scene, own)
+        own = markers.get(output.name) or boxes[output.name]
+        if isinstance(own, Boxes):
+            draw_boxes(axes, sim, view_of, own, env)
+        elif scene is not None:
+            draw_markers(axes, scene, own, Normalize(0.0, float(own.value.max()) or 1.0))
+            _draw_arrows(axes, scene, own)
         axes.set_title(f"{output.name}  ·  {output.kind}", fontsize=11, color=INK, loc="left", pad=18, weight="bold")
         axes.text(0, 1.02, own.headline, transform=axes.transAxes, fontsize=9.5, color=FAINT)
     figure.text(0.012, 1 - 0.26 / figure.get_figheight(), title, size=15, weight="bold", color=INK, va="center")
     return figure
+
+
+def _lead(
+    touch: TactileModule,
+    sim: Simulator,
+    readings: Mapping[str, Tensor],
+    markers: Mapping[str, Markers],
+    boxes: Mapping[str, Boxes],
+    env: int,
+) -> Markers:
+    """Return what the camera is to face: taxels of the reading that a picture is of, or else bodies, or else boxes."""
+    outputs = {output.name: output for output in touch.outputs if output.name in markers}
+    if not outputs:
+        return next(iter(boxes.values())).markers(sim.model, Pose(*sim.body_poses(env)))
+    has_taxels = any(output.rows == "taxel" for output in outputs.values())
+    output = chosen_output(touch, readings) if has_taxels else next(iter(outputs.values()))
+    return replace(markers[output.name], would_read=touched(touch, sim, output, readings, env))
 
 
 def _draw_arrows(axes: Axes, scene: RenderedScene, markers: Markers) -> None:

@@ -5,6 +5,7 @@ Shapes: `h` and `w` rows and columns of pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,17 +13,22 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
+from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.runtime.source import Simulator
 from tgdsl.view.cameras import best_camera, camera_of
 from tgdsl.view.markers import Markers
 from tgdsl.view.meshes import mesh_of, robot_bodies
-from tgdsl.view.raster import Fragments, Viewport, downsample, rasterise, shade, viewport_for
+from tgdsl.view.raster import Fragments, Mesh, Viewport, downsample, rasterise, shade, viewport_for
 from tgdsl.view.style import DPI, HEAT, INK, SUPERSAMPLING
 from tgdsl.view.taxels import Pose, is_visible
 
 Array = np.ndarray
 _SENSING, _OTHER, _OBJECT = np.array([0.83, 0.84, 0.86]), np.array([0.60, 0.62, 0.66]), np.array([0.33, 0.55, 0.83])
+
+
+_DEPTH = 0.5  # how much of the shading painted surfaces keep
+Paint = Callable[[Array, Array], Array]
 
 
 class RenderedScene(NamedTuple):
@@ -33,10 +39,33 @@ class RenderedScene(NamedTuple):
     viewport: Viewport
 
 
+class Seen(NamedTuple):
+    """What is in view: the robot, the bodies of it that carry sensors, the felt objects; and the pixels it fills."""
+
+    hand: Mesh
+    carriers: frozenset[int]
+    objects: Mesh
+    viewport: Viewport
+
+
 def render_scene(
     touch: TactileModule, sim: Simulator, markers: Markers, env: int, width: int, height: int, view: str | None = None
 ) -> RenderedScene:
-    """Draw robot and felt objects, seen from where some taxels are in view.
+    """Draw robot and felt objects, seen from where some taxels are in view: see `seen`."""
+    return rendered(seen(touch, sim, markers, env, width, height, view))
+
+
+def seen(
+    touch: TactileModule,
+    sim: Simulator,
+    markers: Markers,
+    env: int,
+    width: int,
+    height: int,
+    view: str | None = None,
+    layouts: Sequence[Layout] = (),
+) -> Seen:
+    """Return robot and felt objects, seen from where some taxels are in view.
 
     Args:
         touch: The module.
@@ -46,25 +75,45 @@ def render_scene(
         width: Columns, before `SUPERSAMPLING` of them become one pixel.
         height: Rows, likewise.
         view: From where; default: see `cameras.best_camera`.
+        layouts: What else carries sensors; the first gives views their names where the module has no taxels.
     """
     model, pose = sim.model, Pose(*sim.body_poses(env))
-    carriers = {model.body(link.body).id for link in touch.plan.layout.links}
+    links = [link for own in (touch.plan.layout, *layouts) for link in own.links]
+    carriers = {model.body(link.body).id for link in links}
     framed, robot = robot_bodies(model, carriers)
-    felt = {model.body(target.body).id for target in touch.plan.objects}
+    felt = {model.body(target.body).id for target in touch.plan.objects} - carriers
     hand, objects = (mesh_of(sim.env_model(env), pose, bodies) for bodies in (robot - felt, felt))
     frame = np.isin(hand.body, list(framed))
-    layout, root = touch.plan.layout, min(framed)
-    camera = (
-        best_camera(markers, hand, model, layout, pose, root) if view is None else camera_of(view, model, [layout], pose, root)
-    )
+    own = next((own for own in (touch.plan.layout, *layouts) if (own.radius > 0).any()), touch.plan.layout)
+    root = min(framed)
+    camera = best_camera(markers, hand, model, own, pose, root) if view is None else camera_of(view, model, [own], pose, root)
     box = _bounds(camera.project(hand.corners[frame] if frame.any() else markers.pos[:, None]), camera.project(objects.corners))
-    viewport = viewport_for(camera, box, width, height)
+    return Seen(hand, frozenset(carriers), objects, viewport_for(camera, box, width, height))
+
+
+def rendered(seen: Seen, paint: Paint | None = None) -> RenderedScene:
+    """Draw what is in view.
+
+    Args:
+        seen: What that is.
+        paint: Returns the colours of points of the robot's surface [m] on some bodies, NaN where these stay grey; objects are
+            then fainter.
+    """
+    hand, carriers, objects, viewport = seen
+    width, height, camera = viewport.width, viewport.height, viewport.camera
     fragments = rasterise(viewport.project(hand.corners), width, height)
     colour = np.where(np.isin(hand.body, list(carriers))[:, None], _SENSING, _OTHER)
     image = shade(np.ones((height, width, 3)), fragments, hand, colour, camera, 1.0, viewport.scale)
+    if paint is not None:
+        drawn = fragments.face >= 0
+        face, weights = fragments.face[drawn], fragments.weights[drawn]
+        own = paint(np.einsum("pi,pij->pj", weights, hand.corners[face]), hand.body[face])
+        light = 1 - _DEPTH * (1 - np.minimum(image[drawn] / colour[face], 1))
+        image[drawn] = np.where(np.isnan(own), image[drawn], own * light)
     over = rasterise(viewport.project(objects.corners), width, height)
     over.face[over.nearness < fragments.nearness] = -1
-    image = shade(image, over, objects, np.broadcast_to(_OBJECT, (len(objects.body), 3)), camera, 0.4, viewport.scale)
+    blue, opacity = np.broadcast_to(_OBJECT, (len(objects.body), 3)), 0.4 if paint is None else 0.25
+    image = shade(image, over, objects, blue, camera, opacity, viewport.scale)
     return RenderedScene(downsample(image, SUPERSAMPLING), fragments, viewport)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
@@ -39,12 +39,31 @@ def table(touch: TactileModule, readings: Mapping[str, Tensor], env: int = 0) ->
 
 
 def _own_rows(table: TaxelTable, output: Output, readings: Mapping[str, Tensor], env: int) -> list[str]:
-    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample."""
+    """Return a reading with rows of its own: by the first column of its table, each channel of the last sample.
+
+    Rows that share that column, such as the cells of a link, are one line: how many they are, the lowest and the highest.
+    """
     first, *_ = table.dtype.names or ("row",)
     values = last_step(readings[output.name])[env].detach().cpu().double().numpy()
-    header = [output.rows] + [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]
-    rows = [[str(row[first]), *(f"{number:.3g}" for number in own)] for row, own in zip(table, values, strict=True)]
-    return [output.name, *_aligned(header, rows)]
+    channels = [f"{name} [{unit}]" for name, unit in zip(output.channels, output.units, strict=True)]
+    names = list(dict.fromkeys(table[first].tolist()))
+    if len(names) < len(table):
+        rows = [_span_row(str(name), values[table[first] == name], output.units) for name in names]
+        return [output.name, *_aligned([first, f"{output.rows}s", *channels], rows)]
+    rows = [
+        [str(row[first]), *(_number(n, unit) for n, unit in zip(own, output.units, strict=True))]
+        for row, own in zip(table, values, strict=True)
+    ]
+    return [output.name, *_aligned([output.rows, *channels], rows)]
+
+
+def _span_row(name: str, values: np.ndarray, units: Sequence[str]) -> list[str]:
+    ends = zip(values.min(axis=0), values.max(axis=0), units, strict=True)
+    return [name, str(len(values)), *(f"{_number(low, unit)} … {_number(high, unit)}" for low, high, unit in ends)]
+
+
+def _number(number: float, unit: str) -> str:
+    return f"{number:.2f}" if unit == "degC" else f"{number:.3g}"
 
 
 def _aligned(header: list[str], rows: list[list[str]]) -> list[str]:

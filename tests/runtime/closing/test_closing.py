@@ -7,11 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from closing_hands import hinged_jaws, world
+from closing_hands import finger, hinged_jaws, world
 from odd_hands import CAPSULES, FOUR_BAR, TENDON
 from unscripted_hands import GRIPPER, URDF
 
 import tgdsl
+from tgdsl.errors import SimulationError
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.propose.propose import escaped
 from tgdsl.runtime.batch.simulation import BatchSimulation
@@ -254,6 +255,62 @@ def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path)
     is_off = [bool(sim.model.opt.disableactuator >> group & 1) for group in groups]
     assert closing.resting == (0, 1) and is_off == [True, True, False, True, False]
     assert closing.target == "ball"
+
+
+def fan(groups) -> str:
+    """Return a fan with a motor in each of some groups."""
+    motors = "".join(f"<velocity joint='spin' kv='.01' group='{group}'/>" for group in groups)
+    body = (
+        "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
+    )
+    return scene(body, f"<actuator>{motors}</actuator>")
+
+
+@pytest.mark.parametrize("disabled", ["30", "7"])
+def test_one_group_that_is_free_or_disabled_is_enough(tmp_path, disabled):
+    """The hand's actuators rest in it, and the servos act in one that MuJoCo cannot disable."""
+    groups = range(30) if disabled == "30" else range(31)
+    text = fan(groups).replace(
+        "</mujoco>", f"<option actuatorgroupdisable='{disabled}'/></mujoco>" if disabled == "7" else "</mujoco>"
+    )
+    closing, sim, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"ball": BALL, "fan": {"body": "fan"}}, text))
+    is_off = [bool(group < 31 and sim.model.opt.disableactuator >> group & 1) for group in sim.model.actuator_group.tolist()]
+    assert closing.resting == (0, 1)
+    assert is_off == [True, True, *(group == 7 and disabled == "7" for group in groups), False]
+    assert (load[0] > 0).sum() >= 2
+
+
+def test_groups_that_others_have_all_taken_are_an_error(tmp_path):
+    closing = closing_of(module(tmp_path, "gripper.xml", GRIPPER, {"ball": BALL, "fan": {"body": "fan"}}, fan(range(31))))
+    assert isinstance(closing, Closing)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "scene.xml"))
+    with pytest.raises(SimulationError, match=r"not the hand's are in all 31 groups, .* leave one of the groups 0 to 30 free"):
+        closing.prepare(spec)
+
+
+# Two fingers of three joints, of which the second follows the first, and the third the second.
+CHAINED = world(
+    finger("left", ".03 0 .05", "0 0 180") + finger("right", "-.03 0 .05") + '<geom type="box" size=".05 .02 .015"/>'
+)
+
+
+@pytest.mark.parametrize("order", [(2, 3), (3, 2)])
+def test_a_joint_that_follows_a_follower_closes_too(tmp_path, order):
+    equalities = "".join(
+        f"<joint joint1='{side}_j{i}' joint2='{side}_j{i - 1}' polycoef='{0.1 if i == 3 else 0} {0.5 * (i - 1)} 0 0 0'/>"
+        for side in ("left", "right")
+        for i in order
+    )
+    text = CHAINED.replace("</mujoco>", f"<equality>{equalities}</equality></mujoco>")
+    touch = module(tmp_path, "chained.xml", text)
+    closing = closing_of(touch)
+    assert isinstance(closing, Closing)
+    assert sorted(servo.joint for servo in closing.servos) == ["left_j1", "right_j1"]
+    assert sorted(closing.slack) == ["left_j2", "left_j3", "right_j2", "right_j3"] and not closing.held
+    model = BatchSimulation(touch, 1, keyframe=START, prepare=closing.prepare).model
+    for side in ("left", "right"):
+        one, two, three = (closing.start[model.joint(f"{side}_j{i}").qposadr[0]] for i in (1, 2, 3))
+        assert two == pytest.approx(0.5 * one) and three == pytest.approx(0.1 + two)
 
 
 @pytest.mark.parametrize("robot", ["xhand1", "sharpa"])

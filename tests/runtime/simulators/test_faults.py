@@ -220,6 +220,25 @@ def test_pools_that_overflow_raise_whatever_becomes_of_faults(tmp_path):
     assert not sim.faults.any() and not sim.fault_counts.any()
 
 
+@pytest.mark.parametrize("on_fault", ["raise", "note", "reset"])
+def test_a_search_that_runs_out_of_room_is_a_fault_of_its_environment(tmp_path, on_fault):
+    """No pool is too small, and nobody can make it larger: one of thousands of environments stops nobody else."""
+    sim = warp(module(tmp_path), 3, keyframe="home", on_fault=on_fault)
+    sim._worlds.arrays["overflow"][1] = 1 << 8
+    text = "the search for the deepest point of two convex shapes ran out of room"
+    if on_fault == "raise":
+        with pytest.raises(SimulationError, match=rf"^{text} in environments 1: contacts may be wrong; reset them to go on$"):
+            sim.step()
+    else:
+        with pytest.warns(UserWarning, match=f"in 1 {text}; this is said once"):
+            sim.step()
+    assert sim.faults.tolist() == [False, True, False] and sim.fault_counts.tolist() == [0, 1, 0]
+    if on_fault != "reset":
+        sim.reset(sim.faults)
+    sim.step()
+    assert not sim.faults.any() and sim.fault_counts.tolist() == [0, 1, 0]
+
+
 @pytest.mark.parametrize(
     ("kind", "text"),
     [

@@ -40,9 +40,11 @@ KNOBS_OF = {
     "proximity": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
     "force_taxel": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
     "link_contact": BASE,
+    "temperature_grid": BASE,
 }
 """The paper's table "Imperfection knobs available per sensor type", the Schmitt threshold that its values give to `bool`, and
-the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` with what every sensor has."""
+the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` and
+`temperature_grid` with what every sensor has."""
 VALUES = {
     "read_delay": 0.01,
     "jitter": 0.01,

@@ -29,10 +29,9 @@ class TreeNode:
         """All joints to its parent."""
         return () if self.joint is None else (self.joint, *self.stacked)
 
-    @property
-    def is_swapped(self) -> bool:
-        """Whether the joint's body 0 is the child."""
-        return self.joint is not None and self.joint.bodies[0] == self.body
+    def is_swapped(self, joint: Joint) -> bool:
+        """Return whether body 0 of one of its joints is the child."""
+        return joint.bodies[0] == self.body
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +88,15 @@ class _TreeBuilder:
         return [body for child in children for body in (child, *self._depth_first(child))]
 
     def _stacked(self, node: TreeNode) -> TreeNode:
-        """Return a node with all joints that stack on its own, in stage order."""
+        """Return a node with all joints that stack on its own, from the parent on.
+
+        Stage order counts from body 0 of the first of them.
+        """
         own = node.joint
         if own is None or not own.is_stackable:
             return node
-        first, *rest = [joint for joint in self.joints if joint.is_stackable and joint.bodies == own.bodies]
+        found = [joint for joint in self.joints if joint.is_stackable and set(joint.bodies) == set(own.bodies)]
+        first, *rest = found[::-1] if node.is_swapped(found[0]) else found
         return replace(node, joint=first, stacked=tuple(rest))
 
     def _rank(self, path: str) -> int:

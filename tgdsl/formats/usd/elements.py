@@ -111,11 +111,11 @@ def add_joint_element(body: ET.Element, node: TreeNode, names: Mapping[str, str]
     for joint in node.joints:
         if joint.kind == "fixed":
             continue
-        frame = joint.frames[0 if node.is_swapped else 1]
+        frame = joint.frames[0 if node.is_swapped(joint) else 1]
         element = ET.SubElement(body, "joint", name=names[joint.path], type=joint.kind, pos=floats_text(frame[:3, 3]))
         if joint.kind != "ball":
             # Positions count body 1 against body 0; where body 0 is the child, it turns the other way.
-            element.set("axis", floats_text(frame[:3, :3] @ joint.axis * (-1 if node.is_swapped else 1)))
+            element.set("axis", floats_text(frame[:3, :3] @ joint.axis * (-1 if node.is_swapped(joint) else 1)))
         if joint.range is not None:
             element.set("range", floats_text(joint.range))
         element.attrib |= joint.mjcf_attributes
@@ -252,8 +252,8 @@ def _authored_qpos(
 
 def _child_turn(node: TreeNode, joint: Joint, apart: Matrix) -> Matrix:
     """Return a ball joint's rotation as MuJoCo counts it: in the child's axes at position zero."""
-    frame, turn = joint.frames[0 if node.is_swapped else 1], np.eye(4)
-    own = apart[:3, :3].T if node.is_swapped else apart[:3, :3]
+    frame, turn = joint.frames[0 if node.is_swapped(joint) else 1], np.eye(4)
+    own = apart[:3, :3].T if node.is_swapped(joint) else apart[:3, :3]
     turn[:3, :3] = frame[:3, :3] @ own @ frame[:3, :3].T
     return turn
 

@@ -171,7 +171,7 @@ def _check(stage: Stage, robot: _Robot) -> None:
         for name in ("velocity", "angularVelocity"):
             if any(stage.value(prim, f"physics:{name}")):
                 stage.drop("initial velocities were dropped", prim)
-        poses = [joint.pose(node.is_swapped) for joint in node.joints]
+        poses = [joint.pose(node.is_swapped(joint)) for joint in node.joints]
         is_apart = any(np.abs(pose - poses[0]).max() > FRAME_TOLERANCE for pose in poses)
         if node.joint is not None and (is_apart or _authored(robot, node.joint)[2] > FRAME_TOLERANCE):
             stage.drop("in the authored poses the frames of joints do not meet; MuJoCo will join them", node.joint.prim)
@@ -257,7 +257,7 @@ def _add_exclusions(stage: Stage, robot: _Robot, contact: ET.Element, flags: Map
 def _add_body(
     robot: _Robot, node: TreeNode, parent: ET.Element, meshes: MeshAssets, elements: dict[str | None, ET.Element]
 ) -> None:
-    pose = robot.frames[node.body] if node.joint is None else node.joint.pose(node.is_swapped)
+    pose = robot.frames[node.body] if node.joint is None else node.joint.pose(node.is_swapped(node.joint))
     attributes = {"name": robot.names[0][node.body]} | robot.body_attributes[node.body]
     element = with_pose(ET.SubElement(parent, "body", attributes), pose)
     elements[node.body] = element

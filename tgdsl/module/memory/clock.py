@@ -58,6 +58,11 @@ class Clock(HookedModule):
         """Number of environments; None before the start."""
         return len(self.get_buffer("age")) if hasattr(self, "age") else None
 
+    @property
+    def _num_calls(self) -> int:
+        """How many calls before the present one some ring remembers."""
+        return self.get_buffer("ages").shape[-1] if hasattr(self, "ages") else 0
+
     def start(self, num_envs: int, calls: int, like: Tensor) -> None:
         """Begin to count.
 
@@ -193,8 +198,10 @@ class Clock(HookedModule):
         age = state_dict.get(f"{prefix}age")
         if self.is_wanted and isinstance(age, Tensor):
             ages = state_dict.get(f"{prefix}ages")
-            with torch.inference_mode(False):
-                self.start(len(age), ages.shape[-1] if isinstance(ages, Tensor) else 0, self.home)
+            calls = ages.shape[-1] if isinstance(ages, Tensor) else 0
+            if (len(age), calls) != (self.num_envs, self._num_calls):  # else captured graphs go on with what is there
+                with torch.inference_mode(False):
+                    self.start(len(age), calls, self.home)
         load()
         if self.num_envs is not None:
             self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))

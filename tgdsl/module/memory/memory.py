@@ -7,7 +7,7 @@ numbers per row.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.memory.clock import Clock
-from tgdsl.plan.sensors import PlannedMemory, PlannedSensor
+from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
 from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
@@ -29,10 +29,12 @@ class Memory(HookedModule):
 
     Attributes:
         home: Has device and dtype of state that is loaded before the first call.
+        keeps_last: Whether the last readings are kept from the first call on, and not only once some environments are read
+            alone, which needs them: code that is compiled for the first call then serves all later ones.
     """
 
-    def __init__(self, sensors: Sequence[PlannedSensor]):
-        """Note what sensors carry."""
+    def __init__(self, sensors: Sequence[PlannedSensor], readings: Mapping[str, PlannedReading]):
+        """Note what sensors carry, and what all readings are."""
         super().__init__()
         self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
         for s in sensors:
@@ -41,7 +43,15 @@ class Memory(HookedModule):
                 shape = (s.history.length, len(reading.channels), reading.num_rows)
                 self._planned[f"{WINDOW}{reading.name}"] = PlannedMemory(0.0, shape)
         self._rings = {f"{s.name}:{n}": (s.sensor, part) for s in sensors for n, part in s.state.items() if part.past > 0}
+        stacks = {reading.name for s in sensors for reading in s.windows if reading.steps}  # their windows hold them already
+        self._kept = {
+            name: (*((reading.steps,) if reading.steps else ()), len(reading.channels), reading.num_rows)
+            for name, reading in readings.items()
+            if name not in stacks
+        }
         self._last: dict[str, tuple[Tensor, int]] = {}
+        self._is_filled = False  # whether what is kept was handed out
+        self.keeps_last = False
         self.clock = Clock(sensors)
         self.home = torch.empty(0)
 
@@ -78,6 +88,11 @@ class Memory(HookedModule):
                 if self.clock.is_wanted:
                     calls = max((_calls(part, dt)[0] for _, part in self._rings.values()), default=0)
                     self.clock.start(num_envs, calls, torch.empty(0, dtype=dtype, device=device))
+        if self.keeps_last and self.num_kept is None:
+            with torch.inference_mode(False):
+                for name, shape in self._kept.items():
+                    room = torch.zeros(num_envs, *shape, dtype=dtype, device=device)
+                    self.register_buffer(f"{KEPT}{name}", room, persistent=False)
         held = held_buffers(self)
         for path, (sensor, planned) in self._rings.items():
             if _calls(planned, dt)[0] > held[path].shape[1]:
@@ -91,33 +106,30 @@ class Memory(HookedModule):
         return next((buffer.shape[0] for name, buffer in held_buffers(self).items() if name.startswith(KEPT)), None)
 
     def note_last(self, readings: Mapping[str, Tensor]) -> None:
-        """Note what is handed out, (env, row, channel), where it lies; nothing to do once it is kept."""
-        if self.num_kept:
-            self._last = {}
-        else:
+        """Note what is handed out, (env, row, channel): where it lies, or once it is kept, that it is."""
+        self._is_filled = self.num_kept is not None
+        self._last = {}
+        if not self._is_filled:
             self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in readings.items()}
 
-    def keep_last(self, num_envs: int, stacks: Collection[str]) -> None:
+    def keep_last(self, num_envs: int) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.
-
-        Args:
-            num_envs: Number of environments.
-            stacks: Readings whose windows hold them already.
 
         Raises:
             StateError: If nothing was handed out yet, or of another number of environments.
         """
-        if self.num_kept is None:
-            if not self._last:
-                raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+        if not (self._is_filled or self._last):
+            raise StateError("nothing was handed out yet for the environments left out: read all of them first")
+        if not self._is_filled:
             if changed := [name for name, (reading, version) in self._last.items() if num_writes(reading) != version]:
                 what = f"the readings {listed(changed)} that were handed out last have been written into since"
                 raise StateError(f"{what}, and the environments left out are to have them: write into clones")
             with torch.inference_mode(False), torch.no_grad():
                 for name, (reading, _) in self._last.items():
-                    if name not in stacks:
+                    if name in self._kept:
                         copy = reading.transpose(-2, -1).clone(memory_format=torch.contiguous_format)
                         self.register_buffer(f"{KEPT}{name}", copy, persistent=False)
+            self._is_filled = True
         if self.num_kept not in (None, num_envs):
             raise StateError(f"readings of {self.num_kept} environments were handed out before, the scene has {num_envs}")
 
@@ -127,6 +139,7 @@ class Memory(HookedModule):
             self._forget_kept()
 
     def _forget_kept(self) -> None:
+        self._is_filled = False
         for name in [name for name, _ in self.named_buffers(recurse=False) if name.startswith(KEPT)]:
             delattr(self, name)
 
@@ -134,7 +147,7 @@ class Memory(HookedModule):
         """Hold nothing again, as before the first call."""
         for name in [name for name, _ in self.named_buffers(recurse=False)]:
             delattr(self, name)
-        self._last = {}
+        self._last, self._is_filled = {}, False
         self.clock.free()
 
     def reset(self, chosen: Tensor) -> None:
@@ -151,7 +164,10 @@ class Memory(HookedModule):
         move()
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
-        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state."""
+        """Make room for the state that is loaded, in the module's own dtype; part of a state is no state.
+
+        Buffers that have the shape already stay where they are: captured graphs go on with them.
+        """
         found = {path: state_dict[prefix + path] for path in self._planned if isinstance(state_dict.get(prefix + path), Tensor)}
         has_clock = f"{prefix}clock.age" in state_dict
         if found or has_clock:
@@ -160,10 +176,9 @@ class Memory(HookedModule):
             return  # nothing is loaded, nor by the clock
         with torch.inference_mode(False):
             for path, value in found.items():
-                room = torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device)
-                self.register_buffer(path, room)
-        self._last = {}
-        self._forget_kept()  # what is replaced has handed them out
+                if path not in (held := held_buffers(self)) or held[path].shape != value.shape:
+                    self.register_buffer(path, torch.zeros(value.shape, dtype=self.home.dtype, device=self.home.device))
+        self._last, self._is_filled = {}, False  # what is replaced has handed them out
         load()
 
     def _misfits(self, found: Mapping[str, Tensor], age: Tensor | None, prefix: str) -> list[str]:

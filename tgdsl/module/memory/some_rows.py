@@ -14,11 +14,9 @@ from torch import Tensor
 from tgdsl.module.memory.clock import ENV, SHARED
 from tgdsl.module.memory.history import reduced
 from tgdsl.module.memory.memory import KEPT, WINDOW, chosen_only
-from tgdsl.tensors.env_ids import broadcast_over
+from tgdsl.tensors.env_ids import broadcast_over, few_ids
 
 Tensors = dict[str, Tensor]
-LARGEST_SHARE = 0.5
-"""With more of the environments than this, all of them are computed."""
 
 
 def chosen_rows(
@@ -48,10 +46,8 @@ def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
 
     One alone is read twice: compiled code that serves every batch from two on is then not made again for it.
     """
-    if mask.device.type != "cpu" or torch.is_grad_enabled() or torch.compiler.is_compiling():
-        return None
-    rows = mask.nonzero()[:, 0]
-    if not 0 < len(rows) <= LARGEST_SHARE * len(mask):
+    rows = None if torch.is_grad_enabled() else few_ids(mask)
+    if rows is None or not len(rows):
         return None
     return rows if len(rows) > 1 else rows.repeat(2)
 

@@ -12,6 +12,10 @@ from tgdsl.quantities.contact_depth.query import ObjectDistance, Probes, Target,
 from tgdsl.quantities.contact_depth.request import Penetration
 from tgdsl.quantities.contact_depth.search import search
 from tgdsl.quantities.geoms.gathering import object_geoms
+from tgdsl.tensors.env_ids import may_look
+
+FAR = 1e6
+"""Numbers of poses up to this [m] have distances that are numbers, in float32 too."""
 
 
 def gather(part: ContactDepthPart[Tensor], scene: Scene) -> tuple[Penetration, ...]:
@@ -22,10 +26,13 @@ def gather(part: ContactDepthPart[Tensor], scene: Scene) -> tuple[Penetration, .
         if geoms is not None
     }
     measured: dict[int, tuple[ObjectDistance, ...]] = {}
-    found = []
+    found, are_closed = [], _are_closed(scene)
     for use in part.uses:
         query = part.queries[use.query]
         probes, own = Probes(vec(query.pos.unbind()), query.pair), [targets[o] for o in query.objects]
+        if are_closed and use.is_gated and not {"distance", "frame"} & {*use.wants}:  # as right after a reset
+            found.append(penetration(pairs_for(scene, True), probes, (), use.reach[:0], use.wants))
+            continue
         answer = _searched(use, probes, own, scene)
         if answer is None:
             if use.query not in measured:
@@ -34,6 +41,18 @@ def gather(part: ContactDepthPart[Tensor], scene: Scene) -> tuple[Penetration, .
             answer = penetration(pairs_for(scene, use.is_gated), probes, near, _reach(use, scene), use.wants)
         found.append(answer)
     return tuple(found)
+
+
+def _are_closed(scene: Scene) -> bool:
+    """Return whether no pair is in contact, and nothing is so far away or no number that a closed gate would not hide it.
+
+    False where the values are not to be looked at: on a GPU, in code that is traced, and where derivatives are wanted.
+    """
+    pairs = scene.pairs
+    if pairs is None or pairs.gate is None or not may_look(pairs.gate) or not bool((pairs.gate == -torch.inf).all()):
+        return False
+    sizes = scene.tensors.get("object_size", pairs.gate[:, :0])
+    return bool((torch.stack([*pairs.rotation, *pairs.offset]).abs() < FAR).all() and sizes.isfinite().all())
 
 
 def _searched(use: DepthUse[Tensor], probes: Probes, targets: list[Target], scene: Scene) -> Penetration | None:

@@ -118,20 +118,23 @@ def penetration(
 
 def _distance(pairs: Pairs, probes: Probes, geoms: Geoms, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
     """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
-    frames = []
-    for g in range(len(geoms.shapes)):
-        rotation, offset = _link_in_geom(pairs, own, geoms, g)
-        every = slice(None)
-        turn, shift = ([at_probes(part, every, pair) for part in parts] for parts in (rotation, offset))
-        frames.append(Frame(planes.rot(turn), planes.vec(shift)))
+    rotation = planes.rot(part[:, own] for part in pairs.rotation)
+    offset = planes.vec(part[:, own] for part in pairs.offset)
+    centred = _at_probes(rotation, offset, pair) if any(geoms.is_centred) else None
+    frames = [
+        centred if is_centred else _at_probes(*_link_in_geom(rotation, offset, geoms, g), pair)
+        for g, is_centred in enumerate(geoms.is_centred)
+    ]
     return union_distance(probes.pos, frames, geoms)
 
 
-def _link_in_geom(pairs: Pairs, own: slice, geoms: Geoms, g: int) -> tuple[Rot, Vec]:
-    rotation = planes.rot(part[:, own] for part in pairs.rotation)
-    offset = planes.vec(part[:, own] for part in pairs.offset)
-    if geoms.is_centred[g]:
-        return rotation, offset
+def _at_probes(rotation: Rot, offset: Vec, pair: Tensor) -> Frame:
+    """Return how an object, or a geom of it, sees each probe, of how it sees the links."""
+    turn, shift = ([at_probes(part, slice(None), pair) for part in parts] for parts in (rotation, offset))
+    return Frame(planes.rot(turn), planes.vec(shift))
+
+
+def _link_in_geom(rotation: Rot, offset: Vec, geoms: Geoms, g: int) -> tuple[Rot, Vec]:
     geom_rotation = planes.rot(geoms.rotation[:, g, None].unbind(-1))
     moved = planes.sub(offset, planes.split(geoms.pos[:, g, None]))
     return planes.transpose_times(geom_rotation, rotation), planes.rotate_back(geom_rotation, moved)

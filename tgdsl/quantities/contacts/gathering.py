@@ -43,7 +43,7 @@ def contacts_of(
     whole = _of_pairs(state["contact_netforce"], index)
     net = planes.rotate_back(rotation, planes.split(whole.sum(dim=2)))
     if "contact_force" not in state:
-        none = net[0].new_zeros((*net[0].shape, 0))
+        none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         own = [(none, none, none)] * 4
     else:
         each = planes.rot(part[..., None] for part in rotation)

@@ -46,13 +46,13 @@ def reference(part: ContactsPart[np.ndarray], use: int, scene: ReferenceScene) -
             net[b] += body.rotation.T @ whole
             slots = zip(*(scene.fields[name][p] for name in SLOT_FIELDS), strict=True) if SLOT_FIELDS[0] in scene.fields else ()
             used = [list(row) for row in slots if np.any(row[1:])]
-            for pos, *vectors in _completed(used, whole):
+            for pos, *vectors in completed(used, whole):
                 rows.append((b, [body.rotation.T @ vector for vector in (pos - body.pos, *vectors)]))
     pos, force, torque, normal = np.array([row for _, row in rows]).reshape(len(rows), 4, 3).transpose(1, 0, 2)
     return ReferenceContacts(np.array([b for b, _ in rows], dtype=np.int64), pos, force, torque, normal, net)
 
 
-def _completed(contacts: list[list[np.ndarray]], whole: np.ndarray) -> list[list[np.ndarray]]:
+def completed(contacts: list[list[np.ndarray]], whole: np.ndarray) -> list[list[np.ndarray]]:
     """Return a pair's contacts (place, force, torque, normal), what they lack of its whole force added by shares of force."""
     sizes = [float(np.linalg.norm(force)) for _, force, _, _ in contacts]
     sizes = sizes if sum(sizes) > 0 else [1.0] * len(contacts)

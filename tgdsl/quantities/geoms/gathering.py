@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from tgdsl.geometry.grid import Grid
@@ -11,10 +12,11 @@ from tgdsl.quantities.base import Scene, variant_of
 from tgdsl.quantities.geoms.distance import Geoms, RaycastSurface
 from tgdsl.quantities.geoms.tables import GeomTable, GridTable, TriangleTable
 from tgdsl.quantities.pairs import PairedObject
+from tgdsl.tensors.env_ids import may_look
 
 
 def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -> Geoms:
-    """Return an object's geoms as each environment has them: its variant, its size."""
+    """Return an object's geoms as each environment has them: its variant, its size. What none of them has may be left out."""
     variant = variant_of(scene, target)
     size, is_absent = _chosen(table.size, variant), None
     if variant is not None and table.is_absent is not None:
@@ -22,7 +24,7 @@ def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -
     if target.is_sized:
         own = scene.tensors["object_size"][:, target.varied, None].to(size.dtype).expand(-1, size.shape[1], -1)
         size = own if is_absent is None else torch.where(is_absent[..., None], size, own)
-    return Geoms(
+    geoms = Geoms(
         shapes=table.shapes,
         is_centred=table.is_centred,
         size=size,
@@ -31,6 +33,18 @@ def object_geoms(table: GeomTable[Tensor], target: PairedObject, scene: Scene) -
         is_absent=is_absent,
         variant=variant,
         surfaces=tuple(_surface(own, variant) for own in table.surfaces),
+    )
+    return geoms if is_absent is None or not may_look(is_absent) else _had_by_some(geoms, is_absent)
+
+
+def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:
+    """Return those geoms that some environment has."""
+    own = [g for g, is_missing in enumerate(is_absent.all(dim=0).tolist()) if not is_missing]
+    if len(own) == len(geoms.shapes) or not own:
+        return geoms
+    return geoms._replace(
+        **{name: tuple(getattr(geoms, name)[g] for g in own) for name in ("shapes", "is_centred", "surfaces")},
+        **{name: getattr(geoms, name)[:, own] for name in ("size", "pos", "rotation", "is_absent")},
     )
 
 

@@ -7,7 +7,8 @@ its name.
 
 Of gymnasium's wrappers, those of observations (`FlattenObservation`, `NormalizeObservation`, …) refuse every environment of
 this mode: the argument `groups` leaves out what a policy shall not see. `NumpyToTorch` cannot convert `final_obs` as an array:
-`output="torch"` takes its place. All others take this environment.
+`output="torch"` takes its place. All others take this environment with `output="numpy"`; they compute with arrays, so that with
+`output="torch"` all but `TransformReward` raise.
 
 Shapes: `env` environments, `joint` joints that the policy moves.
 """

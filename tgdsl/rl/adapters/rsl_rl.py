@@ -4,6 +4,9 @@ Groups of observations are a TensorDict, of which the runner's `obs_groups` take
 `extras["time_outs"]` are episodes that have merely lasted long enough. `extras["log"]` is there when an episode has ended, and
 of those that have: return, steps, score, whether a fault has ended it, and the sum of each term of the reward.
 
+rsl_rl's normaliser divides by the standard deviation plus `eps`, 0.01, which hides groups in metres: once the runner is made,
+set `obs_normalizer.eps` of actor and critic to 1e-5, as `examples/learn.py` does.
+
 Shapes: `env` environments, `joint` joints that the policy moves.
 """
 
@@ -45,6 +48,16 @@ class TouchVecEnv(VecEnv):
         self.max_episode_length = touch_env.max_steps
         self.cfg = touch_env.spec.model_dump(mode="json")
         self._obs = self._given(touch_env.reset())
+
+    @property
+    def unwrapped(self) -> TouchVecEnv:
+        """These environments: random network distillation of rsl_rl asks them for `step_dt`."""
+        return self
+
+    @property
+    def step_dt(self) -> float:
+        """Duration of a control step [s]."""
+        return self.touch_env.control_step
 
     @property
     def episode_length_buf(self) -> Int[Tensor, " env"]:

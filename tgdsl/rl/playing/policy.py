@@ -1,42 +1,55 @@
 """A learned policy in a file: TorchScript, as rsl_rl's `export_policy_to_jit` writes it.
 
 Such a file takes groups of observations side by side, (env, feature), and returns actions, (env, joint). Which groups these
-are, and in which order, it does not say: they are those of the actor, in the order of the runner's `obs_groups`.
+are, and in which order, rsl_rl does not write: they are those of the actor, in the order of the runner's `obs_groups`. What
+`tgdsl train` writes has a card in it that names them, and the joints and taxels that the policy was learned with.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.sensed import GROUP
 
 ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 """Groups that a policy sees unless others are named: of these, those that there are."""
+
+
+CARD = "card.json"
+"""Name of the card in the file."""
 
 
 class PolicyError(TgdslError):
     """A policy that cannot be read, or that is of other sizes than the environments."""
 
 
-def actor_groups(groups: Mapping[str, int], named: Sequence[str] = ()) -> tuple[str, ...]:
+def actor_groups(
+    groups: Mapping[str, int], named: Sequence[str] = (), card: Mapping[str, Any] | None = None
+) -> tuple[str, ...]:
     """Return the groups of observations that a policy takes.
 
     Args:
         groups: Size of each group that there is.
-        named: The groups, in their order; default: those of `ACTOR_GROUPS` that there are.
+        named: The groups, in their order; default: those of the card, or of `ACTOR_GROUPS` that there are.
+        card: The policy's card, if it has one.
 
     Raises:
         PolicyError: If there is no such group.
     """
+    named = tuple(named) or tuple((card or {}).get("groups", ()))
     for name in named:
         if name not in groups:
             raise PolicyError(f'there is no group of observations "{name}"; {did_you_mean(name, groups, "groups")}')
@@ -66,10 +79,11 @@ class Policy(Actor):
             PolicyError: If it cannot be read, or does not fit.
         """
         self.groups, self._num_envs = tuple(groups), num_envs
-        self._module = _read(file, device)
+        self._module, card = _read(file, device)
         total = sum(groups.values())
         taken = f"{' + '.join(f'{name} ({size})' for name, size in groups.items())} = {total}"
-        wanted = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
+        first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
+        wanted = sum(card["groups"].values()) if card else first
         if wanted != total:
             raise PolicyError(f"{file}: this policy takes {wanted} numbers, not {taken}; name its groups, in its order")
         try:
@@ -90,13 +104,60 @@ class Policy(Actor):
             return self._module(torch.cat([obs[name] for name in self.groups], dim=1))
 
     def begin(self, ended: Bool[Tensor, " env"]) -> None:
-        """Forget what is remembered, if all episodes have ended: a recurrent policy of rsl_rl takes one environment alone."""
-        if hasattr(self._module, "reset") and bool(ended.all()):
+        """Forget episodes that have ended; a recurrent policy of rsl_rl, which takes one environment alone, if all have."""
+        if hasattr(self._module, "begin"):
+            self._module.begin(ended)
+        elif hasattr(self._module, "reset") and bool(ended.all()):
             self._module.reset()
 
 
-def _read(file: Path, device: torch.device | str) -> torch.jit.ScriptModule:
-    """Return the module of a TorchScript file.
+def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
+    """Return a policy that acts in some environments.
+
+    Args:
+        env: The environments.
+        file: The policy.
+        named: Groups of observations that it takes, in its order; default: see `actor_groups`.
+
+    Raises:
+        PolicyError: If it cannot be read, or is for other environments.
+    """
+    card = card_of(file)
+    if card is not None:
+        check_card(card, file, env.joint_names, env.touch.taxels_id)
+    groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
+    return Policy(file, groups, env.num_envs, env.num_actions, env.device)
+
+
+def card_of(file: Path) -> dict[str, Any] | None:
+    """Return a policy's card; None if it has none.
+
+    Raises:
+        PolicyError: If the policy cannot be read.
+    """
+    return _read(file, "cpu")[1]
+
+
+def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxels: str) -> None:
+    """See that a policy is for what the environments have.
+
+    Args:
+        card: The policy's card.
+        file: Its file, for errors.
+        joints: The joints that the environments' actions move.
+        taxels: The hash of their taxels.
+
+    Raises:
+        PolicyError: If joints are others, or taxels are, and it feels with them.
+    """
+    if list(joints) != list(card["joints"]):
+        raise PolicyError(f"{file}: this policy moves {', '.join(card['joints'])}, not {', '.join(joints)}")
+    if GROUP in card["groups"] and card["taxels"] != taxels:
+        raise PolicyError(f"{file}: this policy feels with other taxels: its taxels.csv lists them")
+
+
+def _read(file: Path, device: torch.device | str) -> tuple[torch.jit.ScriptModule, dict[str, Any] | None]:
+    """Return the module of a TorchScript file, and its card, if it has one.
 
     Raises:
         PolicyError: If it cannot be read.
@@ -105,10 +166,12 @@ def _read(file: Path, device: torch.device | str) -> torch.jit.ScriptModule:
         content = file.open("rb")
     except OSError as error:
         raise PolicyError(f"{file}: cannot read this file: {error.strerror or error}") from error
+    extra: dict[str, Any] = {CARD: ""}
     with content, warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself, which rsl_rl writes
         try:
-            return torch.jit.load(content, map_location=device).eval()
+            module = torch.jit.load(content, map_location=device, _extra_files=extra).eval()
+            return module, json.loads(extra[CARD]) if extra[CARD] else None
         except (RuntimeError, ValueError, OSError) as error:
             what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
             raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error

@@ -61,10 +61,12 @@ from torch import Tensor
 from tgdsl.errors import LowerError, SimulationError
 from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import groups, rotations, terms
+from tgdsl.rl.draws import whole
 from tgdsl.rl.spec import TaskSpec, Time, Weight
 from tgdsl.rl.task import Now, Setup, Start, Task
 from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.tensors.env_ids import may_hold
 
 Force = Annotated[float, Quantity("force", gt=0.0)]
 
@@ -209,8 +211,9 @@ class GripForce(Task[GripForceSpec]):
         self.samples += is_settled
         self.left -= 1
         is_due = self.left <= 0
-        self.count += is_due
-        self._command(is_due, now.mass, now.friction)
+        if may_hold(is_due):
+            self.count += is_due
+            self._command(is_due, now.mass, now.friction)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped or crushed."""
@@ -220,7 +223,7 @@ class GripForce(Task[GripForceSpec]):
         """Return the terms of the reward: see the top of this page."""
         spec, weights = self.spec, self.spec.rewards
         distance = (now.object.pos - self.start_pos).norm(dim=1)
-        turned = rotations.angle(rotations.product(now.object.quat, rotations.inverse(self.start_quat)))
+        turned = rotations.between(now.object.quat, self.start_quat)
         return {
             "force_near": weights.force_near * torch.exp(-(self.error / spec.force_width).square()),
             "force_far": weights.force_far * (1.0 - self.error.abs()).clamp(min=0.0),
@@ -252,9 +255,9 @@ class GripForce(Task[GripForceSpec]):
         spec, draws = self.spec, self.setup.draws
         low, high = spec.force
         least = (spec.hold_margin * self.weight * mass / friction).clamp(min=low, max=high)
-        share = draws.uniform("command", self.count, 1)[:, 0].to(least.dtype)
-        left = draws.integers("command interval", self.count, 1, self.first, self.last)[:, 0]
-        self.begin(chosen, command=least + share * (high - least), left=left, since=0.0)
+        found = draws.shares({"command": 1, "command interval": 1}, self.count, chosen)
+        share, left = found["command"][:, 0].to(least.dtype), whole(found["command interval"], self.first, self.last)
+        self.begin(chosen, command=least + share * (high - least), left=left[:, 0], since=0.0)
 
     def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
         return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance

@@ -44,6 +44,7 @@ from torch import Tensor
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Weight
+from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task
 from tgdsl.rl.tasks.placing import placed
 
@@ -75,8 +76,18 @@ class Rewards(SpecModel):
     """Power of the drives [1/J]."""
 
 
+class Distill(DistillSpec):
+    """How students are taught; the paper's numbers for this task."""
+
+    decoders: dict[str, DecoderSpec] = {"object_size": DecoderSpec(scale=20.0), "goal_distance": DecoderSpec()}
+    """Heads by the privileged number that they tell: the object's height [m], and its angle to the goal [rad]."""
+
+
 class InPalmRotateSpec(TaskSpec):
     """Turn an object on the palm about the vertical."""
+
+    distill: Distill = Distill()
+    """How students are taught by a policy that is there: `tgdsl distill`."""
 
     randomise: PlacedRandomSpec = PlacedRandomSpec()
     """What is random."""
@@ -161,7 +172,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random."""
-        qpos, pos, quat = placed(self.setup, self.spec.randomise, episode)
+        qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
         self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
         self.begin(chosen, is_reached=0.0)
         return Start({"qpos": qpos})
@@ -169,10 +180,11 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def advance(self, now: Now) -> None:
         """Add up what the object has turned, and give it another goal where it has reached one."""
         quat = now.object.quat
-        step = rotations.twist(rotations.product(quat, rotations.inverse(self.quat)), self.up)
+        since = rotations.product(quat.expand(2, -1, -1), rotations.inverse(torch.stack([self.quat, self.start_quat])))
+        step = rotations.twist(since[0], self.up)
         self.angle += step
         self.rate.copy_(step / self.setup.control_step)
-        self.tilt.copy_(rotations.swing(rotations.product(quat, rotations.inverse(self.start_quat)), self.up))
+        self.tilt.copy_(rotations.swing(since[1], self.up))
         self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
         self.reached += self.is_reached
         self.quat.copy_(quat)
@@ -201,12 +213,16 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
         goal = rotations.product(rotations.about(self.up, self._goal()), self.start_quat)
-        error = rotations.angle(rotations.product(goal, rotations.inverse(now.object.quat)))
+        error = rotations.between(goal, now.object.quat)
         return {
             "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),
         }
+
+    def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
+        """Return the object's height when it stands upright [m], and the angle from the goal to its orientation [rad]."""
+        return {"object_size": 2.0 * self.setup.half_height, "goal_distance": self.observe(now)["goal"][:, -1]}
 
     def score(self) -> Float[Tensor, " env"]:
         """Return how many quarter turns were reached."""

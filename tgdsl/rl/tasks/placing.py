@@ -5,31 +5,41 @@ Shapes: `env` environments, `nq` as in MuJoCo's model.
 
 from __future__ import annotations
 
+import mujoco
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.errors import SimulationError
+from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.rl import rotations
+from tgdsl.rl.draws import within
 from tgdsl.rl.spec import PlacedRandomSpec
 from tgdsl.rl.task import Setup
 
 
 def object_qpos(setup: Setup) -> slice:
-    """Return where a free object's position and quaternion stand in `qpos`.
+    """Return where the task's object's position and quaternion stand in `qpos`: see `free_qpos`."""
+    return free_qpos(setup.model, setup.object)
+
+
+def free_qpos(model: mujoco.MjModel, name: str) -> slice:
+    """Return where a free body's position and quaternion stand in `qpos`.
 
     Raises:
-        SimulationError: If its body does not move freely.
+        SimulationError: If there is no such body, or it does not move freely.
     """
-    body = setup.model.body(setup.object)
+    known = [model.body(i).name for i in range(1, model.nbody)]
+    if name not in known:
+        raise SimulationError(f'the scene has no body "{name}"; {did_you_mean(name, known, "bodies")}')
+    body = model.body(name)
     if int(body.dofnum[0]) != 6 or int(body.jntnum[0]) != 1:
-        raise SimulationError(f'the object\'s body "{setup.object}" has no free joint, by which it could be put elsewhere')
-    first = int(setup.model.jnt_qposadr[int(body.jntadr[0])])
+        raise SimulationError(f'the object\'s body "{name}" has no free joint, by which it could be put elsewhere')
+    first = int(model.jnt_qposadr[int(body.jntadr[0])])
     return slice(first, first + 7)
 
 
 def placed(
-    setup: Setup, spec: PlacedRandomSpec, episode: Int[Tensor, " env"]
+    setup: Setup, spec: PlacedRandomSpec, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]
 ) -> tuple[Float[Tensor, "env nq"], Float[Tensor, "env 3"], Float[Tensor, "env 4"]]:
     """Return `qpos` with the object at its start, and its position [m] and quaternion there, in the world.
 
@@ -38,15 +48,16 @@ def placed(
     Args:
         setup: What the task is made for.
         spec: What is random.
+        chosen: The environments; rows of the others mean nothing.
         episode: How often each environment was reset.
     """
     own, draws, dtype = object_qpos(setup), setup.draws, setup.dtype
     qpos = setup.qpos.repeat(setup.num_envs, 1)
-    xy = draws.uniform("placement", episode, 2, *spec.xy).to(dtype)
-    yaw = draws.uniform("yaw", episode, 1, *spec.yaw)[:, 0].to(dtype)
+    found = draws.shares({"placement": 2, "yaw": 1}, episode, chosen)
+    xy, yaw = (within(found[name], *own).to(dtype) for name, own in (("placement", spec.xy), ("yaw", spec.yaw)))
     up = torch.eye(3, dtype=dtype, device=setup.device)[2].expand(setup.num_envs, 3)
     rise = setup.half_height - setup.half_height[:1]
     pos = qpos[:, own.start : own.start + 3] + torch.cat([xy, rise[:, None]], dim=1)
-    quat = rotations.product(rotations.about(up, yaw), qpos[:, own.start + 3 : own.stop])
+    quat = rotations.product(rotations.about(up, yaw[:, 0]), qpos[:, own.start + 3 : own.stop])
     qpos[:, own] = torch.cat([pos, quat], dim=1)
     return qpos, pos, quat

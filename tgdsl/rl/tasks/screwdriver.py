@@ -28,6 +28,10 @@ So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where �
 |s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
 a drop nothing is added.
 
+The scene's handles are cylinders, a box and capsules. An ellipsoid would be as telling to the hand, but its distance takes 18
+Newton steps (`geometry.shapes`), which take minutes to compile on a GPU, and against it MuJoCo Warp's search for the deepest
+point of two convex shapes runs out of room.
+
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
 formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what
 turning forth has paid, however fast: `spin` is bounded above alone.
@@ -46,11 +50,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
-from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
+from tgdsl.fields.models import Angle, NonNegative, Positive, PositiveLength, Quantity, SpecModel
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.grasps.spec import GraspSpec
 from tgdsl.rl.spec import TaskSpec, Weight
+from tgdsl.rl.students.spec import DecoderSpec, DistillSpec, Loss
 from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.train.spec import Share, TrainSpec, Whole
 from tgdsl.runtime.simulators.watch import Watch
 
 UPRIGHT = math.radians(20.0)
@@ -80,8 +86,49 @@ class Rewards(SpecModel):
     """Power of the drives [1/J]."""
 
 
+class Train(TrainSpec):
+    """How a policy is learned; the paper's numbers for this task."""
+
+    iterations: Whole = 5000
+    """Iterations of the whole run: rollout and update."""
+    steps: Whole = 12
+    """Control steps of each environment per iteration."""
+    discount: Share = 0.99
+    """γ."""
+    entropy: NonNegative = 0.0
+    """Weight of the entropy."""
+
+
+class Distill(DistillSpec):
+    """How students are taught; the paper's numbers for this task."""
+
+    iterations: Whole = 2000
+    """Iterations of the whole run: rollout and update."""
+    steps: Whole = 12
+    """Control steps of each environment per iteration: a multiple of `gradient_length`."""
+    gradient_length: Whole = 4
+    """Control steps of a gradient step, through which recurrent networks are differentiated."""
+    learning_rate: Positive = 1e-5
+    """Learning rate."""
+    max_grad_norm: Positive | None = 0.5
+    """Norm to which the gradient of each student is scaled down; null: it is not."""
+    loss: Loss = "inverse_variance"
+    """Mean of (a_s − a_t)², or of (a_s − a_t)²/σ_t², σ_t the standard deviation of the teacher's actions."""
+    clip: Positive | None = 0.1
+    """Bound of a student's change of an action within an update, as PPO bounds values; null: there is none."""
+    decoders: dict[str, DecoderSpec] = {
+        name: DecoderSpec(weight=0.5, hidden=(512, 128)) for name in ("object_tilt", "rotation_progress")
+    }
+    """Heads by the privileged number that they tell: tilt [rad] and rate of turning [rad/s]."""
+
+
 class ScrewdriverSpec(TaskSpec):
     """Spin a screwdriver about its long axis."""
+
+    train: Train = Train()
+    """How a policy is learned: `tgdsl train`."""
+    distill: Distill = Distill()
+    """How students are taught by a policy that is there: `tgdsl distill`."""
 
     episode: Annotated[float, Quantity("time", gt=0.0)] = 20.0
     """Duration of an episode [s]."""
@@ -220,6 +267,10 @@ class Screwdriver(Task[ScrewdriverSpec]):
             "priv_obj_state": torch.cat([groups.object_state(now), now.distance], dim=1),
             "priv_obj_props": torch.stack([now.friction, now.mass], dim=1),
         }
+
+    def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
+        """Return the screwdriver's tilt [rad], and its rate of turning [rad/s]."""
+        return {"object_tilt": self.tilt, "rotation_progress": self.rate}
 
     def score(self) -> Float[Tensor, " env"]:
         """Return what was turned while upright, over the duration of a whole episode [rad/s]."""

@@ -25,6 +25,7 @@ from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
 from tgdsl.runtime.simulators.memory import bytes_per_env, refuse_beyond_memory
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.runtime.simulators.objects.choices import EnvObjects
+from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
 from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
@@ -120,6 +121,7 @@ class BatchSimulation(Simulation):
             self._arrays = {name: torch.from_numpy(self.batch.bind(name)) for name in INTEGRATED}
             self._table = StateTable(self.model, self._arrays)
             self._faults = EnvFaults(num_envs, torch.device("cpu"), on_fault)
+        self.heat = EnvHeat(touch.inputs, num_envs, torch.device("cpu"), torch.float64)
         bodies_of = touch.inputs.bodies_of
         if self._objects is None:
             self.properties = OwnFields(self.batch, model, bodies_of)
@@ -228,7 +230,8 @@ class BatchSimulation(Simulation):
         values = self._reader.read() | self._kept.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant, "object_size": self._objects.object_size}
-        return self._scene_state({name: torch.from_numpy(value).to(self._touch.device) for name, value in values.items()}, dt)
+        tensors = {name: torch.from_numpy(value) for name, value in values.items()} | self.heat.read()
+        return self._scene_state({name: value.to(self._touch.device) for name, value in tensors.items()}, dt)
 
     def _read_watch(self) -> SceneState:
         arrays = self._watch_reader.read() | self._watched_joints.read()

@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.errors import listed
+from tgdsl.errors import SimulationError, listed
 from tgdsl.formats.model import Model
 from tgdsl.module.module import TactileModule
 from tgdsl.placement.propose.limits import angles_are_misread
@@ -41,6 +41,8 @@ SPEED = 0.2
 """How fast one finger pushes the object away [m/s]."""
 STEPS = 0.3
 """Most that a servo's natural frequency turns in one physics step [rad]."""
+NUM_GROUPS = 31
+"""Groups of actuators that MuJoCo can disable, from 0; those in the next one always act."""
 _EARTH = 9.81
 _TORQUE_SCALE = 10
 
@@ -108,9 +110,8 @@ class Closing:
         for key in list(spec.keys):
             spec.delete(key)
         self._rest(spec)
-        group = _free_groups(spec)[-1]
         for servo in self.servos:
-            _add_servo(spec, servo, group)
+            _add_servo(spec, servo)
         for name in self.slack:
             _slacken(spec.joint(name))
         for name in self.held:
@@ -134,10 +135,12 @@ class Closing:
 
     def _rest(self, spec: mujoco.MjSpec) -> None:
         """Have actuators of the hand give no force, nor tendons that are sprung."""
-        group = _free_groups(spec)[0]
-        for i in self.resting:
-            spec.actuators[i].group = group
-        spec.option.disableactuator = int(spec.option.disableactuator) | 1 << group
+        if self.resting:
+            others = {int(actuator.group) for i, actuator in enumerate(spec.actuators) if i not in self.resting}
+            group = _resting_group(int(spec.option.disableactuator), others)
+            for i in self.resting:
+                spec.actuators[i].group = group
+            spec.option.disableactuator = int(spec.option.disableactuator) | 1 << group
         for tendon in spec.tendons:
             tendon.stiffness, tendon.frictionloss = [0, 0, 0], 0.0
 
@@ -279,12 +282,12 @@ def _acting(model: mujoco.MjModel, moving: Movement) -> tuple[int, ...]:
     return tuple(np.flatnonzero((moments[:, own] != 0).any(axis=1)).tolist())
 
 
-def _add_servo(spec: mujoco.MjSpec, servo: Servo, group: int) -> None:
+def _add_servo(spec: mujoco.MjSpec, servo: Servo) -> None:
     joint = spec.joint(servo.joint)
     _slacken(joint)
     joint.damping, joint.armature = [servo.damping, 0, 0], servo.armature
     actuator = spec.add_actuator(
-        name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=group
+        name=f"tgdsl/{servo.joint}", target=servo.joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, group=NUM_GROUPS
     )
     # Nothing of the scene's own <default> for actuators: neither gear nor a range.
     actuator.gear, actuator.inheritrange = [1, 0, 0, 0, 0, 0], 0.0
@@ -299,7 +302,18 @@ def _slacken(joint: mujoco.MjsJoint) -> None:
     joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
-def _free_groups(spec: mujoco.MjSpec) -> list[int]:
-    """Return groups of actuators that none is in and that are not disabled."""
-    used = {int(actuator.group) for actuator in spec.actuators}
-    return [group for group in range(31) if group not in used and not int(spec.option.disableactuator) >> group & 1]
+def _resting_group(disabled: int, others: set[int]) -> int:
+    """Return the group of actuators that rest: one that is disabled already, or that no other actuator is in.
+
+    Args:
+        disabled: MuJoCo's option `disableactuator`, a bit for each group.
+        others: Groups of the actuators that do not rest.
+
+    Raises:
+        SimulationError: If other actuators are in all groups.
+    """
+    groups = [group for group in range(NUM_GROUPS) if disabled >> group & 1 or group not in others]
+    if not groups:
+        what = f"the scene's actuators that are not the hand's are in all {NUM_GROUPS} groups"
+        raise SimulationError(f"{what}, and the hand's have to rest in one; leave one of the groups 0 to {NUM_GROUPS - 1} free")
+    return groups[0]

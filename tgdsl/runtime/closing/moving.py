@@ -26,7 +26,8 @@ class Movement:
     Attributes:
         model: The scene.
         trees: Topmost bodies of the kinematic trees that carry taxels.
-        ends: Open and closed end of each joint that closes the hand and follows no other such [rad, of slides m].
+        ends: Open and closed end of each joint that closes the hand and follows no other such, be it by way of others
+            [rad, of slides m].
         follows: By joint, those that an equality has follow another: that one, and the polynomial's coefficients.
     """
 
@@ -37,9 +38,9 @@ class Movement:
 
     @cached_property
     def closing(self) -> tuple[int, ...]:
-        """Joints that close the hand, those that follow such included."""
-        followers = (joint for joint, (leader, _) in self.follows.items() if leader in self.ends)
-        return tuple(dict.fromkeys((*self.ends, *followers)))
+        """Joints that close the hand, those that follow such included: each after the one that it follows."""
+        followers = [joint for joint in self.follows if set(leaders(joint, self.follows)) & self.ends.keys()]
+        return (*self.ends, *sorted(followers, key=lambda joint: len(leaders(joint, self.follows))))
 
     @cached_property
     def hand(self) -> frozenset[int]:
@@ -67,7 +68,7 @@ class Movement:
     def held(self) -> tuple[int, ...]:
         """Joints of the trees that neither close the hand nor follow or lead another that does, nor are in a closed loop."""
         looped = self._looped()
-        led = {leader for joint, (leader, _) in self.follows.items() if joint in self.ends}
+        led = {leader for joint in self.ends for leader in leaders(joint, self.follows)}
         coupled = {*self.ends, *self.follows, *led}
         return tuple(j for j in self.own if j not in coupled and int(self.model.jnt_bodyid[j]) not in looped)
 
@@ -116,6 +117,15 @@ class Movement:
         return found
 
 
+def leaders(joint: int, follows: Mapping[int, tuple[int, Float[np.ndarray, " 5"]]]) -> list[int]:
+    """Return the joint that one follows, the one that this follows, and so on; `follows` as in `Movement`."""
+    found: list[int] = []
+    while joint in follows and follows[joint][0] not in found:
+        joint = follows[joint][0]
+        found.append(joint)
+    return found
+
+
 def movement(scene: Model, bodies: frozenset[str]) -> Movement:
     """Return how the hand of a scene moves; nothing closes if it is not clear how.
 
@@ -131,5 +141,5 @@ def movement(scene: Model, bodies: frozenset[str]) -> Movement:
             follows[int(model.eq_obj1id[i])] = leader, model.eq_data[i, :5].copy()
     ends = {int(model.joint(name).id): pair for name, pair in closing_motion(scene).items()}
     ends = {joint: pair for joint, pair in ends.items() if int(model.body_rootid[model.jnt_bodyid[joint]]) in trees}
-    driven = {joint: pair for joint, pair in ends.items() if joint not in follows or follows[joint][0] not in ends}
+    driven = {joint: pair for joint, pair in ends.items() if not set(leaders(joint, follows)) & ends.keys()}
     return Movement(model, trees, driven, follows)

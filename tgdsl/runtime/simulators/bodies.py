@@ -24,7 +24,13 @@ class BodyFields:
     """Gathers the fields of a state that are poses and velocities of bodies."""
 
     def __init__(
-        self, inputs: Inputs, model: mujoco.MjModel, *, index: Callable[[np.ndarray], Any], cross: Callable[[Any, Any], Any]
+        self,
+        inputs: Inputs,
+        model: mujoco.MjModel,
+        *,
+        index: Callable[[np.ndarray], Any],
+        take: Callable[[Any, Any], Any],
+        cross: Callable[[Any, Any], Any],
     ):
         """Look the bodies up.
 
@@ -32,6 +38,7 @@ class BodyFields:
             inputs: What the module wants.
             model: The scene.
             index: Makes indices of the arrays that are read: NumPy's, or tensors on their device.
+            take: Returns the rows of an array (env, row, …) that such indices name.
             cross: Their cross product along the last axis.
 
         Raises:
@@ -40,19 +47,20 @@ class BodyFields:
         ids = np.array([body_id(model, name) for name in inputs.bodies], dtype=np.int64)
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
-        self._cross = cross
+        self._take, self._cross = take, cross
 
     def read(self, arrays: Mapping[str, T]) -> dict[str, T]:
         """Return the fields that the module wants, (env, body, …), each an array of its own."""
         values: dict[str, T] = {}
         if "body_pos" in self._fields:
-            values["body_pos"] = arrays["xpos"][:, self._bodies]
+            values["body_pos"] = self._take(arrays["xpos"], self._bodies)
         if "body_quat" in self._fields:
-            values["body_quat"] = arrays["xquat"][:, self._bodies]
+            values["body_quat"] = self._take(arrays["xquat"], self._bodies)
         if "body_linvel" in self._fields or "body_angvel" in self._fields:
-            spatial = arrays["cvel"][:, self._bodies]
+            spatial = self._take(arrays["cvel"], self._bodies)
             if "body_linvel" in self._fields:
-                arm = arrays["xpos"][:, self._bodies] - arrays["subtree_com"][:, self._roots]
+                pos = values["body_pos"] if "body_pos" in values else self._take(arrays["xpos"], self._bodies)
+                arm = pos - self._take(arrays["subtree_com"], self._roots)
                 values["body_linvel"] = origin_velocity(spatial, arm, self._cross)
             if "body_angvel" in self._fields:
                 values["body_angvel"] = spatial[..., :3]

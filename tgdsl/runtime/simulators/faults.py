@@ -17,13 +17,19 @@ from tgdsl.errors import SimulationError, did_you_mean, listed
 OnFault = Literal["raise", "reset", "note"]
 """What becomes of environments with a fault: "raise" has a step raise until they are reset, "reset" starts them anew, "note"
 leaves that to whoever looks at `mask`."""
-DIVERGED, BAD_CONTROL, BAD_VALUES = range(3)
+DIVERGED, BAD_CONTROL, BAD_VALUES, NO_ROOM = range(4)
 _MESSAGES = (
     "environments {envs} diverged{diverged}",
     "control is not finite in environments {envs}",
     "values given for the state of environments {envs} are not finite, or hold a quaternion of length 0, and were left out",
+    "the search for the deepest point of two convex shapes ran out of room in environments {envs}: contacts may be wrong",
 )
-_COUNTS = ("{num} diverged", "{num} had controls that are not finite", "{num} were given a state that is not finite")
+_COUNTS = (
+    "{num} diverged",
+    "{num} had controls that are not finite",
+    "{num} were given a state that is not finite",
+    "in {num} the search for the deepest point of two convex shapes ran out of room",
+)
 
 
 class EnvFaults:

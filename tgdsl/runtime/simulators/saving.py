@@ -1,7 +1,7 @@
 """The state of a simulation as tensors by name: what its environments' future follows from.
 
-Names: `state/<array of MuJoCo>`, `properties/<field of the model>`, `start/is_placed`, `start/<field of a state>`, and
-`faults/counts`.
+Names: `state/<array of MuJoCo>`, `properties/<field of the model>`, `heat/temperature` and `heat/material`,
+`start/is_placed`, `start/<field of a state>`, and `faults/counts`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,15 @@ from tgdsl.runtime.simulators.state_values import INTEGRATED
 
 
 def saved_state(
-    arrays: Mapping[str, Tensor], properties: ObjectProperties, start: StartContacts, faults: EnvFaults
+    arrays: Mapping[str, Tensor],
+    heat: Mapping[str, Tensor],
+    properties: ObjectProperties,
+    start: StartContacts,
+    faults: EnvFaults,
 ) -> dict[str, Tensor]:
     """Return copies of a simulation's state by name."""
     is_placed, values = start.placed
-    found = {f"state/{name}": arrays[name] for name in INTEGRATED}
+    found = {f"state/{name}": arrays[name] for name in INTEGRATED} | dict(heat)
     found |= {f"properties/{name}": value for name, value in properties.fields().items()}
     if is_placed is not None:
         found |= {"start/is_placed": is_placed} | {f"start/{name}": value for name, value in values.items()}
@@ -33,6 +37,7 @@ def saved_state(
 def load_state(
     saved: Mapping[str, Tensor],
     arrays: Mapping[str, Tensor],
+    heat: Mapping[str, Tensor],
     properties: ObjectProperties,
     start: StartContacts,
     faults: EnvFaults,
@@ -43,7 +48,7 @@ def load_state(
     Raises:
         SimulationError: If it is that of another simulation; nothing has changed.
     """
-    wanted = {f"state/{name}": arrays[name] for name in INTEGRATED} | {"faults/counts": faults.counts}
+    wanted = {f"state/{name}": arrays[name] for name in INTEGRATED} | {**heat, "faults/counts": faults.counts}
     wrong = [name for name, now in wanted.items() if name not in saved or saved[name].shape != now.shape]
     if wrong:
         raise SimulationError(f"this is the state of another simulation: {listed(wrong)} missing or of another shape")

@@ -12,18 +12,18 @@ from typing import Any, TypeVar, Unpack
 
 import mujoco
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
-from tgdsl.runtime.controls import control_tensor, is_unfinite, refuse_unfinite
+from tgdsl.runtime.controls import write_controls
 from tgdsl.runtime.simulators.claims import release
 from tgdsl.runtime.simulators.faults import BAD_CONTROL, EnvFaults
 from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.objects.choices import ObjectChoices, Values
+from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties
 from tgdsl.runtime.simulators.saving import load_state, saved_state
 from tgdsl.runtime.simulators.start_contacts import Contacts, StartContacts
@@ -45,6 +45,7 @@ class Simulation(ABC):
         model: The compiled scene; where objects differ between environments, that of the first.
         substeps: Physics steps per control step.
         properties: Masses and frictions of objects, which environments may have of their own.
+        heat: Temperatures and materials of objects that hold heat, in live tensors.
         drive: Is called before each physics step, and may write into `qpos`, `qvel`, `ctrl` and the other live tensors: what an
             actuator does that MuJoCo's does not. It is captured with the step on a GPU, so it must not wait for it there.
     """
@@ -52,6 +53,7 @@ class Simulation(ABC):
     model: mujoco.MjModel
     substeps: int
     properties: ObjectProperties
+    heat: EnvHeat
     drive: Callable[[], None] | None = None
     _touch: TactileModule
     _arrays: Mapping[str, Tensor]
@@ -296,8 +298,11 @@ class Simulation(ABC):
         variants: Mapping[str, Values] | None = None,
         sizes: Mapping[str, Values] | None = None,
         env_ids: EnvIds | None = None,
+        *,
+        temperatures: Mapping[str, Values] | None = None,
+        materials: Mapping[str, Values] | None = None,
     ) -> None:
-        """Say what objects are like in some environments (default: all), and start these anew.
+        """Say what objects are like in some environments (default: all), and start these anew; resets leave it as it is.
 
         At first, environment i has variant i modulo their number. MuJoCo compiles one model per distinct choice: for a cube in
         the XHand1's palm, 10 ms; on the CPU each is kept and takes 3 MB.
@@ -306,15 +311,21 @@ class Simulation(ABC):
             variants: Which variant of an object these environments have: (env,) integers, or one for all.
             sizes: Size of an object in them as MuJoCo defines it [m]: (env, size), or one for all.
             env_ids: Indices, or a boolean mask over environments.
+            temperatures: Temperature of an object when an episode begins [°C]: (env,), or one for all.
+            materials: Which of its materials an object is of: (env,) integers, or one for all.
 
         Raises:
-            SimulationError: If there is no such object, variant or environment, or a size does not fit; nothing has changed.
+            SimulationError: If there is no such object, variant, material or environment, or a value does not fit; nothing has
+                changed.
         """
-        if self._objects is None:
+        if self._objects is None and (variants or sizes or not (temperatures or materials)):
             raise SimulationError("no object of this module differs between environments")
         ids = env_indices(env_ids, self.num_envs)
-        self._objects.choose(ids, variants or {}, sizes or {})
-        self._use_objects()
+        chosen = self.heat.choose(ids, temperatures or {}, materials or {})
+        if self._objects is not None and (variants or sizes):
+            self._objects.choose(ids, variants or {}, sizes or {})
+            self._use_objects()
+        self.heat.write(ids, chosen)
         self.reset(ids)
 
     def repeated(self, body: Callable[[], T]) -> Callable[[], T]:
@@ -327,7 +338,7 @@ class Simulation(ABC):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return copies of all that the future of the environments follows from, but for the module's own `state_dict`."""
-        return saved_state(self._arrays, self.properties, self._start_contacts, self._faults)
+        return saved_state(self._arrays, self.heat.saved, self.properties, self._start_contacts, self._faults)
 
     def load_state_dict(self, saved: Mapping[str, Tensor]) -> None:
         """Go on where a simulation of the same scene, objects and number of environments was saved.
@@ -336,7 +347,7 @@ class Simulation(ABC):
             SimulationError: If it was another one; nothing has changed.
         """
         self._refuse_if_closed()
-        load_state(saved, self._arrays, self.properties, self._start_contacts, self._faults, self.forward)
+        load_state(saved, self._arrays, self.heat.saved, self.properties, self._start_contacts, self._faults, self.forward)
 
     def close(self) -> None:
         """Release the module, so that another simulation can read it; this one can no longer be used."""
@@ -376,15 +387,7 @@ class Simulation(ABC):
         self._faults.begin_step()
         if control is None:
             return
-        ctrl = self.ctrl
-        values = control_tensor(control, self.num_envs, self.model.nu)
-        is_read_here = not (values.is_cuda and ctrl.is_cuda)
-        values = values.to(ctrl.device, ctrl.dtype)
-        if is_read_here and self._faults.on_fault == "raise":
-            refuse_unfinite(values)
-        is_bad = is_unfinite(values)
-        self._faults.note(BAD_CONTROL, is_bad)
-        ctrl.copy_(torch.where(is_bad[..., None], ctrl, values))
+        self._faults.note(BAD_CONTROL, write_controls(control, self.ctrl, self._faults.on_fault == "raise"))
 
     def _scene_state(self, values: Mapping[str, Tensor], dt: float) -> SceneState:
         """Return a state of the fields that the module wants; `dt` in s."""

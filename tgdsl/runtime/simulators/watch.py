@@ -141,8 +141,8 @@ class WatchReader:
         """
         pos, quat, linvel, angvel = (_present(getattr(values, name)) for name in _BODY_FIELDS)
         joint_pos, joint_vel, joint_effort, last_action = (_present(getattr(values, name)) for name in _JOINT_FIELDS)
-        num, carried = len(self._watch.bodies), quat[:, self._carriers]
-        site_pos, site_quat = (own.to(pos.dtype).expand(len(pos), -1, -1) for own in (self._site_pos, self._site_quat))
+        num = len(self._watch.bodies)
+        site_pos, site_quat = self._sites(pos, quat) if self._watch.sites else (pos[:, :0], quat[:, :0])
         force = pos.new_zeros((len(pos), 0, 3))
         if self.has_pairs:
             assert state is not None and state.contact_netforce is not None
@@ -153,14 +153,20 @@ class WatchReader:
             body_quat=quat[:, :num],
             body_linvel=linvel[:, :num],
             body_angvel=angvel[:, :num],
-            site_pos=pos[:, self._carriers] + rotated(carried, site_pos),
-            site_quat=product(carried, site_quat),
+            site_pos=site_pos,
+            site_quat=site_quat,
             joint_pos=joint_pos,
             joint_vel=joint_vel,
             joint_effort=joint_effort,
             last_action=last_action,
             pair_force=force,
         )
+
+    def _sites(self, pos: Float[Tensor, "env body 3"], quat: Float[Tensor, "env body 4"]) -> tuple[Tensor, Tensor]:
+        """Return position [m] and orientation of each site, of those of the bodies."""
+        carried = quat[:, self._carriers]
+        site_pos, site_quat = (own.to(pos.dtype).expand(len(pos), -1, -1) for own in (self._site_pos, self._site_quat))
+        return pos[:, self._carriers] + rotated(carried, site_pos), product(carried, site_quat)
 
 
 def _inputs(watch: Watch, bodies: Sequence[str]) -> Inputs:

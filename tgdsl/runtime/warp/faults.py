@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import listed
-from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults
+from tgdsl.runtime.simulators.faults import DIVERGED, NO_ROOM, EnvFaults
 
 POOLS = {
     0: "njmax={njmax} is too small in environments {envs}: constraints are left out, {nefc} were wanted last",
@@ -23,11 +23,13 @@ POOLS = {
     6: "contacts that a contact sensor of the model's own should report are left out in environments {envs}: it matches more "
     'than {maxmatch}; raise it with <custom><numeric name="contact_sensor_maxmatch" data="…"/></custom> in the scene',
     7: "nvmax is too small in environments {envs}: degrees of freedom are left out",
-    8: "the search for the deepest point of two convex shapes ran out of room in environments {envs}: contacts may be wrong",
     11: "contacts of MuJoCo's tactile sensors are left out in environments {envs}",
 }
-"""What each bit of MuJoCo Warp's `overflow` says. Bits 9 and 10, a solver at its last iteration, are no faults: it goes on."""
+"""What each bit of MuJoCo Warp's `overflow` says of a pool. Bits 9 and 10, a solver at its last iteration, are no faults: it
+goes on."""
 _MASK = sum(1 << bit for bit in POOLS)
+_HORIZON = 1 << 8
+"""Bit of a search that ran out of room: of a size that nobody can choose, and a matter of its environment alone."""
 _LARGEST = 1e10
 """Positions and velocities above it have diverged: MuJoCo's own limit, `mjMAXVAL`."""
 
@@ -62,6 +64,7 @@ class Faults(EnvFaults):
     def update(self) -> Bool[Tensor, " env"]:
         """Count faults that are new; return which environments have any of their own."""
         self.note(DIVERGED, ~(self._peak < _LARGEST))
+        self.note(NO_ROOM, (self._arrays["overflow"] & _HORIZON) != 0)
         self._peak.zero_()
         is_faulty = super().update()
         has_pool_fault = (self._arrays["overflow"] & _MASK) != 0

@@ -42,7 +42,13 @@ class StateReader:
         """
         self._sources, self._contacts = sources, contacts
         device = sources["xpos"].device
-        self._bodies = BodyFields(inputs, model, index=lambda ids: torch.from_numpy(ids).to(device), cross=torch.linalg.cross)
+        self._bodies = BodyFields(
+            inputs,
+            model,
+            index=lambda ids: torch.from_numpy(ids).to(device),
+            take=lambda array, ids: array[:, ids],
+            cross=torch.linalg.cross,
+        )
         indices = JointColumns.of(inputs, model)
         self._joints = {
             name: ({**sources, **kept}[array], torch.from_numpy(indices.by_array[array]).to(device))

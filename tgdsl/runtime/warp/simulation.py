@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import mujoco
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -19,6 +20,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.simulators.objects.heat import EnvHeat
 from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.objects.shared_meshes import SharedMeshModels
 from tgdsl.runtime.simulators.simulation import Simulation
@@ -97,11 +99,11 @@ class WarpSimulation(Simulation):
                 model by name, such as "geom_friction".
             device: Where physics runs: "cuda", "cuda:1", or "cpu", which is slow and meant for tests.
             graph: Whether a GPU's work is captured as CUDA graphs; without them it is easier to debug and slower.
-            on_fault: What becomes of environments that diverge or are given controls that are not finite: "raise" has `step`
-                raise until they are reset; "reset" starts them anew, in the simulator and in the module, counts them in
-                `fault_counts` and warns once; "note" leaves it to whoever looks at `faults` and resets them. On a GPU "reset"
-                is done there, without waiting, and each `state` then evaluates all environments once more. Pools that are too
-                small raise either way.
+            on_fault: What becomes of environments that diverge, are given controls that are not finite, or whose search for
+                contacts of convex shapes runs out of room: "raise" has `step` raise until they are reset; "reset" starts them
+                anew, in the simulator and in the module, counts them in `fault_counts` and warns once; "note" leaves it to
+                whoever looks at `faults` and resets them. On a GPU "reset" is done there, without waiting, and each `state`
+                then evaluates all environments once more. Pools that are too small raise either way.
 
         Raises:
             ArtifactError: If an asset of the scene is missing or has changed.
@@ -135,6 +137,7 @@ class WarpSimulation(Simulation):
         self._arrays, self._faults = self._worlds.arrays, self._worlds.faults
         parameters, bodies_of = self._worlds.parameters, touch.inputs.bodies_of
         self.properties = WorldProperties(parameters, model, bodies_of, num_envs, self._stream.device)
+        self.heat = EnvHeat(touch.inputs, num_envs, self._stream.device, torch.float32)
         with self._stream.scope():
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
@@ -278,7 +281,7 @@ class WarpSimulation(Simulation):
         return self._read(dt).to(self._touch.device)
 
     def _read(self, dt: float) -> SceneState:
-        values = self._reader.read()
+        values = self._reader.read() | self.heat.read()
         if self._objects is not None:
             values |= {"variant": self._objects.variant.clone(), "object_size": self._objects.object_size.clone()}
         return self._scene_state(values, dt)

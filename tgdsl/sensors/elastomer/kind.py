@@ -46,7 +46,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.points import Points
-from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.base import Alternative, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.elastomer import anchors, operators, point_anchors
 from tgdsl.sensors.elastomer.blocks import fold_links
 from tgdsl.sensors.elastomer.point_anchors import Markers
@@ -146,6 +146,23 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
     return planes.vec(operators.apply(constants, "traction", traction))
 
 
+def alternatives(spec: ElastomerSpec) -> list[Alternative]:
+    """Return the forms of the operator; with anchors of points, fewer points or more."""
+    forms = [Alternative(f"svd, {100 * error:g} %", {"operator": "svd", "tolerance": error}) for error in (0.1, 1e-2, 1e-3)]
+    forms += [Alternative(form, {"operator": form, "tolerance": None}) for form in ("fft", "dense")]
+    if spec.anchored != "points":
+        return forms
+    exact = {"operator": "dense", "tolerance": None}
+    return forms[:-1] + [Alternative(f"{num} points", {**exact, "points": num}) for num in (250, 1000, 4000)]
+
+
 ELASTOMER = Kind(
-    ElastomerSpec, lower, forward, reference, knobs=TAXEL, gains_depth=True, indices=lambda found, _: operators.indices(found)
+    ElastomerSpec,
+    lower,
+    forward,
+    reference,
+    knobs=TAXEL,
+    gains_depth=True,
+    indices=lambda found, _: operators.indices(found),
+    alternatives=alternatives,
 )

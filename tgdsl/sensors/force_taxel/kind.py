@@ -45,6 +45,7 @@ from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import (
+    Alternative,
     Channel,
     Constants,
     ContactProbeSpec,
@@ -184,4 +185,9 @@ def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> dict[str, i
     return {"taxel": num_taxels, "first": num_taxels + 1, "row": constants["taxel"].size}
 
 
-FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE, indices=indices)
+def alternatives(spec: ForceTaxelSpec) -> list[Alternative]:
+    """Return numbers of Newton steps towards the contacts' moment."""
+    return [Alternative(f"{num} Newton steps", {"moment_iterations": num}) for num in (0, 1, 2, 4, 8, 16)]
+
+
+FORCE_TAXEL = Kind(ForceTaxelSpec, lower, forward, reference, knobs=FORCE, indices=indices, alternatives=alternatives)

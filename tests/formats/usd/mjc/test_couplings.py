@@ -14,6 +14,7 @@ from stages import (
     add_shape,
     close,
     compiled,
+    error_of,
     inertia,
     new_stage,
     stage_with_base,
@@ -92,6 +93,57 @@ def test_joints_between_the_same_bodies_stack(tmp_path, by):
     pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     pose[:2, 3] = np.array([x, 0]) + pose[:2, :2] @ [0, y]
     close(world_pose(model, "puck", [x, turn, y]), pose)
+
+
+def slid(x, y):
+    pose = np.eye(4)
+    pose[:2, 3] = x, y
+    return pose
+
+
+def turned(angle):
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return pose
+
+
+@pytest.mark.parametrize("swapped", [("turn",), ("x",), ("x", "turn"), ("y",), ("x", "turn", "y")])
+def test_stacked_joints_may_name_the_two_bodies_in_any_order(tmp_path, swapped):
+    """A joint moves its body 1 against its body 0; stage order counts from body 0 of the first, whichever body is the parent."""
+    stage = stage_with_base(tmp_path)
+    add_body(stage, "/puck")
+    for name, kind, axis in (("x", "slide", "X"), ("turn", "hinge", "Z"), ("y", "slide", "Y")):
+        bodies = ("/puck", "/base") if name in swapped else ("/base", "/puck")
+        apply(add_joint(stage, f"/{name}", kind, bodies, axis=axis), "MjcJointAPI")
+    model = compiled(stage)
+    assert model.neq == 0 and model.njnt == 3
+    values = {"x": 0.3, "turn": 0.7, "y": -0.2}
+    moves = {"x": slid(0.3, 0.0), "turn": turned(0.7), "y": slid(0.0, -0.2)}
+    is_back = "x" in swapped  # the product is then the base's pose against the puck
+    chain = [np.linalg.inv(move) if (name in swapped) != is_back else move for name, move in moves.items()]
+    pose = chain[0] @ chain[1] @ chain[2]
+    found = world_pose(model, "puck", [values[model.joint(i).name] for i in range(3)])
+    close(found, np.linalg.inv(pose) if is_back else pose)
+
+
+@pytest.mark.parametrize("name", ["newton:mimicJoint", "mjc:target"])
+def test_a_joint_that_follows_two_is_an_error(tmp_path, name):
+    stage = lead_and_follow(tmp_path)
+    follower = stage.GetPrimAtPath("/follow")
+    apply(follower, "NewtonMimicAPI", "MjcEqualityJointAPI")
+    relate(follower, name, ["/lead", "/follow"])
+    message = f"/follow: {name} has 2 targets, /lead, /follow; expected one, which it follows"
+    assert error_of(stage).endswith(message)
+
+
+@pytest.mark.parametrize("path", ["/connect", "/weld"])
+def test_constraints_that_are_disabled_start_inactive(tmp_path, path):
+    stage = schema_stage(tmp_path)
+    joints = [prim for prim in stage.Traverse() if prim.GetName() == path[1:]]
+    joints[0].GetAttribute("physics:jointEnabled").Set(False)
+    model = compiled(stage)
+    kind = mujoco.mjtEq.mjEQ_WELD if path == "/weld" else mujoco.mjtEq.mjEQ_CONNECT
+    assert [bool(active) for active in model.eq_active0] == [int(own) != int(kind) for own in model.eq_type]
 
 
 def test_the_range_of_a_ball_joint_is_its_cone(tmp_path):

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy.polynomial import Polynomial
 from scipy.spatial.transform import Rotation
 
+from tgdsl.errors import listed
 from tgdsl.formats.usd.custom_attributes import read_custom, text_of
 from tgdsl.formats.usd.joints import Joint
 from tgdsl.formats.usd.mjc.attributes import EQUALITY, WELD, Source, SourceTable, mjc, read_attributes
@@ -40,6 +41,9 @@ def add_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], n
         equality: Where constraints go.
         joints: All joints.
         names: Names of the hinges and slides of the tree by path: only these can lead or follow.
+
+    Raises:
+        RobotError: If a joint follows several.
     """
     joints = list(joints)
     references = {joint.path: joint.reference if read_custom(stage, joint.prim, "ref") else 0.0 for joint in joints}
@@ -50,7 +54,12 @@ def add_couplings(stage: Stage, equality: ET.Element, joints: Iterable[Joint], n
         if not stage.has(prim, "NewtonMimicAPI"):
             continue
         found = read_attributes(stage, prim, COEFFICIENTS, is_angular=joint.kind == "hinge")
-        leaders = [str(path) for name in ("mjc:target", "newton:mimicJoint") for path in stage.targets(prim, name)]
+        leaders = []
+        for name in ("mjc:target", "newton:mimicJoint"):
+            targets = [str(path) for path in stage.targets(prim, name)]
+            if len(targets) > 1:
+                raise stage.error(prim, f"{name} has {len(targets)} targets, {listed(targets)}; expected one, which it follows")
+            leaders += targets
         if joint.path not in names or not leaders or leaders[0] not in names:
             stage.drop("couplings were dropped of which the leader or the follower is no revolute or prismatic joint", prim)
             continue

@@ -1,0 +1,86 @@
+"""Conduction on a CPU: a step of `exact` beside the paper's, for `heat.py conduction`."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tgdsl.quantities.patches.cells import cosines, eigenvalues
+from tgdsl.sensors.temperature_grid import diffusion
+
+LINKS = 5
+
+
+class Mirrored(torch.nn.Module):
+    """The paper's step: cells are mirrored along each axis, and modes divided by 1 + αΔt|k|²."""
+
+    def __init__(self, rate: Tensor, num: int):
+        """Take αΔt/L² of each row, and the number of cells along each axis."""
+        super().__init__()
+        place = torch.fft.fftfreq(2 * num, 1.0 / (2 * num)).abs(), torch.fft.rfftfreq(2 * num, 1.0 / (2 * num))
+        k = torch.pi * place[0], torch.pi * place[0], torch.pi * place[1]
+        square = k[0][:, None, None] ** 2 + k[1][:, None] ** 2 + k[2] ** 2
+        self.divisor, self.num = 1.0 + rate[:, None, None, None] * square, num
+
+    def forward(self, cells: Tensor) -> Tensor:
+        """Return the cells after a step."""
+        for axis in (2, 3, 4):
+            cells = torch.cat([cells, cells.flip(axis)], dim=axis)
+        modes_of = torch.fft.rfftn(cells, dim=(2, 3, 4)) / self.divisor
+        made = torch.fft.irfftn(modes_of, s=cells.shape[2:], dim=(2, 3, 4))
+        return made[:, :, : self.num, : self.num, : self.num]
+
+
+class Exact(torch.nn.Module):
+    """A step of `exact`, with its operators of each Δt."""
+
+    def __init__(self, rate: Tensor, num: int):
+        """Take αΔt/L² of each row, and the number of cells along each axis."""
+        super().__init__()
+        count = torch.full((len(rate),), num).numpy()
+        self.rate = rate[None] * num**2
+        self.cosines, self.values = (torch.from_numpy(part).float() for part in (cosines(count), eigenvalues(count)))
+
+    def forward(self, cells: Tensor) -> Tensor:
+        """Return the cells after a step."""
+        return cells + diffusion.spread(cells, [diffusion.along_axis(self.rate, self.cosines, self.values)] * 3)
+
+
+def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str, Any]]:
+    """Time both in turn, at some numbers of cells, print what is found, and return it."""
+    torch.set_num_threads(1)
+    rows = []
+    print("cells  mirrored [ms]  exact, eager [ms]  compiled [ms]  ratio, eager  compiled")
+    for num in numbers:
+        rate = 0.02 * (1.0 + torch.arange(LINKS))
+        cells = torch.randn(num_envs, LINKS, num, num, num, generator=torch.Generator().manual_seed(0))
+        mirrored, exact = Mirrored(rate, num), Exact(rate, num)
+        check(mirrored, exact, cells[:4], rate)
+        torch.compiler.reset()
+        calls = {"mirrored": mirrored, "eager": exact, "compiled": torch.compile(exact, fullgraph=True)}
+        took: dict[str, list[float]] = {name: [] for name in calls}
+        with torch.no_grad():
+            for i in range(repeats + 2):
+                for name, call in calls.items():
+                    start = time.perf_counter()
+                    call(cells)
+                    took[name] += [1e3 * (time.perf_counter() - start)] if i >= 2 else []
+        ms = {name: statistics.median(own) for name, own in took.items()}
+        rows.append({"cells": num, "envs": num_envs, **ms, "ratio": ms["mirrored"] / ms["compiled"]})
+        ratios = (ms["mirrored"] / ms[name] for name in ("eager", "compiled"))
+        print(f"{num}³  " + "  ".join(f"{value:.3f}" for value in ms.values()) + "  " + "  ".join(f"{r:.1f}" for r in ratios))
+    return rows
+
+
+def check(mirrored: Mirrored, exact: Exact, cells: Tensor, rate: Tensor) -> None:
+    """See that the mirrored step is that of `semi_implicit`, and that `exact` keeps the sum."""
+    num = mirrored.num
+    table = torch.from_numpy(cosines(torch.full((LINKS,), num).numpy())).float()
+    expected = cells + diffusion.semi_implicit(cells, rate[:, None].expand(-1, 3), (table, table, table))
+    torch.testing.assert_close(mirrored(cells), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(exact(cells).sum(dim=(2, 3, 4)), cells.sum(dim=(2, 3, 4)), rtol=0, atol=1e-4 * num**1.5)

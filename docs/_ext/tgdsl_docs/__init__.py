@@ -1,0 +1,1 @@
+"""A Sphinx extension that generates reference pages from the package: see `extension`."""

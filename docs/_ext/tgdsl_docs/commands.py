@@ -1,0 +1,47 @@
+"""The help of every command."""
+
+from __future__ import annotations
+
+import io
+import os
+import typing
+from collections.abc import Iterator
+from contextlib import redirect_stdout, suppress
+from typing import Any
+
+import tyro
+
+from tgdsl.commands.cli import Command
+
+WIDTH = "110"
+"""Columns of the help."""
+
+
+def command_pages() -> dict[str, str]:
+    """Return one page with the help of all commands."""
+    os.environ["COLUMNS"] = WIDTH
+    text = ["# Command line\n\nWhat `tgdsl COMMAND --help` prints.\n"]
+    for words in command_names(Command):
+        text.append(f"\n## `tgdsl {' '.join(words)}`\n\n```text\n{help_of(words).strip()}\n```\n")
+    return {"commands.md": "".join(text)}
+
+
+def command_names(union: Any, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield the words of every command, those with commands of their own before these."""
+    for choice in typing.get_args(union):
+        (name,) = (part.name for part in choice.__metadata__ if hasattr(part, "prefix_name"))
+        words = (*before, name)
+        yield words
+        for hint in typing.get_type_hints(choice.__origin__, include_extras=True).values():
+            for part in (hint, *typing.get_args(hint)):
+                parts = typing.get_args(part)
+                if parts and all(any(hasattr(m, "prefix_name") for m in getattr(p, "__metadata__", ())) for p in parts):
+                    yield from command_names(part, words)
+
+
+def help_of(words: tuple[str, ...]) -> str:
+    """Return the help of a command."""
+    printed = io.StringIO()
+    with redirect_stdout(printed), suppress(SystemExit):
+        tyro.cli(Command, prog="tgdsl", args=[*words, "--help"])  # type: ignore[arg-type]
+    return "\n".join(line.rstrip() for line in printed.getvalue().splitlines())

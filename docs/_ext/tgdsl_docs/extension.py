@@ -1,0 +1,57 @@
+"""Pages generated at build time from what they describe: kinds, grammar, command line, API, and the README as a page.
+
+They are written to `generated/` of the source folder, before Sphinx looks for pages.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+
+from tgdsl_docs.api import api_pages, escape_docstring, is_external
+from tgdsl_docs.commands import command_pages
+from tgdsl_docs.grammar import grammar_pages
+from tgdsl_docs.kinds import kind_pages
+from tgdsl_docs.links import overview, resolve_links
+from tgdsl_docs.sections import add_others
+
+FOLDER = "generated"
+"""Folder of the generated pages, within the source folder."""
+
+
+def generate(app: Sphinx) -> None:
+    """Write all generated pages."""
+    source = Path(app.srcdir)
+    pages: dict[str, str] = {}
+    for made in (kind_pages(source), grammar_pages(), command_pages(), api_pages(), {"overview.md": overview()}):
+        pages |= made
+    shutil.rmtree(source / FOLDER, ignore_errors=True)
+    for name, text in pages.items():
+        path = source / FOLDER / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def read(app: Sphinx, docname: str, content: list[str]) -> None:
+    """Complete the index, and turn links that leave the documentation into downloads."""
+    if docname == "index":
+        content[0] = add_others(content[0], Path(app.srcdir))
+    if docname not in {"index"} and not str(app.env.doc2path(docname)).endswith(".rst"):
+        content[0] = resolve_links(content[0], Path(app.srcdir) / f"{docname}.md", Path(app.srcdir))
+
+
+def missing(app: Sphinx, env: Any, node: Any, content: Any) -> Any:
+    """Show names of other packages, and types that have no page, as text; there is no network to look them up."""
+    return content if is_external(node.get("reftype", ""), node.get("reftarget", "")) else None
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the hooks."""
+    app.connect("builder-inited", generate)
+    app.connect("source-read", read)
+    app.connect("missing-reference", missing)
+    app.connect("autodoc-process-docstring", escape_docstring)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

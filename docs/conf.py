@@ -1,0 +1,31 @@
+"""Sphinx's configuration: `make docs` builds these pages, and those that `_ext/tgdsl_docs` generates, into build/docs."""
+
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+
+project = "tgdsl"
+author = "The tgdsl authors"
+version = release = installed_version("tgdsl")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "tgdsl_docs.extension"]
+exclude_patterns = ["_ext"]
+default_role = "code"
+nitpicky = True
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_class_signature = "mixed"
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 100
+
+html_theme = "furo"
+html_title = f"tgdsl {version}"
+html_copy_source = False
+copybutton_prompt_text = "$ "

@@ -1,0 +1,134 @@
+"""`tgdsl distill`, as users run it."""
+
+import csv
+import json
+
+import pytest
+import torch
+from felt_tasks import felt_task
+from written_teachers import teacher
+
+from tgdsl.rl.load import load_task
+from tgdsl.rl.train.checkpoint import read_checkpoint
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+SMALL = [
+    *("--set", "distill.steps=4"),
+    *("--set", "distill.networks.encoder.hidden=[8]"),
+    *("--set", "distill.networks.hidden=[8]"),
+]
+TEACHER = ("--teacher", "teacher.pt", "--device", "cpu")
+FIVE = ("--types", "depth,bool,none", "--placements", "ends,all", "--seeds", "1")
+
+
+def rows_of(file):
+    with file.open(newline="") as opened:
+        return list(csv.DictReader(opened))
+
+
+@pytest.fixture
+def base(tmp_path):
+    task = felt_task(tmp_path)
+    sensors = (tmp_path / "sensors.yaml").read_text()
+    dense = "      high:\n        tip: {method: grid, rows: 3, columns: 3, direction: [0, 0, 1], radius: 8 mm}\n"
+    dense += "        finger: {method: grid, rows: 3, columns: 2, direction: [0, -1, 0], radius: 8 mm}\nobjects:"
+    (tmp_path / "sensors.yaml").write_text(sensors.replace("objects:", dense, 1))
+    teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
+    return tmp_path
+
+
+@pytest.fixture
+def fails(here, base):
+    """Run a command that a user got wrong; return what it says. Nothing is written."""
+
+    def run(*arguments):
+        before = sorted(base.rglob("*"))
+        code, out, message = here(base, "distill", "task.yaml", *arguments)
+        assert (code, out) == (2, ""), message
+        assert sorted(base.rglob("*")) == before
+        return message
+
+    return run
+
+
+def test_from_a_teacher_to_students_that_play(base, here):
+    """A student's file evaluates in environments of its own task; a run goes on with the same students."""
+    arguments = ("--envs", "10", "--iterations", "2", "--episodes", "2", *SMALL)
+    code, out, error = here(base, "distill", "task.yaml", *TEACHER, *FIVE, *arguments)
+    assert code == 0, error
+    assert out.splitlines()[0] == "5 students in 3 stacks, 10 environments: out/task_students/default"
+    folder = base / "out" / "task_students"
+    rows = rows_of(folder / "table.csv")
+    kinds = [("depth", "ends"), ("bool", "ends"), ("depth", "all"), ("bool", "all"), ("none", "")]
+    assert [(row["type"], row["placement"]) for row in rows] == kinds
+    assert all(row["samples"] == "16" and row["episodes"] == "2" for row in rows)
+    evaluation = json.loads((folder / "default" / "evaluation.json").read_text())
+    assert float(rows[0]["score"]) == evaluation["depth-ends-clean-s0"]["score"]
+    card = json.loads((folder / "default" / "students" / "depth-all-clean-s0.json").read_text())
+    assert card["groups"] == {"proprio": 6, "tactile_sensors": 10, "goal": 7} and card["teacher"] == "teacher.pt"
+    student = ("--policy", "out/task_students/default/students/depth-all-clean-s0.pt", "--episodes", "2", "--envs", "2")
+    code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=all")
+    assert code == 0 and out.startswith("score "), error
+    code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=tip")
+    assert code == 2 and "this policy feels with other taxels" in error
+    code, out, error = here(base, "distill", "task.yaml", "--resume", str(folder), "--device", "cpu", "--iterations", "3")
+    assert code == 0, error
+    assert read_checkpoint(folder / "default" / "checkpoint.pt")["iteration"] == 3
+    curve = rows_of(folder / "default" / "curve.csv")
+    assert [row["iteration"] for row in curve] == ["1", "2", "3"] and float(curve[2]["Loss/none-s0"]) > 0
+    code, out, error = here(base, "distill", "task.yaml", "--resume", str(folder), "--types", "none", "--device", "cpu")
+    assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
+
+
+def test_resolutions_are_simulations_one_after_the_other(base, here):
+    """One that the layout lacks is named before the first begins."""
+    arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "low,med", *SMALL)
+    assert code == 2 and '"med"' in error and not (base / "out").exists()
+    code, _, error = here(
+        base, "distill", "task.yaml", *arguments, "--resolutions", "low,high", "--episodes", "2", *SMALL, "-o", "both"
+    )
+    assert code == 0, error
+    rows = rows_of(base / "both" / "table.csv")
+    assert [(row["resolution"], row["seeds"]) for row in rows] == [("low", "2"), ("high", "2")]
+    cards = [
+        json.loads((base / "both" / name / "students" / "depth-ends-clean-s1.json").read_text()) for name in ("low", "high")
+    ]
+    assert [card["groups"]["tactile_sensors"] for card in cards] == [4, 9]
+
+
+def test_mistakes_are_named_before_anything_runs(base, fails):
+    assert "11 environments do not divide among 5 students: expected 10 or 15" in fails(*TEACHER, *FIVE, "--envs", "11")
+    assert 'has no sensor of kind "elastomer", expected one' in fails(*TEACHER, "--types", "elastomer")
+    assert 'there is no type "forces"; did you mean "force"' in fails(*TEACHER, "--types", "forces")
+    assert "types bool, bool: one is named twice" in fails(*TEACHER, "--types", "bool,bool")
+    assert "--teacher FILE is missing" in fails("--device", "cpu")
+    assert "--seeds 0: expected at least 1" in fails(*TEACHER, "--seeds", "0")
+    assert "there is no run of tgdsl distill to go on with" in fails("--resume", "nothing")
+    assert 'no link matches "palm"' in fails(*TEACHER, "--types", "bool", "--placements", "palm", "--resolutions", "low,high")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "screwdriver"}, 'this teacher was learned in the task "screwdriver", not "in_palm_rotate"'),
+        ({"action": {"mode": "absolute"}}, 'this teacher was learned with other actions: {"mode": "absolute"}, here {'),
+        ({"physics": {"timestep": 0.005, "substeps": 4}}, "learned with other control steps [s]: 0.02, here 0.025"),
+    ],
+)
+def test_a_teacher_of_something_else_is_refused(base, fails, change, message):
+    task = load_task(base / "task.yaml")
+    spec = task.spec.model_dump(mode="json") | change
+    teacher(base / "teacher.pt", task, ["priv_proprio"], spec=spec)
+    assert message in fails(*TEACHER, *FIVE, "--envs", "10")
+
+
+def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
+    task = load_task(base / "task.yaml")
+    teacher(base / "teacher.pt", task, ["proprio", "tactile_sensors"], taxels="0")
+    assert "teacher.pt: this policy feels with other taxels" in fails(*TEACHER, *FIVE, "--envs", "10")
+    torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), base / "teacher.pt")
+    assert "this policy has no card that says how it was learned" in fails(*TEACHER, *FIVE, "--envs", "10")
+    teacher(base / "teacher.pt", task, ["proprio"])
+    divided = ("--set", "distill.loss=inverse_variance")
+    assert "its card has no deviations of actions, `std`" in fails(*TEACHER, *FIVE, "--envs", "10", *divided)

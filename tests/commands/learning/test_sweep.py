@@ -1,0 +1,136 @@
+"""`tgdsl sweep`: what is run, what a mistake is called, and what becomes of a run whose worker is killed."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from small_runs import SMALL
+from small_tasks import small_task
+
+from tgdsl.commands.learning import sweep
+from tgdsl.commands.learning.sweep import run_trial
+from tgdsl.commands.learning.sweep_document import Trial, load_sweep
+from tgdsl.errors import SpecError
+from tgdsl.rl.train.checkpoint import read_checkpoint
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "tasks" / "sweep.yaml"
+FIXED = {"--device": "cpu", "--envs": 4, "--iterations": 3, "--episodes": 4, **SMALL}
+KILLED = """
+import os, signal
+from pathlib import Path
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+
+class Killed(InPalmRotate):
+    def advance(self, now):
+        mark = Path(__file__).parent / "kill"
+        if mark.exists() and list(mark.parent.glob("runs/*/checkpoint.pt")):
+            mark.unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        super().advance(now)
+"""
+
+
+def write(folder, matrix, fixed=FIXED, task="task.yaml", **rest):
+    text = json.dumps({"tgdsl": 1, "task": task, "fixed": fixed, "matrix": matrix, **rest})
+    (folder / "sweep.yaml").write_text(text)
+    return folder / "sweep.yaml"
+
+
+@pytest.fixture
+def base(tmp_path):
+    small_task(tmp_path)
+    return tmp_path
+
+
+def test_every_combination_is_a_trial(base):
+    fixed = {"--minutes": 0.5, "randomise": {}, "train.rnd": "off"}
+    spec, trials = load_sweep(write(base, {"action.scale": [0.1, "10 deg"], "--seed": [1, 2, 3]}, fixed, gpus=0.5))
+    assert (spec.gpus, spec.cpus, spec.retries) == (0.5, 1.0, 3)
+    assert [trial.name for trial in trials] == [
+        f"action.scale={scale},seed={seed}" for scale in ("0.1", "10_deg") for seed in (1, 2, 3)
+    ]
+    common = ("train", str(base / "task.yaml"), "--minutes", "0.5", "--set", "randomise={}", "--set", "train.rnd=off")
+    assert trials[4].words == (*common, "--set", "action.scale=10 deg", "--seed", "2")
+    assert trials[4].settings == {"action.scale": "10 deg", "--seed": 2}
+
+
+def test_the_example():
+    spec, trials = load_sweep(EXAMPLE)
+    assert len(trials) == 9 and (spec.cpus, spec.gpus) == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "place", "what"),
+    [
+        (
+            {"matrix": {"--sede": [1]}},
+            "1:",
+            r"`tgdsl train` has no option --sede that a sweep may set; did you mean \"--seed\"",
+        ),
+        ({"matrix": {"--out": ["a", "b"]}}, "1:", "has no option --out that a sweep may set"),
+        ({"matrix": {"--seed": [1, 1]}}, "1:", "two combinations are the same"),
+        ({"matrix": {"--seed": []}}, "1:", "at least 1"),
+        ({"matrix": {}}, "1:", "at least 1"),
+        ({"matrix": {"action.scael": [0.1]}}, "action", "scael"),
+        ({"matrix": {"action.scale": [0.1, -1]}}, "action", "scale"),
+        ({"matrix": {"--seed": [1]}, "gpus": -1}, "1:", "gpus"),
+        ({"matrix": {"--seed": [1]}, "command": "trian"}, "1:", "command"),
+    ],
+)
+def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
+    with pytest.raises(SpecError, match=what) as found:
+        load_sweep(write(base, **changes))
+    assert place in str(found.value)
+
+
+def test_a_run_that_goes_on_learns_the_minutes_that_are_left(base):
+    """9 of 30 seconds were learned: 0.35 minutes are left; and none where more was."""
+    words = ["train", "task.yaml", "--minutes", "0.5", "--seed", "1"]
+    assert sweep._left(words, base) == words
+    for seconds, left in (("9.0", 0.35), ("42", 0.0)):
+        with (base / "curve.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([["iteration", "seconds"], ["1", "3.0"], ["2", seconds]])
+        found = sweep._left(words, base)
+        assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(left)
+
+
+def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base, monkeypatch):
+    for name in ("argv", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, getattr(sys, name))
+    trial = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml"))
+    assert run_trial(trial, str(base / "x")) == "failed: exit code 2"
+    assert "nowhere.yaml" in (base / "x" / "log.txt").read_text()
+    assert not (base / "x" / "ended.json").exists()
+    (base / "x" / "ended.json").write_text("{}")
+    assert run_trial(trial, str(base / "x")) == "was made before"
+
+
+@pytest.mark.slow
+def test_two_workers_one_of_them_killed(base, here):
+    """Both runs end whole: the one that was killed went on from its checkpoint, and its curve has each iteration once."""
+    (base / "killed.py").write_text(KILLED)
+    (base / "kill").write_text("")
+    task = (base / "task.yaml").read_text().replace("task: in_palm_rotate", "task: killed.py:Killed")
+    (base / "task.yaml").write_text(task)
+    document = write(base, {"--seed": [1, 2]}, {**FIXED, "train.checkpoint": 1e-9})
+    code, out, error = here(base, "sweep", document.name, "--out", "runs")
+    assert code == 0, error
+    assert not (base / "kill").exists()
+    lines = [line for line in out.splitlines() if "(raylet)" not in line]  # Ray tells of the worker that died
+    assert [line.partition(" ")[0] for line in lines] == ["1/2", "2/2"]
+    assert all("quarter turns" in line for line in lines)
+    starts = []
+    for seed in (1, 2):
+        folder = base / "runs" / f"seed={seed}"
+        assert read_checkpoint(folder / "checkpoint.pt")["iteration"] == 3
+        with (folder / "curve.csv").open() as file:
+            assert [row["iteration"] for row in csv.DictReader(file)] == ["1", "2", "3"]
+        assert json.loads((folder / "ended.json").read_text()) == {"--seed": seed}
+        starts.append(len(json.loads((folder / "run.json").read_text())["starts"]))
+    assert sorted(starts) == [1, 2]
+    code, out, error = here(base, "sweep", document.name, "--out", "runs")
+    assert code == 0 and out.count("was made before") == 2, error
+    code, out, error = here(base, "sweep", write(base, {"--seed": [1]}, cpus=1e6).name)
+    assert code == 2 and "a run takes 1e+06 processors and 0 GPUs, no machine has more than" in error

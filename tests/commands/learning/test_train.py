@@ -1,0 +1,119 @@
+"""`tgdsl train` and `tgdsl evaluate`, as users run them."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from small_runs import ARGUMENTS
+from small_tasks import small_task
+
+from tgdsl.rl.train.checkpoint import read_checkpoint
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+ON = ["--device", "cpu", "--envs", "4"]
+
+
+@pytest.fixture
+def base(tmp_path):
+    small_task(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def fails(here, base):
+    """Run a command that a user got wrong; return what it says. Nothing is written."""
+
+    def run(*arguments):
+        before = sorted(base.rglob("*"))
+        code, out, message = here(base, *arguments)
+        assert (code, out) == (2, ""), message
+        assert sorted(base.rglob("*")) == before
+        return message
+
+    return run
+
+
+def test_from_nothing_to_a_policy_that_plays(base, here):
+    code, out, error = here(
+        base, "train", "task.yaml", *ON, "--iterations", "2", "--episodes", "6", *ARGUMENTS, "--set", "rewards.spin=3"
+    )
+    assert code == 0, error
+    lines = out.splitlines()
+    assert lines[0].startswith("1/2: ") and lines[0].endswith(" left")
+    assert lines[-2] == "policy: out/task/policy.pt, after 2 iterations, 32 steps, 0.0 min"
+    assert lines[-1].startswith("score ") and "quarter turns" in lines[-1] and "in 6 episodes" in lines[-1]
+    folder = base / "out" / "task"
+    names = {file.name.split(".out.")[0] for file in folder.iterdir()}
+    assert names == {"checkpoint.pt", "curve.csv", "evaluation.json", "events", "policy.json", "policy.pt", "run.json"} | {
+        "sensors.yaml",
+        "task.yaml",
+        "taxels.csv",
+    }
+    card = json.loads((folder / "policy.json").read_text())
+    assert card["score"] == json.loads((folder / "evaluation.json").read_text())
+    assert card["spec"]["rewards"]["spin"] == 3 and card["command"].startswith("tgdsl train task.yaml --device cpu")
+    code, out, error = here(
+        base,
+        "evaluate",
+        "task.yaml",
+        "--policy",
+        "out/task/policy.pt",
+        "--episodes",
+        "6",
+        "--envs",
+        "4",
+        "-o",
+        "e.json",
+        "--set",
+        "rewards.spin=3",
+    )
+    assert code == 0, error
+    assert out.splitlines() == [lines[-1]]
+    assert json.loads((base / "e.json").read_text()) == card["score"]
+    code, out, error = here(
+        base, "play", "task.yaml", "--policy", "out/task/policy.pt", "--envs", "1", "--seconds", "0.1", "--no-video"
+    )
+    assert code == 0, error
+    with np.load(base / "out" / "played.npz") as found:
+        assert found["action"].shape == (4, 1, 2)
+
+
+def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
+    start = ["train", "task.yaml", "--device", "cpu", "--episodes", "0"]
+    assert here(base, *start, "--envs", "3", "--seed", "7", "--iterations", "1", "-o", "a run", *ARGUMENTS)[0] == 0
+    code, out, error = here(base, *start, "--iterations", "3", "--resume", "a run", "--set", "rewards.spin=3")
+    assert code == 0, error
+    assert out.splitlines()[0] == "changed since the run began: rewards.spin: 2.0, now 3.0"
+    assert "after 3 iterations, 36 steps" in out
+    starts = json.loads((base / "a run" / "run.json").read_text())["starts"]
+    assert [(each["seed"], each["envs"], len(each["overrides"])) for each in starts] == [(7, 3, 8), (7, 3, 9)]
+    assert here(base, *start, "--iterations", "4", "--resume", "a run", "-o", "other", *ARGUMENTS)[0] == 0
+    assert json.loads((base / "other" / "run.json").read_text())["starts"][0]["spec"]["rewards"]["spin"] == 2.0
+    assert [read_checkpoint(base / name / "checkpoint.pt")["iteration"] for name in ("a run", "other")] == [3, 4]
+
+
+def test_time_is_a_limit_too(base, here):
+    code, out, error = here(base, "train", "task.yaml", *ON, "--minutes", "0.0", "--episodes", "0", *ARGUMENTS)
+    assert code == 0, error
+    assert "after 1 iterations" in out
+
+
+def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rsl_rl.utils", None)
+    monkeypatch.delitem(sys.modules, "tgdsl.rl.train.learner")
+    assert 'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" (' in fails("train", "task.yaml", *ON)
+
+
+def test_mistakes(fails, here, base):
+    assert "there is no run to go on with: run.json is missing or empty" in fails("train", "task.yaml", *ON, "--resume", "none")
+    assert "train.clip: -1 is out of range, expected more than 0" in fails("train", "task.yaml", *ON, "--set", "train.clip=-1")
+    assert "--envs 0: expected at least 1" in fails("train", "task.yaml", "--device", "cpu", "--envs", "0")
+    assert "--minutes nan: expected at least 0" in fails("train", "task.yaml", *ON, "--minutes", "nan")
+    assert "task.yaml is a file, expected a folder" in fails("train", "task.yaml", *ON, "--out", "task.yaml/run")
+    assert 'no group of observations "gaol"' in fails("train", "task.yaml", *ON, "--set", "train.actor=[gaol]")
+    assert "none.pt: cannot read this file: No such file or directory" in fails("evaluate", "task.yaml", "--policy", "none.pt")
+    assert "--episodes 0 --envs 256: expected at least 1 of each" in fails("evaluate", "task.yaml", "--episodes", "0")
+    assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
+    said = fails("train", "task.yaml", *ON)
+    assert said == "tgdsl: out/task: this folder holds a run; go on with --resume out/task, or give another --out\n"

@@ -1,0 +1,39 @@
+"""`tgdsl bench`: what it prints and writes, and how it ends when a user got it wrong."""
+
+import pytest
+from benched_pads import bench_document
+
+FEW = ("--steps", "6", "--state-envs", "2", "--repeats", "1", "--envs", "2,3", "--sensors", "depth")
+
+
+def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
+    bench_document(tmp_path)
+    code, said, error = here(tmp_path, "bench", "pad.yaml", "-o", "out", "--save-states", "states.npz", *FEW)
+    assert code == 0, error
+    assert "depth (contact_depth), against as written, float64\n" in said
+    assert "ms, 2 envs" in said and "ms, 3 envs" in said and "now" in said and "●" in said
+    assert said.endswith("out/bench.csv\nout/bench.json\nout/bench.html\n")
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"bench.csv", "bench.json", "bench.html"}
+    code, said, error = here(tmp_path, "bench", "pad.yaml", "-o", "again", "--states", "states.npz", *FEW)
+    assert code == 0, error
+    assert said.startswith("pad.yaml: states.npz: 6 steps in 2 environments\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--envs", "many"), "tgdsl: --envs many: expected whole numbers joined by commas, such as 1024,4096\n"),
+        (("--envs", "0"), "tgdsl: environments that are timed: found 0, expected numbers of at least 1\n"),
+        (("--sensors", "dept"), 'tgdsl: there is no sensor "dept"; did you mean "depth"?\n'),
+        (("--device", "abacus"), None),
+        (("--states", "none.npz"), "tgdsl: none.npz: expected an .npz file of states: "),
+        (("--out", "pad.yaml"), "tgdsl: pad.yaml/bench.csv: "),
+        (("--set", "sensors.depth.gate=open"), None),
+    ],
+)
+def test_mistakes_end_in_their_message(here, tmp_path, arguments, message):
+    bench_document(tmp_path)
+    code, said, error = here(tmp_path, "bench", "pad.yaml", *arguments)
+    assert code == 2 and not said
+    assert message is None or error.startswith(message)
+    assert not (tmp_path / "report").exists()

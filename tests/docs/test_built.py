@@ -1,0 +1,74 @@
+"""The built pages: no warnings, and in a browser pictures are drawn and the search finds a page. Nothing is fetched."""
+
+import os
+import shutil
+import subprocess
+import sys
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from tgdsl.sensors import KINDS
+
+pytestmark = pytest.mark.slow
+REPOSITORY = Path(__file__).parents[2]
+SOURCES = ("tgdsl", "robots", "examples", "benchmarks", "tests", "README.md")
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Build from a tree of links, so that generated pages do not come into the repository."""
+    folder = tmp_path_factory.mktemp("docs")
+    for name in SOURCES:
+        (folder / name).symlink_to(REPOSITORY / name)
+    shutil.copytree(REPOSITORY / "docs", folder / "docs", ignore=shutil.ignore_patterns("generated", "__pycache__"))
+    command = [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet", "docs", "build"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return folder / "build"
+
+
+class Silent(SimpleHTTPRequestHandler):
+    def log_message(self, format, *args):
+        pass
+
+
+@pytest.fixture
+def page(built):
+    """Yield a page of headless Chromium and the address of the built docs."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed (apt-get install chromium): the built docs are not opened in a browser")
+    from playwright.sync_api import sync_playwright
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=str(built)))
+    Thread(target=server.serve_forever, daemon=True).start()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser.new_page(), f"http://127.0.0.1:{server.server_port}"
+        browser.close()
+    server.shutdown()
+    server.server_close()
+
+
+def test_there_is_a_page_for_each_kind_and_each_page(built):
+    for kind in KINDS:
+        assert (built / "generated" / "kinds" / f"{kind.name}.html").is_file()
+    for source in (*(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "docs" / "add").glob("*.md")):
+        assert (built / source.relative_to(REPOSITORY / "docs").with_suffix(".html")).is_file()
+
+
+def test_pictures_are_drawn_and_the_search_finds_a_page(page):
+    tab, address = page
+    for name in ("index", "performance", "hands", "learn"):
+        tab.goto(f"{address}/{name}.html", wait_until="load")
+        widths = tab.eval_on_selector_all(".content img, article img", "images => images.map(image => image.naturalWidth)")
+        assert widths and min(widths) > 0, name
+    tab.goto(f"{address}/search.html?q=permittivity")
+    tab.wait_for_selector("#search-results li a", timeout=30_000)
+    found = tab.eval_on_selector_all("#search-results li a", "links => links.map(link => link.getAttribute('href'))")
+    assert any("add/kind" in href for href in found), found

@@ -1,0 +1,47 @@
+"""What pages say of the code is what the code says: tables of kinds and extras, the rooms, the example's kinds."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from tgdsl.sensors import KINDS
+
+REPOSITORY = Path(__file__).parents[2]
+FIRST_CELL = re.compile(r"^\| `(\w+)` \|", re.M)
+
+
+def text_of(name: str) -> str:
+    return (REPOSITORY / name).read_text(encoding="utf-8")
+
+
+def test_the_readme_lists_every_kind_with_its_file():
+    section = text_of("README.md").split("## Sensor kinds")[1].split("\n\nEach file")[0]
+    rows = [line for line in section.splitlines() if line.startswith("| `")]
+    assert [FIRST_CELL.match(row)[1] for row in rows] and {FIRST_CELL.match(row)[1] for row in rows} == {k.name for k in KINDS}
+    for row in rows:
+        name, (file,) = FIRST_CELL.match(row)[1], re.findall(r"\]\((tgdsl/[^)]+)\)", row)
+        (kind,) = (kind for kind in KINDS if kind.name == name)
+        assert file in {kind.forward.__module__.replace(".", "/") + ".py", kind.spec.__module__.replace(".", "/") + ".py"}
+
+
+def test_the_comparison_has_every_kind():
+    table = text_of("docs/which-kind.md").split("\n\n")[1]
+    kinds = [line.split("|")[2].strip(" `") for line in table.splitlines()[2:]]
+    assert sorted(kinds) == sorted(kind.name for kind in KINDS)
+
+
+def test_the_page_of_installing_has_every_extra():
+    extras = tomllib.loads(text_of("pyproject.toml"))["project"]["optional-dependencies"]
+    assert set(FIRST_CELL.findall(text_of("docs/install.md"))) == extras.keys()
+
+
+def test_every_kind_has_its_example():
+    found = set(re.findall(r"\bkind: (\w+)", text_of("examples/every_sensor.yaml")))
+    assert found == {kind.name for kind in KINDS}
+
+
+@pytest.mark.parametrize("room", sorted(p.name for p in (REPOSITORY / "tgdsl").iterdir() if (p / "__init__.py").is_file()))
+def test_the_architecture_names_every_room(room):
+    assert re.search(rf"\b{room}\b", text_of("docs/architecture.md"))

@@ -1,0 +1,82 @@
+"""Random arguments of a step of temperatures: links of which some touch objects of one temperature."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.quantities.patches.cells import tables
+from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects
+from tgdsl.quantities.patches.topology import Topology
+from tgdsl.sensors.temperature_grid.rows import rows_of
+
+NUM_ENVS = 7
+
+
+class Case(NamedTuple):
+    """What there is: cells of each link along each axis, objects, terms, and whether materials differ by environment."""
+
+    count: tuple[tuple[int, int, int], ...]
+    num_objects: int
+    terms: tuple[str, ...] = ("emissivity", "convection", "source")
+    is_per_env: bool = False
+    dt: float = 0.01
+
+
+CASES = {
+    "one object": Case(((2, 2, 2),) * 5, 1),
+    "five objects": Case(((2, 2, 2),) * 5, 5),
+    "other cells": Case(((2, 3, 2), (1, 2, 4), (3, 1, 1)), 2, is_per_env=True),
+    "contact alone": Case(((2, 2, 2),) * 3, 3, ()),
+    "one cell": Case(((1, 1, 1),), 1, ("convection",)),
+    "long steps": Case(((2, 2, 3), (2, 2, 2)), 3, dt=10.0),
+}
+
+
+def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
+    """Return the arguments of `step`."""
+    case, rng = CASES[name], np.random.default_rng(3)
+    num, objects = len(case.count), case.num_objects
+
+    def tensor(value) -> Tensor:
+        return torch.as_tensor(np.asarray(value, dtype=np.float32)).to(dtype)
+
+    low = rng.uniform(-0.02, 0.0, (num, 3))
+    boxes = np.stack([low, low + rng.uniform(0.01, 0.03, (num, 3))], axis=1)
+    count, size = np.array(case.count), boxes[:, 1] - boxes[:, 0]
+    found = tables(count, size)
+    there = found["outer"] > 0
+    constants = {key: tensor(value) for key, value in found.items()} | {
+        "conductivity": tensor(rng.uniform(0.2, 50.0, num)),
+        "volumetric_heat": tensor(rng.uniform(1e6, 3e6, num)),
+        "ambient": tensor(22.0),
+        "compliance": tensor(rng.uniform(1e-8, 1e-6, num)),
+        "curvature": tensor(rng.uniform(50, 200, num)),
+        "contact_conductance": tensor(2000.0),
+    }
+    given = {"emissivity": rng.uniform(0.3, 0.9, num), "convection": 20.0, "source": rng.uniform(0, 0.5, there.shape) * there}
+    constants |= {key: tensor(given[key]) for key in case.terms}
+    where = Topology(num, ((1, 1, 1),) * objects, (), tuple(range(objects)), (-1,) * objects, tuple(np.ndindex(num, objects)))
+    of = (num_envs if case.is_per_env else 1, objects)
+    volume = rng.uniform(1e-6, 1e-5, of)
+    volume[:, -1] = np.inf if objects > 1 else volume[:, -1]  # the last of some keeps its temperature
+    made_of = HeatOfObjects(
+        tensor(rng.uniform(10, 60, of)), tensor(np.ones(of)), tensor(rng.uniform(0.2, 100.0, of)),
+        tensor(rng.uniform(1e6, 3e6, of)), tensor(rng.uniform(0.3, 0.9, of)), tensor(rng.uniform(1e-9, 1e-7, of)),
+        tensor(volume), tensor(rng.uniform(1e-4, 1e-3, of)), tensor(rng.uniform(0, 100, of)),
+        *[tuple(tensor(part) for part in rng.uniform(0.01, 0.02, (3, objects))) for _ in range(2)],
+    )  # fmt: skip
+    shape = (num_envs, num, objects)
+    touches = rng.random(shape) < 0.6
+    normal = rng.normal(size=(3, *shape))
+    normal /= np.linalg.norm(normal, axis=0)
+    pos = [rng.uniform(-0.025, 0.035, shape) for _ in range(3)]
+    patches = ContactPatch(
+        tensor(rng.uniform(0.1, 10.0, shape) * touches), tensor(rng.uniform(0, 1e-4, shape) * touches * (rng.random(shape) < 0.5)),
+        tuple(tensor(part * touches) for part in pos), tuple(tensor(part * touches) for part in normal), None, None,
+        made_of, where, {key: torch.from_numpy(part) for key, part in where.tables().items()}, {}, tensor(boxes),
+    )  # fmt: skip
+    cells = tensor(rng.uniform(-20.0, 60.0, (num_envs, *there.shape)) * there)
+    nodes = tensor(rng.uniform(-20.0, 60.0, (num_envs, objects)))
+    return cells, nodes, rows_of(constants, patches, False), patches, constants, tensor(case.dt)

@@ -1,0 +1,200 @@
+"""A whole bench of a small scene: errors by other means, the same twice, and what is refused."""
+
+import csv
+import json
+import warnings
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from benched_pads import bench_document
+
+import tgdsl
+from tgdsl.errors import StateError, TgdslError
+from tgdsl.module.accuracy.states import narrowed, readings_of
+from tgdsl.report.bench.bench import Bench, bench
+from tgdsl.report.bench.files import write_files
+from tgdsl.report.bench.recording import load_recording, record, save_recording, varied
+from tgdsl.report.bench.results import rows_of
+from tgdsl.report.bench.sensors import Options
+
+FEW = Options(num_envs=(3, 5), repeats=2)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("bench")
+
+
+@pytest.fixture(scope="module")
+def work(folder):
+    return Bench(bench_document(folder), kept=folder / "states.npz", state_envs=4, steps=9, options=FEW)
+
+
+@pytest.fixture(scope="module")
+def report(work):
+    return bench(work)
+
+
+def test_every_subject_has_three_points_and_one_is_taken_now(report):
+    assert [subject.name for subject in report.subjects] == ["depth", "skin", "physics"]
+    for subject in report.subjects:
+        assert len(subject.points) >= 3 and sum(point.is_own for point in subject.points) == 1
+        assert any(point.is_on_front for point in subject.points)
+
+
+def test_errors_are_those_of_the_readings_themselves(report, folder):
+    """Float32 against float64, and bfloat16, from the recorded states with nothing but compiled modules."""
+    recording = load_recording(folder / "states.npz")
+    change = {"observations": "{}"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        touches = [
+            tgdsl.compile(folder / "pad.yaml", sensors=["depth"], overrides=change, dtype=d) for d in ("float64", "float32")
+        ]
+    exact, found = (torch.stack([t(s)["depth"].double() for s in recording.for_module(t.inputs)])[:, ::2] for t in touches)
+    whole = torch.stack([touches[0](s)["depth"] for s in recording.for_module(touches[0].inputs)])
+    scale = (whole - whole.flatten().median()).abs().max()
+    assert scale > 1e-3
+    depth = report.subjects[0]
+    assert depth.own.chosen.largest.value == pytest.approx(float((found - exact).abs().max() / scale), rel=1e-9)
+    rounded = next(point for point in depth.points if point.precision == "bfloat16 readings")
+    assert rounded.chosen.largest.value == pytest.approx(
+        float((found.bfloat16().double() - exact).abs().max() / scale), rel=1e-9
+    )
+    assert 1e-9 < depth.own.chosen.largest.value < 1e-5 < rounded.chosen.largest.value < 2**-8
+
+
+def test_the_definition_agrees_with_what_errors_are_measured_against(report):
+    assert float(report.subjects[0].check.split(" by ")[1].split()[0]) < 1e-12
+
+
+def test_a_truncated_operator_is_off_by_about_its_tolerance(report):
+    """Relative errors of the matrix bound those of what it makes, up to the loads' conditioning."""
+    errors = {point.label: point.chosen.rms.value for point in report.subjects[1].points if point.precision == "float32"}
+    assert errors["svd, 10 %"] < 1.0 and errors["svd, 1 %"] < 0.1
+    assert errors["dense"] < 1e-5
+    assert report.subjects[1].reference.startswith("dense")
+
+
+def test_times_are_of_all_numbers_of_environments(report):
+    assert all(set(point.times) == {3, 5} for subject in report.subjects[:2] for point in subject.points)
+
+
+def test_counted_bytes_are_those_of_the_tensors(report):
+    """16 taxels of a number each: 64 bytes in float32; a sensor without imperfections and shear remembers nothing."""
+    own, exact, short = report.subjects[0].points
+    assert (own.cost.output, exact.cost.output, short.cost.output) == (64, 128, 32)
+    assert own.cost.state == report.subjects[1].own.cost.state == 0
+
+
+def test_two_runs_agree_on_errors_exactly(work, report):
+    again = bench(Bench(work.document, states=work.kept, sensors=("skin",), options=FEW))
+    for one, two in zip(report.subjects[1].points, again.subjects[0].points, strict=True):
+        assert (one.chosen, one.verified, one.cost) == (two.chosen, two.verified, two.cost)
+    physics = bench(Bench(work.document, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
+    assert [p.chosen for p in physics.points] == [p.chosen for p in report.subjects[2].points]
+
+
+class Links(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.tags, self.links, self.open = [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("href", "src", "xlink:href") and value]
+
+    def handle_decl(self, decl):
+        self.links += [decl] if "http" in decl else []
+
+
+def test_the_page_opens_offline(report, folder):
+    files = {file.suffix: file for file in write_files(report, folder / "out")}
+    text = files[".html"].read_text()
+    parser = Links()
+    parser.feed(text)
+    assert parser.tags.count("svg") == parser.tags.count("table") == 3
+    assert not {"script", "link", "img", "iframe"} & set(parser.tags) and "http" not in text and "@import" not in text
+    assert all(link.startswith("#") for link in parser.links)
+    identifiers = [part.split('"')[0] for part in text.split(' id="')[1:] if part.startswith("m")]
+    assert len(identifiers) == len(set(identifiers))
+    with files[".csv"].open() as file:
+        rows = list(csv.DictReader(file))
+    told = json.loads(files[".json"].read_text())
+    assert len(rows) == len(told["rows"]) == len(list(rows_of(report)))
+    assert float(rows[0]["rms"]) == told["rows"][0]["rms"] == report.subjects[0].points[0].chosen.rms.value
+
+
+def test_states_that_are_saved_are_those_that_are_loaded(folder, work, report, tmp_path):
+    touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
+    recording = record(touch, 3, steps=6)
+    save_recording(recording, tmp_path / "s.npz")
+    again = load_recording(tmp_path / "s.npz")
+    for one, two in zip(recording.for_module(touch.inputs), again.for_module(touch.inputs), strict=True):
+        for name in touch.inputs.fields:
+            assert name == "dt" or torch.equal(getattr(one, name), getattr(two, name))
+        assert one.dt == two.dt
+
+
+def test_narrowed_states_read_the_same(work):
+    """A module of one sensor reads of states of all what the module of all reads."""
+    everything = tgdsl.compile(work.document, overrides={"observations": "{}"}, dtype="float64")
+    recording = record(everything, 2, steps=6)
+    alone = tgdsl.compile(work.document, overrides={"observations": "{}"}, sensors=["depth"], dtype="float64")
+    np.testing.assert_array_equal(
+        readings_of(alone, recording.for_module(alone.inputs), "depth"), readings_of(everything, recording.states, "depth")
+    )
+
+
+def test_controls_differ_between_environments_and_stay_within_their_range():
+    controls, ranges = np.linspace([0.0, 0.0], [1.0, 5.0], 7), np.array([[0.0, 1.0], [0.0, 0.0]])
+    found = varied(controls, ranges, 6, seed=0)
+    np.testing.assert_array_equal(found[:, 0], controls)
+    assert found[..., 0].min() >= 0 and found[..., 0].max() <= 1
+    assert len(np.unique(found[-1], axis=0)) == 6
+    np.testing.assert_array_equal(found, varied(controls, ranges, 6, seed=0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"sensors": ("dept",)}, 'there is no sensor "dept"; did you mean "depth"?'),
+        ({"options": Options(num_envs=(0,))}, "environments that are timed: found 0, expected numbers of at least 1"),
+        ({"options": Options(num_envs=())}, "environments that are timed: found none, expected numbers of at least 1"),
+        ({"options": Options(repeats=0)}, "timed calls: found 0, expected at least 1"),
+        ({"state_envs": 1}, "1 environments of 90 steps: expected at least 2, and at least one step"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(work, wrong, message):
+    with pytest.raises(TgdslError) as caught:
+        bench(Bench(work.document, **wrong))
+    assert str(caught.value) == message
+
+
+def test_states_of_another_document_are_refused(work, report, tmp_path):
+    arrays = dict(np.load(work.kept))
+    arrays["names:body"] = np.array(["pad", "ball"])
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(StateError, match="these states lack the body cube: they are of another document"):
+        bench(Bench(work.document, states=tmp_path / "other.npz", sensors=("depth",), options=FEW))
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip", None])
+def test_files_that_are_no_states_are_refused(tmp_path, content):
+    path = tmp_path / "s.npz"
+    if content is None:
+        np.savez(path, ctrl=np.zeros(3))
+    else:
+        path.write_bytes(content)
+    with pytest.raises(StateError, match=r"s\.npz: expected "):
+        load_recording(path)
+
+
+def test_a_field_that_is_missing_is_told(work, report):
+    touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
+    recording = load_recording(work.kept)
+    recording.states[0].contact_found = None
+    with pytest.raises(StateError, match="these states have no contact_found"):
+        narrowed(recording.states[0], recording.names, touch.inputs)

@@ -1,0 +1,103 @@
+"""Several things felt in one simulation: each is what an environment of its own would feel."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from felt_tasks import felt_task
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.sensed import Felt
+from tgdsl.rl.students.encoders import Images
+from tgdsl.rl.students.keys import grid_of
+
+TYPES = ("bool", "agg_bool", "depth", "agg_force", "force", "force_torque")
+FEELS = [Felt(type_, placement, noise) for type_ in TYPES for placement in ("ends", "all") for noise in ("clean", "noisy")]
+ENVS = 3
+
+
+@pytest.fixture
+def make(tmp_path: Path):
+    made, task = [], felt_task(tmp_path)
+
+    def environment(feels=None, **overrides):
+        made.append(TouchEnv(task, ENVS, seed=3, threads=1, overrides=overrides, feels=feels))
+        return made[-1]
+
+    yield environment
+    for env in made:
+        env.close()
+
+
+def rolled(env, steps=12):
+    """Return the observations of steps in which the finger swings onto the object, over an episode's end."""
+    seen = [env.reset(3)]
+    for step in range(steps):
+        seen.append(env.step(torch.full((ENVS, 2), 1.0 if step % 8 < 4 else -1.0)).obs)
+    return {name: torch.stack([obs[name] for obs in seen]) for name in seen[0]}
+
+
+def test_each_group_is_what_an_environment_of_its_own_feels(make):
+    """Clean to the bit, with noise where no other links draw numbers before its own; and what else is seen is the same."""
+    env = make(FEELS)
+    found = rolled(env)
+    assert "tactile_sensors" not in found
+    for felt in FEELS:
+        if felt.noise == "clean":
+            alone = rolled(make(touch=felt.type, placement=felt.placement))
+            assert torch.equal(found[felt.group], alone["tactile_sensors"]), felt
+            assert (alone["tactile_sensors"] != 0).any(), felt
+            assert torch.equal(found["priv_obj_state"], alone["priv_obj_state"])
+    noisy, clean = (found[Felt("depth", "all", noise).group] for noise in ("noisy", "clean"))
+    assert not torch.equal(noisy, clean)
+    alone = rolled(make(touch="depth", placement="all", noise="noisy"))
+    assert torch.equal(noisy, alone["tactile_sensors"])
+
+
+def test_one_sensor_serves_all_types_placements_and_noises(make):
+    env = make(FEELS)
+    assert {sensor.name for sensor in env.touch.plan.sensors if sensor.name in ("bit", "deep", "soft")} == {
+        "bit",
+        "deep",
+        "soft",
+    }
+    assert env.felt[Felt("depth", "ends", "clean").group].layout.num_taxels == 4
+    assert env.felt[Felt("depth", "all", "clean").group].layout.num_taxels == 10
+    assert env.groups[Felt("force_torque", "ends", "noisy").group] == 24
+    assert env.groups[Felt("agg_force", "ends", "noisy").group] == 3
+
+
+def test_nothing_is_felt(make):
+    assert not [name for name in make([]).groups if name.startswith("tactile")]
+
+
+def test_mistakes_are_named(make, tmp_path):
+    with pytest.raises(SpecError, match='has no sensor of kind "elastomer", expected one'):
+        make([Felt("elastomer", "all", "clean")])
+    with pytest.raises(SpecError, match='no link matches "palm"'):
+        make([Felt("depth", "palm", "clean")])
+    both = [Felt("depth", "all", noise) for noise in ("noisy", "other")]
+    with pytest.raises(SpecError, match="noise noisy, other of one sensor in one simulation, expected one beside clean"):
+        make(both)
+    assert load_task(tmp_path / "task.yaml").spec.touch == "bool"
+
+
+@pytest.mark.parametrize("placement", ["ends", "all"])
+def test_images_of_a_network_are_those_of_the_module(make, placement):
+    """Made of the group's numbers; a link whose grid is smaller fills a corner."""
+    felt = Felt("force_torque", placement, "clean")
+    env, alone = make([felt, Felt("force_torque", "all", "clean")]), make(touch="force_torque", placement=placement)
+    grid = grid_of(env.felt[felt.group].layout, env.groups[felt.group], felt)
+    action = torch.full((ENVS, 2), 0.3)
+    for _ in range(3):
+        obs, own = env.step(action).obs, alone.step(action).obs
+    assert torch.equal(obs[felt.group], own["tactile_sensors"]) and (obs[felt.group] != 0).any()
+    found = Images(grid).images(obs[felt.group])
+    images, masks = alone.images()
+    assert found.shape[1] == len(images) == (1 if placement == "ends" else 2)
+    for link, (image, mask) in enumerate(zip(images.values(), masks.values(), strict=True)):
+        rows, columns = mask.shape
+        assert torch.equal(found[:, link, :, :rows, :columns], image)
+        assert float(Images(grid).masks()[link].sum()) == float(mask.sum())

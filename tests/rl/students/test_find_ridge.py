@@ -1,0 +1,43 @@
+"""A small real distillation: a finger that stops on a ridge by what it feels, and one that feels nothing."""
+
+from pathlib import Path
+
+import pytest
+from written_teachers import FindRidge, teacher
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.playing.evaluation import evaluate_each
+from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.learner import Distiller
+from tgdsl.rl.students.teacher import Teacher
+
+TASK = Path(__file__).parents[3] / "examples" / "tasks" / "find_ridge.yaml"
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+CHOSEN = {
+    "noise": "clean",
+    "distill.steps": 8,
+    "distill.learning_rate": 1e-3,
+    "distill.networks.encoder.hidden": "[64]",
+    "distill.networks.hidden": "[128, 64]",
+}
+EPISODES = 32
+
+
+@pytest.mark.slow
+def test_students_that_feel_reach_their_teacher_and_others_do_not(tmp_path):
+    """The teacher always finds the ridge; a student that feels nothing does at chance, which is 1 in 12, at best."""
+    loaded = load_task(TASK, CHOSEN)
+    own = Teacher(teacher(tmp_path / "teacher.pt", loaded, ["command", "tactile_sensors"], FindRidge()), loaded)
+    own.check_taxels()
+    keys = student_keys(["depth", "bool", "none"], ["tips"], ["clean"], 1)
+    env = TouchEnv(loaded, 96, threads=1, feels=feels(keys, own.felt))
+    try:
+        distiller = Distiller(env, loaded, own.bound(env), keys, 0)
+        for _ in range(40):
+            distiller.iterate()
+        found = evaluate_each(env, distiller.acting(), len(keys), EPISODES)
+    finally:
+        env.close()
+    scores = {key.kind[0]: each.score for key, each in zip(distiller.keys, found, strict=True)}
+    assert scores["depth"] >= 0.95 and scores["bool"] >= 0.6 and scores["none"] <= 0.3

@@ -1,0 +1,172 @@
+"""A stack of students is as many separate trainings: against plain modules, torch's own cells, Adam and clipping."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from tgdsl.rl.students import losses
+from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
+from tgdsl.rl.students.stack import Stack, made
+from tgdsl.rl.students.student import Architecture, deployed, forgotten
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
+SEEDS = (3, 4, 9)
+GRID = Grid(2, 7, (2, 3, 2), (0, 1, 2, 3, -1, -1, 4, 5, -1, -1, 6, -1))
+ENCODERS = {
+    "mlp": Encoder("mlp", (8, 8), 5),
+    "lstm": Encoder("lstm", (6,), 5),
+    "cnn": Encoder("cnn", (4, 6), 5, 3, GRID),
+    "convrnn": Encoder("convrnn", (4,), 5, 3, GRID),
+}
+FORWARD = 1e-5  # float32: sums in another order
+UPDATES = 1e-9  # float64, 20 steps of Adam
+CLIP = 20.0  # of gradients whose norms are 10 to 50
+
+
+def architecture(kind, heads=((6,), (4,))):
+    return Architecture(((3, Encoder("mlp", (8,), 4)), (14, ENCODERS[kind])), (16, 8), 2, heads)
+
+
+def inputs(stack, rows, dtype, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn((stack.size, rows, 17), generator=generator, dtype=dtype)
+    return x, torch.randn((stack.size, rows, stack.memory), generator=generator, dtype=dtype)
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_a_stack_returns_what_single_students_do(kind):
+    stack = Stack(architecture(kind), SEEDS, 1e-3, 1.0)
+    x, memory = inputs(stack, 11, torch.float32)
+    stack.look(3.0 * x + 1.0)
+    found = stack(x, memory)
+    for i in range(len(SEEDS)):
+        expected = stack.student(i)(x[i], memory[i])
+        for one, two in zip(found, expected, strict=True):
+            torch.testing.assert_close(one[i], two, rtol=FORWARD, atol=FORWARD)
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_updates_are_those_of_separate_trainings(kind):
+    """Twenty of them, of two steps each through memory, with gradients that are clipped for some and not for others."""
+    stack = Stack(architecture(kind), SEEDS, 1e-2, CLIP, dtype=torch.float64)
+    plain = [made(stack.architecture, seed).double() for seed in SEEDS]
+    optimisers = [torch.optim.Adam(student.parameters(), lr=1e-2) for student in plain]
+    size = torch.tensor([1.0, 0.01, 5.0], dtype=torch.float64)
+    scales, weights = torch.tensor([20.0, 1.0]).double(), torch.tensor([1.0, 0.5]).double()
+    std, norms = torch.tensor([0.5, 2.0]).double(), []
+    for update in range(20):
+        x, memory = inputs(stack, 8, torch.float64, seed=update)
+        generator = torch.Generator().manual_seed(1000 + update)
+        label, before, target = (torch.randn((3, 8, 2), generator=generator).double() for _ in range(3))
+        label = label * size[:, None, None]
+        held, total = memory, 0.0
+        for _ in range(2):
+            action, told, held = stack(x, held)
+            total = total + losses.behaviour(action, label, before, std, 0.1) + losses.decoded(told, target, scales, weights)
+        stack.descend(total)
+        for i, (student, optimiser) in enumerate(zip(plain, optimisers, strict=True)):
+            own, loss = memory[i], torch.zeros(())
+            for _ in range(2):
+                action, told, own = student(x[i], own)
+                bounded = before[i] + (action - before[i]).clamp(-0.1, 0.1)
+                worst = torch.stack([(action - label[i]) ** 2, (bounded - label[i]) ** 2]).amax(dim=0)
+                loss = loss + (worst / std**2).mean()
+                loss = loss + nn.functional.mse_loss(told[:, 0], 20.0 * target[i, :, 0])
+                loss = loss + 0.5 * nn.functional.mse_loss(told[:, 1], target[i, :, 1])
+            optimiser.zero_grad()
+            loss.backward()
+            norms.append(float(nn.utils.clip_grad_norm_(student.parameters(), CLIP)))
+            optimiser.step()
+    assert min(norms) < CLIP < max(norms)
+    for i, student in enumerate(plain):
+        for name, value in student.named_parameters():
+            torch.testing.assert_close(stack.parameters[name][i], value, rtol=UPDATES, atol=UPDATES)
+
+
+def test_a_student_does_not_depend_on_who_is_beside_it():
+    """Its first weights follow from its seed; torch's own generator is where it was."""
+    before = torch.get_rng_state()
+    alone, beside = (Stack(architecture("mlp"), seeds, 1e-3, 1.0) for seeds in ((9,), SEEDS))
+    assert torch.equal(torch.get_rng_state(), before)
+    for name, value in alone.parameters.items():
+        assert torch.equal(value[0], beside.parameters[name][2])
+        assert name.endswith("norm.weight") or not torch.equal(beside.parameters[name][0], beside.parameters[name][1])
+
+
+def test_means_and_variances_are_those_of_all_rows_of_a_student():
+    stack = Stack(architecture("mlp"), SEEDS, 1e-3, 1.0, dtype=torch.float64)
+    parts = [inputs(stack, rows, torch.float64, rows)[0] * torch.tensor([1.0, 2.0, 3.0])[:, None, None] for rows in (5, 40, 7)]
+    for part in parts:
+        stack.look(part)
+    seen = torch.cat(parts, dim=1)
+    torch.testing.assert_close(stack.buffers["mean"], seen.mean(dim=1), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(stack.buffers["var"], seen.var(dim=1, correction=0), rtol=1e-12, atol=1e-12)
+
+
+def test_an_lstm_is_torchs_own():
+    own = Lstm(14, ENCODERS["lstm"])
+    cell = nn.LSTMCell(14, 6)
+    for name, layer in (("ih", own.of_input), ("hh", own.of_memory)):
+        cell.load_state_dict(cell.state_dict() | {f"weight_{name}": layer.weight, f"bias_{name}": layer.bias})
+    x, h, c = torch.randn(5, 14), torch.randn(5, 6), torch.randn(5, 6)
+    made_h, made_c = cell(x, (h, c))
+    embedding, memory = own(x, torch.cat([h, c], dim=1))
+    torch.testing.assert_close(memory, torch.cat([made_h, made_c], dim=1))
+    torch.testing.assert_close(embedding, own.projection(made_h))
+
+
+@pytest.mark.parametrize("kind", ["cnn", "convrnn"])
+def test_cells_without_a_taxel_tell_nothing_and_each_taxel_does(kind):
+    """Also after steps: what is remembered of a cell without a taxel stays 0."""
+    own = network(14, ENCODERS[kind])
+    x = torch.randn(1, 14, requires_grad=True)
+    embedding, memory = own(x, torch.zeros(1, own.memory))
+    (gradient,) = torch.autograd.grad(embedding.sum(), x, retain_graph=True)
+    assert (gradient != 0).all()
+    images, mask = own.images(x), own.masks()
+    assert images.shape == (1, 2, 2, 3, 2) and float(mask.sum()) == 7
+    assert torch.equal(images[0, 1, :, 1, 1], torch.zeros(2)) and torch.equal(images[0, 1, :, 0, 1], x[0, [5, 12]])
+    if kind == "convrnn":
+        held = memory.unflatten(1, (2, 2, 4, 3, 2))
+        assert (held * (1 - mask) == 0).all() and (held != 0).any()
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_a_deployed_student_acts_as_it_did_and_forgets_episode_by_episode(kind, tmp_path):
+    stack = Stack(architecture(kind), SEEDS, 1e-3, 1.0)
+    torch.jit.save(deployed(stack.student(1)), tmp_path / "policy.pt")
+    policy = torch.jit.load(tmp_path / "policy.pt")
+    assert not [name for name, _ in policy.named_parameters() if "decoder" in name]
+    memory = torch.zeros((3, 4, stack.memory))
+    with torch.no_grad():
+        for step in range(4):
+            x = torch.randn((3, 4, 17))
+            action, _, memory = stack(x, memory)
+            torch.testing.assert_close(policy(x[1]), action[1], rtol=FORWARD, atol=FORWARD)
+            ended = torch.tensor([False, step == 1, False, True])
+            memory = forgotten(memory, ended)
+            if stack.memory:
+                policy.begin(ended)
+
+
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_what_is_saved_goes_on_to_the_bit(kind):
+    one, other = (Stack(architecture(kind), seeds, 1e-2, 0.1) for seeds in (SEEDS, (1, 2, 5)))
+
+    def teach(stack, updates):
+        for update in updates:
+            x, memory = inputs(stack, 6, torch.float32, seed=update)
+            stack.look(x)
+            made = stack(x, memory)
+            stack.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+
+    teach(one, range(3))
+    other.load_state_dict(copy.deepcopy(one.state_dict()))
+    for stack in (one, other):
+        teach(stack, range(3, 6))
+    for name, value in one.parameters.items():
+        assert torch.equal(value, other.parameters[name])
+    with pytest.raises(RuntimeError, match="its networks are"):
+        other.load_state_dict(Stack(architecture("mlp", ()), SEEDS, 1e-2, 0.1).state_dict())

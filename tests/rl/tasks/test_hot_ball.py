@@ -1,0 +1,398 @@
+"""Finding the hot ball: rewards and ends against the reference, what latches, what pays, starts, and what is forgotten."""
+
+import itertools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from task_records import Recorder, assert_reference
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.tasks.hot_ball import Rewards, reference
+from tgdsl.schema.load import load
+
+FOLDER = Path(__file__).parents[3] / "examples" / "tasks"
+DOCUMENT = FOLDER / "hot_ball.yaml"
+NUM_BALLS = 8
+CALM = {"randomise.drive": {}, "randomise.xy": 0.0}
+"""Ideal drives, and balls where the keyframe has them, but for which is where."""
+
+
+def bin_of_balls(num_envs=4, **overrides):
+    named = {name.replace("__", "."): value for name, value in overrides.items()}
+    return TouchEnv(DOCUMENT, num_envs, threads=1, overrides=CALM | named)
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Four bins, ideal drives."""
+    made = bin_of_balls()
+    yield made
+    made.close()
+
+
+def still(env):
+    return torch.zeros(env.num_envs, env.num_actions)
+
+
+def random_actions(env, num, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def balls(env):
+    """Return the positions of all balls (env, ball, 3) [m], the hot one's first."""
+    return env.sim.qpos[:, env.task.places][:, :, :3]
+
+
+def put_on(env, ball, press=0.03, ahead=0.0):
+    """Put the middle fingertip on top of a ball of each environment, or ahead of it [m], and have the base press."""
+    for i, which in enumerate(ball):
+        data = mujoco.MjData(env.sim.model)
+        data.qpos[:] = env.sim.qpos[i].numpy()
+        mujoco.mj_kinematics(env.sim.model, data)
+        top = balls(env)[i, which].numpy() + [ahead, 0.0, 0.04]
+        env.sim.qpos[i, :3] += torch.from_numpy(top - data.site("right_hand_mid_tip").xpos)
+    env.sim.qvel.zero_()
+    env.actuation.target[:, :3] = env.sim.qpos[:, :3] - torch.tensor([0.0, 0.0, press])
+
+
+def settled(env, seed=0, steps=30):
+    """Begin, and let the balls roll to the wall."""
+    env.reset(seed)
+    for _ in range(steps):
+        env.step(still(env))
+
+
+def hottest(env):
+    """Return what the hottest cell reads [°C]."""
+    return env.now.readings["heat"].amax(dim=(1, 2))
+
+
+def cells(env):
+    return {"heat": env.now.readings["heat"][:, :, 0].double().numpy().copy()}
+
+
+ODD = {
+    "episode": "0.6 s", "margin": 0.95, "min_force": "0.5 N", "near_width": "5 cm", "lost_height": "12 cm",
+    "ambient": "21 degC", "target": "60 degC", "action.slide_scale": "1 mm", "action.scale": 0.01,
+    "rewards": {name: 1.5 * value for name, value in Rewards()},
+}  # fmt: skip
+"""Other numbers than the document's, and enough going on that every term is seen."""
+
+
+def test_rewards_ends_and_scores_equal_the_reference():
+    """Balls of the lower row get lower than 12 cm, and so are lost; those of the upper one stay, and are pressed on."""
+    env = bin_of_balls(8, **ODD)
+    recorder = Recorder(env, lambda: cells(env))
+    for i, action in enumerate(random_actions(env, 40)):
+        if i % 12 == 2:
+            put_on(env, [0] * 8, press=0.03)
+        recorder.step(action)
+    assert sum(len(episodes) for episodes in recorder.episodes) > 12
+    assert assert_reference(recorder, reference) == {*Rewards.model_fields, "is_over", "score"}
+    env.close()
+
+
+@pytest.mark.slow
+def test_the_document_as_it_is_equals_the_reference():
+    env = TouchEnv(DOCUMENT, 8, threads=1)
+    recorder = Recorder(env, lambda: cells(env))
+    for action in random_actions(env, 100):
+        recorder.step(action)
+    assert {"approach", "action_rate", "work"} <= assert_reference(recorder, reference)
+    env.close()
+
+
+def test_terms_sum_to_the_reward(env):
+    env.reset(0)
+    for action in random_actions(env, 3):
+        made = env.step(action)
+        torch.testing.assert_close(sum(made.info.terms.values()), made.reward)
+
+
+@pytest.mark.parametrize(
+    ("margin", "steps", "least", "most"), [(0.5, 80, 0.4, 1.8), pytest.param(0.12, 280, 3.0, 6.5, marks=pytest.mark.slow)]
+)
+def test_a_fingertip_on_the_hot_ball_latches_and_on_a_cold_one_does_not(margin, steps, least, most):
+    """In two environments on the hot ball, in two on a cold one; S counts from the latch on."""
+    env = bin_of_balls(4, margin=margin)
+    settled(env)
+    put_on(env, [0, 0, 3, 5])
+    latched, seconds = torch.full((4,), torch.inf), 0.0
+    for _ in range(steps):
+        made = env.step(still(env))
+        seconds += env.control_step
+        latched = torch.where(env.task.is_latched & latched.isinf(), seconds, latched)
+    assert (latched[:2] > least).all() and (latched[:2] < most).all() and latched[2:].isinf().all()
+    assert (hottest(env)[:2] >= 45 - 23 * margin).all()
+    np.testing.assert_allclose(hottest(env)[2:], 22.0, atol=1e-4)
+    np.testing.assert_allclose(made.info.score[:2], seconds - latched[:2] + env.control_step, atol=1e-4)
+    assert made.info.score[2:].tolist() == [0.0, 0.0]
+    rates = {name: term / env.control_step for name, term in made.info.terms.items()}
+    torch.testing.assert_close(rates["latched"], torch.tensor([10.0, 10.0, 0.0, 0.0]))
+    assert (rates["contact"][2:] == 0).all() and (made.reward[:2] > 10 * made.reward[2:]).all()
+    env.close()
+
+
+def test_rubber_fingers_never_know(tmp_path):
+    """Heat takes L²/α, half an hour, to cross a cell of 1 cm of it."""
+    text = (FOLDER / "bin.yaml").read_text().replace("bin.xml", str(FOLDER / "bin.xml"))
+    own = "material: {like: aluminium, conductivity: 150 W/(m*K), density: 270 kg/m3, emissivity: 0.5}"
+    assert own in text
+    (tmp_path / "rubber.yaml").write_text(text.replace(own, "material: rubber"))
+    env = bin_of_balls(2, document=str(tmp_path / "rubber.yaml"))
+    settled(env)
+    put_on(env, [0, 0])
+    for _ in range(80):
+        made = env.step(still(env))
+    assert env.task.is_touched.all() and not env.task.is_latched.any()
+    assert (hottest(env) > 22.001).all() and (hottest(env) < 23.0).all() and (made.info.score == 0).all()
+    env.close()
+
+
+def told(env, celsius, force, distance=0.02):
+    """Tell the task of an instant: the hottest cell, the hot ball's force on one fingertip; return what each term pays [1/s]."""
+    heat = torch.full_like(env.now.readings["heat"], 22.0)
+    heat[:, 37] = celsius
+    pushed = torch.zeros_like(env.now.link_force)
+    pushed[:, 2, 1] = force
+    far = torch.full_like(env.now.distance, distance)
+    now = replace(env.now, readings={**env.now.readings, "heat": heat}, link_force=pushed, distance=far)
+    env.task.advance(now)
+    return {name: float(term[0]) for name, term in env.task.reward(now, torch.zeros(env.num_envs, dtype=torch.bool)).items()}
+
+
+def test_only_latched_contact_counts_and_the_latch_stays(env):
+    env.reset(0)
+    step, held = env.control_step, lambda: float(env.task.score()[0])
+    assert told(env, 42.0, 1.0)["latched"] == 0 and held() == 0  # hot, but not enough
+    assert told(env, 42.3, 0.0)["latched"] == 0 and held() == 0  # latched by heat, without contact
+    assert told(env, 42.3, 0.01)["latched"] == 0 and held() == 0  # less force than a contact's
+    assert told(env, 42.3, 1.0)["latched"] == 10 and held() == pytest.approx(step)
+    assert told(env, 22.0, 1.0)["latched"] == 10 and held() == pytest.approx(2 * step)  # cold again: the latch stays
+    assert told(env, 45.0, 0.0)["latched"] == 0 and held() == pytest.approx(2 * step)
+    env.reset(0)
+    assert told(env, 42.0, 1.0)["latched"] == 0 and held() == 0
+
+
+def test_the_latch_fires_at_the_margin(env):
+    """1 − m of the way from 22 to 45 °C is 42.24 °C, in float32 readings to 1e-5 °C."""
+    for celsius, fires in ((42.239, False), (42.241, True)):
+        env.reset(0)
+        told(env, celsius, 0.0)
+        assert env.task.is_latched.tolist() == [fires] * 4
+
+
+def test_what_is_nearer_the_goal_pays_more(env):
+    """Far, near, in contact, warmer, hot: in this order; and colder than ambient is not less than nothing."""
+    env.reset(0)
+    order = [(10.0, 0.0, 0.5), (22.0, 0.0, 0.2), (22.0, 0.0, 0.01), (22.0, 1.0, 0.0), (30.0, 1.0, 0.0), (44.0, 1.0, 0.0)]
+    paid = [sum(told(env, *instant).values()) for instant in order]
+    assert all(less < more for less, more in itertools.pairwise(paid))
+    env.reset(0)
+    rates = told(env, 33.5, 1.0, 0.05)
+    assert rates["progress"] == pytest.approx(2 * 0.5) and rates["approach"] == pytest.approx(math.exp(-0.25))
+    assert rates["contact"] == 1 and told(env, 10.0, 0.0)["progress"] == 0
+
+
+def test_going_to_the_hot_ball_beats_rest_and_rest_beats_going_away(env):
+    paid = {}
+    for way in (1.0, 0.0, -1.0):
+        env.reset(3)
+        total = torch.zeros(4)
+        for _ in range(20):
+            action, towards = still(env), balls(env)[:, 0, :2].float()  # fingertips are above the middle
+            action[:, :2] = 0.3 * way * towards / towards.norm(dim=1, keepdim=True)
+            total += env.step(action).reward
+        paid[way] = total
+    assert (paid[1.0] > paid[0.0]).all() and (paid[0.0] > paid[-1.0]).all()
+
+
+def test_groups_hold_what_they_say(env):
+    settled(env)
+    put_on(env, [0, 0, 3, 5])
+    for _ in range(40):
+        made = env.step(still(env))
+    heat = env.now.readings["heat"][:, :, 0]
+    assert made.obs["tactile_sensors"].shape == (4, 10 * 8)
+    torch.testing.assert_close(made.obs["tactile_sensors"], heat.float())
+    links = env.touch.rows["heat"]["link"]
+    each = [heat[:, torch.from_numpy(links == name)].amax(dim=1) for name in dict.fromkeys(links.tolist())]
+    progress = ((torch.stack(each, dim=1).double() - 22) / 23).clamp(0, 1)
+    assert (progress[:2].amax(dim=1) > 0.2).all() and (progress[2:] < 1e-5).all()
+    torch.testing.assert_close(made.obs["priv_heat"][:, :10], progress.float())
+    assert made.obs["priv_heat"][:, 10:].tolist() == [[0, 1], [0, 1], [0, 0], [0, 0]]
+    joints = torch.cat([env.sim.qpos[:, :15], env.sim.qvel[:, :15], still(env)], dim=1)
+    torch.testing.assert_close(made.obs["proprio"], joints.float(), rtol=0, atol=1e-2)  # a physics step earlier
+    torch.testing.assert_close(made.obs["priv_obj_state"][:, :3], balls(env)[:, 0].float(), rtol=0, atol=1e-4)
+    assert env.groups == {"proprio": 45, "tactile_sensors": 80, "priv_proprio": 60, "priv_heat": 12, "priv_obj_state": 15,
+                          "priv_obj_props": 2 + 45}  # fmt: skip
+
+
+def test_what_the_policy_has_does_not_tell_which_ball_is_hot(env):
+    """At the start, wherever the hot ball is: the same proprioception, and no temperature but that of the surroundings."""
+    first = env.reset(0)
+    place = balls(env)[:, 0].clone()
+    second = env.reset()
+    assert not torch.equal(place, balls(env)[:, 0])
+    for name in ("proprio", "tactile_sensors"):
+        torch.testing.assert_close(first[name], second[name], rtol=0, atol=0)
+    assert (first["tactile_sensors"] == 22).all()
+
+
+def test_each_ball_has_a_place_and_the_hot_one_any():
+    """Over 400 episodes each place is the hot ball's 50 times, but for 5 standard deviations of a binomial; none is shared."""
+    env = bin_of_balls(50, randomise__xy=["-1.5 cm", "1.5 cm"])
+    key = env.task.setup.qpos[env.task.places][:, :3]
+    count, moved = torch.zeros(NUM_BALLS), []
+    for _ in range(8):
+        start = env.task.reset(torch.ones(50, dtype=torch.bool), env._episodes.number.clone()).values["qpos"]
+        env._episodes.number += 1
+        pos = start[:, env.task.places][:, :, :3]
+        far = (pos[:, :, None] - key[None, None]).norm(dim=3)
+        nearest = far.argmin(dim=2)
+        assert (nearest.sort(dim=1).values == torch.arange(NUM_BALLS)).all()
+        count += torch.bincount(nearest[:, 0], minlength=NUM_BALLS)
+        offset = pos - key[nearest]
+        assert (offset[:, :, 2] == 0).all()
+        moved.append(offset[:, :, :2])
+        assert (torch.cdist(pos, pos) + torch.eye(NUM_BALLS) > 0.08).all()  # no ball is in another
+    assert ((count - 50).abs() < 5 * math.sqrt(400 * 7 / 64)).all()
+    moved = torch.stack(moved)
+    assert 0.0149 < moved.abs().max() <= 0.015
+    assert moved.mean().abs() < 5 * 0.015 / math.sqrt(3 * moved.numel())
+    env.close()
+
+
+def test_balls_and_hand_rest(env):
+    """Two seconds without an action: the hand stays above, the balls in the bin, and nothing touches anything else."""
+    env.reset(1)
+    for _ in range(80):
+        made = env.step(still(env))
+        assert not made.info.ended.any()
+    assert (env.sim.qpos[:, :3].abs() < 0.01).all() and env.sim.qvel.abs().max() < 1.0
+    middle, away = balls(env), (balls(env)[:, :, None] - balls(env)[:, None]).norm(dim=3) + torch.eye(NUM_BALLS)
+    assert (middle[:, :, :2].abs() < 0.23).all() and (middle[:, :, 2] > 0.1).all() and (away > 0.079).all()
+    assert (made.obs["tactile_sensors"] == 22).all() and (made.info.score == 0).all()
+
+
+def test_heat_begins_anew_with_the_episode_and_with_no_other():
+    """In the environment that ends, balls and fingers have their first temperatures again; in the others they go on."""
+    env = bin_of_balls(3)
+    settled(env)
+    put_on(env, [0, 0, 0])
+    for _ in range(60):
+        env.step(still(env))
+    before = env.now.readings["heat/objects"][:, :, 0].clone()
+    assert (hottest(env) > 25).all() and (before[:, 0] < 44.98).all() and env.task.is_touched.all()
+    held = {name: value.clone() for name, value in env.task.memory.items()}
+    env.sim.qpos[1, env.task.places[0][:3]] = torch.tensor([0.8, 0.0, 0.041]).double()  # out of the bin, on the ground
+    made = env.step(still(env))
+    assert made.terminated.tolist() == [False, True, False] and not made.truncated.any()
+    assert made.info.terms["lost"].tolist() == pytest.approx([0, -100 * env.control_step, 0])
+    objects = env.now.readings["heat/objects"][:, :, 0]
+    torch.testing.assert_close(objects[1], torch.tensor([45.0] + [22.0] * 7), rtol=0, atol=1e-4)
+    assert (made.obs["tactile_sensors"][1] == 22).all() and (hottest(env)[[0, 2]] > 25).all()
+    assert (objects[[0, 2], 0] < 44.98).all() and (objects[[0, 2], 0] > 44).all()
+    assert not env.task.progress[1].any() and not env.task.is_touched[1]
+    assert (env.task.progress[[0, 2]].amax(dim=1) > held["progress"][[0, 2]].amax(dim=1)).all()
+    env.close()
+
+
+def test_an_episode_lasts_its_time():
+    env = bin_of_balls(2, episode="0.1 s", touch="none")
+    assert [bool(env.step(still(env)).truncated.all()) for _ in range(8)] == [False, False, False, True] * 2
+    assert "tactile_sensors" not in env.groups and env.task.cells.shape == (10, 8)  # the latch looks at all fingers
+    env.close()
+
+
+def test_fewer_links_and_other_touch():
+    env = bin_of_balls(1, placement="tips")
+    assert env.groups["tactile_sensors"] == 5 * 8 and env.groups["priv_heat"] == 5 + 2
+    env.close()
+    env = bin_of_balls(1, touch="agg_force", placement="tips")
+    assert env.groups["tactile_sensors"] == 5 * 3 and env.groups["priv_heat"] == 10 + 2
+    env.close()
+
+
+def test_links_with_other_numbers_of_cells_and_one_number_each(tmp_path):
+    """`spacing` gives long links more cells; `outputs: max` leaves one number per link: the same progress of both."""
+    text = (FOLDER / "bin.yaml").read_text().replace("bin.xml", str(FOLDER / "bin.xml"))
+    seen = []
+    for i, own in enumerate(("spacing: 2 cm", "spacing: 2 cm\n    outputs: max")):
+        (tmp_path / f"{i}.yaml").write_text(text.replace("cells: [2, 2, 2]", own))
+        env = bin_of_balls(1, document=str(tmp_path / f"{i}.yaml"))
+        settled(env)
+        put_on(env, [0])
+        for _ in range(10):
+            made = env.step(still(env))
+        seen.append(made.obs["priv_heat"])
+        env.close()
+    torch.testing.assert_close(*seen)
+    assert seen[0][0, :10].max() > 0.1
+
+
+def test_the_task_and_its_sensors_agree_about_temperatures():
+    spec = load(FOLDER / "bin.yaml").spec
+    task = bin_of_balls(1, touch="none")
+    heat, (hot, *cold) = spec.sensors["heat"], spec.objects.values()
+    assert (heat.ambient, hot.temperature) == (task.spec.ambient, task.spec.target) == (22.0, 45.0)
+    assert {ball.temperature for ball in cold} == {None} and len(cold) == 7 and task.spec.margin == 0.12
+    task.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "path", "says"),
+    [
+        ({"randomise": {"friction": [0.5, 1.5]}}, "randomise", "`friction` would be the hot ball's alone"),
+        ({"randomise": {"mass": [0, "10 g"]}}, "randomise", "`mass` would be the hot ball's alone"),
+        ({"randomise": {"push": {"x": ["-1 N", "1 N"]}}}, "randomise", "`push` would be the hot ball's alone"),
+        ({"others": ["ball9"]}, "others", 'no body "ball9"'),
+        ({"others": ["bin"]}, "others", 'body "bin" has no free joint'),
+        ({"others": ["ball1", "ball1"]}, "others", "named twice"),
+        ({"others": ["ball0"]}, "others", "the object is among them"),
+        ({"target": "20 degC"}, "", "more than `ambient`"),
+        ({"target": "3 mm"}, "target", "unit of temperature"),
+        ({"margin": 1.5}, "margin", "1.5"),
+        ({"rewards": {"heat": 1}}, "rewards.heat", "unknown key"),
+    ],
+)
+def test_mistakes_are_told_at_their_place(changes, path, says):
+    with pytest.raises(SpecError) as caught:
+        bin_of_balls(1, touch="none", **changes) if "randomise" not in changes else TouchEnv(DOCUMENT, 1, overrides=changes)
+    (found,) = caught.value.problems
+    assert found.path == path and says in f"{found.what}; {found.hint}"
+
+
+@pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
+def test_random_actions_in_both_simulators(simulator):
+    """Two seconds as the document is: all finite, no faults, temperatures between surroundings and ball, the hand in its range."""
+    env = TouchEnv(DOCUMENT, 2, threads=1, simulator=simulator)
+    for action in random_actions(env, 80):
+        made = env.step(action)
+        assert not made.info.faults.any() and made.reward.isfinite().all()
+        assert all(value.isfinite().all() for value in made.obs.values())
+        heat = made.obs["tactile_sensors"]
+        assert (heat > 21.999).all() and (heat < 45.001).all()
+    assert (env.sim.qpos[:, :2].abs() < 0.21).all() and (balls(env)[:, :, 2] > 0.03).all()
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("touch", ["bool", "depth", "agg_force", "force_torque", "elastomer", "proximity", "force_taxel"])
+def test_other_touch_is_felt_on_any_ball(touch):
+    """On a cold ball as on the hot one: what is felt differs from what is felt of nothing."""
+    env = bin_of_balls(2, touch=touch)
+    settled(env)
+    before = env.step(still(env)).obs["tactile_sensors"]
+    put_on(env, [0, 3], ahead=0.02)  # with its pad, which faces down and back
+    for _ in range(10):
+        after = env.step(still(env)).obs["tactile_sensors"]
+    assert ((after - before).abs().amax(dim=1) > 0).all() and after.isfinite().all()
+    env.close()

@@ -1,0 +1,79 @@
+"""What a task's document says of learning: the paper's numbers, groups, errors at their places."""
+
+import pytest
+from small_runs import small_learner
+from small_tasks import TASK, small_task
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.load import load_task
+from tgdsl.rl.train.config import config, observed
+
+GROUPS = {"proprio": 6, "tactile_sensors": 4, "priv_proprio": 9, "goal": 7, "priv_obj_state": 15, "priv_obj_props": 6}
+
+
+def loaded(folder, train="", **overrides):
+    file = small_task(folder)
+    file.write_text(TASK + train)
+    return load_task(file, overrides)
+
+
+def test_the_paper_s_numbers():
+    """Table of the appendix, by task: iterations, steps, discount, entropy; and those that are the same."""
+    table = {
+        "in_palm_rotate": (6000, 24, 0.998, 2e-3),
+        "in_hand_repose": (20000, 24, 0.998, 2e-3),
+        "screwdriver": (5000, 12, 0.99, 0.0),
+    }
+    for name, wanted in table.items():
+        task = load_task(f"examples/tasks/{name}.yaml", {"train.learning_rate": 1e-3})  # what is said leaves the rest as it is
+        train = task.spec.train
+        assert (train.iterations, train.steps, train.discount, train.entropy) == wanted
+        made = config(task, GROUPS)
+        algorithm = made["algorithm"]
+        assert (algorithm["learning_rate"], algorithm["schedule"], algorithm["desired_kl"]) == (1e-3, "adaptive", 0.01)
+        assert (algorithm["num_learning_epochs"], algorithm["num_mini_batches"], algorithm["lam"]) == (5, 4, 0.95)
+        assert (algorithm["clip_param"], algorithm["value_loss_coef"], algorithm["max_grad_norm"]) == (0.2, 1.0, 1.0)
+        assert made["actor"]["hidden_dims"] == [512, 256, 128] and made["actor"]["distribution_cfg"]["init_std"] == 1.0
+        assert made["critic"]["encoders"]["*"] == {"hidden": [512, 256, 128], "size": 64}
+        assert made["actor"]["encoders"]["tactile_sensors"] == {"hidden": [64, 64], "size": 32}
+        assert (algorithm["rnd_cfg"]["learning_rate"], algorithm["rnd_cfg"]["num_outputs"]) == (1e-3, 8)
+
+
+def test_who_sees_what(tmp_path):
+    teacher = ["priv_proprio", "goal", "priv_obj_state"]
+    found = observed(loaded(tmp_path), GROUPS)
+    assert found == {"actor": teacher, "critic": [*teacher, "priv_obj_props"], "rnd_state": ["priv_obj_state"]}
+    touch = loaded(tmp_path, "train: {actor: [proprio, tactile_sensors, goal], rnd: off}\n")
+    assert observed(touch, GROUPS) == {"actor": ["proprio", "tactile_sensors", "goal"], "critic": found["critic"]}
+    assert config(touch, GROUPS)["algorithm"]["rnd_cfg"] is None
+    own = observed(loaded(tmp_path), {"command": 3, "proprio": 6, "priv_proprio": 9, "priv_ridge": 1})
+    assert own == {name: ["command", "priv_proprio", "priv_ridge"] for name in ("actor", "critic", "rnd_state")}
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        ("{learning_rat: 1}", 'unknown key "learning_rat"'),
+        ("{learning_rate: 0}", "train.learning_rate: 0 is out of range, expected more than 0"),
+        ("{discount: 1.5}", "train.discount"),
+        ("{rnd: of}", "train.rnd"),
+        ("{rnd: {outputs: 0}}", "train.rnd.outputs"),
+        ("{actor: [goal, goal]}", "actor names a group twice"),
+        ("{networks: {hidden: []}}", "train.networks.hidden"),
+    ],
+)
+def test_mistakes_are_located(tmp_path, train, message):
+    with pytest.raises(SpecError) as raised:
+        loaded(tmp_path, f"train: {train}\n")
+    assert message in str(raised.value) and "task.yaml:" in str(raised.value)
+
+
+def test_groups_that_are_not_there_are_located(tmp_path):
+    with pytest.raises(
+        SpecError, match=r'task\.yaml:\d+:\d+: train\.critic\[1\]: there is no group of observations "gaol".*"goal"'
+    ):
+        observed(loaded(tmp_path, "train: {critic: [proprio, gaol]}\n"), GROUPS)
+    with pytest.raises(SpecError, match=r'train\.actor\[0\]: there is no group of observations "tactile_sensors"'):
+        small_learner(tmp_path, touch="none", train__actor="[tactile_sensors]")
+    with pytest.raises(SpecError, match=r'train\.rnd\.groups\[0\]: the group of observations "empty" is empty'):
+        observed(loaded(tmp_path, "train: {rnd: {groups: [empty]}}\n"), GROUPS | {"empty": 0})

@@ -1,0 +1,70 @@
+"""An iteration: what is seen, what is told, and that it learns."""
+
+import pytest
+import torch
+from small_runs import small_learner
+from small_tasks import STEPS
+
+from tgdsl.rl.train.iteration import EpisodeTally
+
+
+def test_an_iteration(tmp_path):
+    """Episodes of 8 steps that begin together, and iterations of 4 steps: each second one has all their ends."""
+    learner, _ = small_learner(tmp_path, train__desynchronise=False)
+    steps, returns = [], []
+    step = learner.env.step
+
+    def recorded(action):
+        made = step(action)
+        steps.append(made)
+        return made
+
+    learner.env.step = recorded
+    found = [learner.iterate() for _ in range(4)]
+    assert [made.episodes for made in found] == [0, 4, 0, 4]
+    assert "Episode/return" not in found[0].told and found[1].told["Episode/steps"] == STEPS
+    returns = torch.stack([made.reward for made in steps[:STEPS]]).sum(dim=0).mean()
+    assert found[1].told["Episode/return"] == pytest.approx(float(returns), rel=1e-5)
+    terms = sum(value for name, value in found[1].told.items() if name.startswith("Reward/"))
+    assert found[1].told["Episode/return"] == pytest.approx(terms, rel=1e-4)
+    assert found[1].told["Episode/dropped"] == 0.0
+    assert learner.samples == 4 * 4 * 4 and learner.iteration == 4
+    assert all(made.rollout > 0 and made.update > 0 for made in found)
+
+
+def test_only_what_somebody_sees_is_kept(tmp_path):
+    learner, _ = small_learner(tmp_path)
+    assert set(learner.algorithm.storage.observations.keys()) == {"priv_proprio", "goal", "priv_obj_state", "priv_obj_props"}
+
+
+def test_first_episodes_end_at_random_times(tmp_path):
+    learner, _ = small_learner(tmp_path, num_envs=64)
+    found = [learner.iterate().episodes for _ in range(2)]
+    assert sum(found) == 64 and min(found) > 15
+
+
+def test_the_same_seed_learns_the_same_and_another_seed_something_else(tmp_path):
+    weights = []
+    for seed in (1, 1, 2):
+        learner, _ = small_learner(tmp_path, seed=seed)
+        learner.iterate()
+        weights.append(torch.cat([value.flatten() for value in learner.algorithm.actor.parameters()]))
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
+
+
+@pytest.mark.slow
+def test_it_learns(tmp_path):
+    """To ask for nothing costs nothing: with a penalty of actions alone, actions become small."""
+    zero = {
+        f"rewards__{name}": 0 for name in ("success", "spin", "near", "tilt", "object_distance", "drop", "joint_limit", "work")
+    }
+    options = {"num_envs": 32, "train__rnd": "off", "train__steps": 8, "train__entropy": 0, "rewards__action_rate": -10}
+    learner, _ = small_learner(tmp_path, **zero, **options)
+    found = [learner.iterate() for _ in range(40)]
+    first, last = (sum(made.told["Episode/return"] for made in part) / 5 for part in (found[:5], found[-5:]))
+    assert first < 0 and last > 0.6 * first
+    assert found[-1].told["Policy/mean_std"] < 0.9 * found[0].told["Policy/mean_std"]
+
+
+def test_no_episode_no_means():
+    assert EpisodeTally().means([0.0]) == {}

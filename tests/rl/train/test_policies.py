@@ -1,0 +1,41 @@
+"""Policies as files, with their cards."""
+
+import json
+
+import pytest
+import torch
+from small_runs import small_learner
+
+from tgdsl.rl.playing.policy import PolicyError, card_of, policy_for
+from tgdsl.rl.train.folder import made_from
+from tgdsl.rl.train.policies import card_of as card_for
+from tgdsl.rl.train.policies import write_policy
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+
+
+def test_a_policy_brings_its_card(tmp_path):
+    """It acts as the network without exploration; other joints and taxels are refused; a touchless one takes any taxels."""
+    learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
+    learner.iterate()
+    card = card_for(learner, made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
+    file = tmp_path / "a policy.pt"
+    write_policy(learner, card, file)
+    assert card_of(file) == card == json.loads((tmp_path / "a policy.json").read_text())
+    assert card["groups"] == {"tactile_sensors": 4, "proprio": 6} and card["minutes"] == 1.5 and card["samples"] == 16
+    env = learner.env
+    policy, obs = policy_for(env, file), env.reset(3)
+    assert policy.groups == ("tactile_sensors", "proprio")
+    with torch.no_grad():
+        torch.testing.assert_close(policy(obs), learner.algorithm.actor(learner._seen(obs)))
+    write_policy(learner, card | {"joints": ["bend", "swing"]}, file)
+    with pytest.raises(PolicyError, match="this policy moves bend, swing, not swing, bend"):
+        policy_for(env, file)
+    write_policy(learner, card | {"taxels": "0"}, file)
+    with pytest.raises(PolicyError, match="this policy feels with other taxels"):
+        policy_for(env, file)
+    blind, _ = small_learner(tmp_path)
+    write_policy(blind, card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
+    assert policy_for(env, file).groups == ("priv_proprio", "goal", "priv_obj_state")
+    with pytest.raises(PolicyError, match="this policy takes 31 numbers, not proprio"):
+        policy_for(env, file, ("proprio",))

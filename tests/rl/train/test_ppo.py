@@ -1,0 +1,139 @@
+"""PPO that is captured does what rsl_rl's own does, in float64, whatever is switched on."""
+
+import contextlib
+import copy
+import io
+
+import pytest
+import torch
+from drifting_envs import Drifting
+from rsl_rl.algorithms import PPO
+
+from tgdsl.errors import TgdslError
+from tgdsl.rl.train.ppo import CapturedPPO
+
+NUM_ENVS, STEPS = 16, 6
+RND = {
+    "weight": 3.0,
+    "num_outputs": 4,
+    "predictor_hidden_dims": [8],
+    "target_hidden_dims": [8],
+    "state_normalization": True,
+    "reward_normalization": True,
+}
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def settings(is_ours, rnd=None, **algorithm):
+    network = {"hidden_dims": [16, 8], "activation": "elu", "obs_normalization": True}
+    ours = {"class_name": "tgdsl.rl.train.model:EncodedModel", "eps": 1e-2}
+    theirs = {"class_name": "MLPModel"}
+    gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian" if is_ours else "GaussianDistribution", "init_std": 0.8}
+    return {
+        "num_steps_per_env": STEPS,
+        "multi_gpu": None,
+        "obs_groups": {"actor": ["here", "there"], "critic": ["here", "there", "still"], "rnd_state": ["here"]},
+        "actor": network | (ours if is_ours else theirs) | {"distribution_cfg": gaussian},
+        "critic": network | (ours if is_ours else theirs),
+        "algorithm": {
+            "class_name": "tgdsl.rl.train.ppo:CapturedPPO" if is_ours else "PPO",
+            "num_learning_epochs": 3,
+            "num_mini_batches": 4,
+            "rnd_cfg": copy.deepcopy(rnd),
+            **algorithm,
+        },
+    }
+
+
+def algorithm_of(is_ours, env, **options):
+    """Make an algorithm with networks that are the same for both."""
+    wanted = settings(is_ours, **options)
+    kind = CapturedPPO if is_ours else PPO
+    torch.manual_seed(0)
+    with contextlib.redirect_stdout(io.StringIO()):
+        return kind.construct_algorithm(env.get_observations(), env, wanted, "cpu")
+
+
+def iterate(algorithm, env, seed, steps=STEPS):
+    """Make one iteration; what is random follows from the seed, before the rollout and before the update."""
+    algorithm.train_mode()
+    obs = env.get_observations()
+    torch.manual_seed(2 * seed)
+    with torch.inference_mode():
+        for _ in range(steps):
+            obs, reward, dones, extras = env.step(algorithm.act(obs))
+            algorithm.process_env_step(obs, reward, dones, extras)
+        algorithm.compute_returns(obs)
+    torch.manual_seed(2 * seed + 1)
+    return {name: float(value) for name, value in algorithm.update().items()}
+
+
+def tensors_of(algorithm):
+    """Return all that has been learned, by name."""
+    models = {"actor": algorithm.actor, "critic": algorithm.critic}
+    if algorithm.rnd:
+        models |= {"predictor": algorithm.rnd.predictor, "state": algorithm.rnd.state_normalizer}
+        models |= {"reward": algorithm.rnd.reward_normalizer.emp_norm}
+    return {f"{part}/{name}": value for part, model in models.items() for name, value in model.state_dict().items()}
+
+
+@pytest.mark.parametrize(
+    ("options", "rates"),
+    [
+        pytest.param({"learning_rate": 1e-3, "rnd": RND}, None, id="rnd"),
+        pytest.param({"learning_rate": 9e-3, "desired_kl": 0.5}, "rises", id="rate rises to its bound"),
+        pytest.param({"learning_rate": 4e-3, "desired_kl": 1e-4}, "falls", id="rate falls"),
+        pytest.param({"schedule": "fixed", "use_clipped_value_loss": False, "optimizer": "adamw"}, "stays", id="fixed"),
+    ],
+)
+def test_it_equals_rsl_rl_s_own(options, rates):
+    """Three iterations from the same weights, with the same numbers drawn and the same mini-batches."""
+    ours, theirs = (algorithm_of(is_ours, Drifting(NUM_ENVS), **options) for is_ours in (True, False))
+    envs = [Drifting(NUM_ENVS), Drifting(NUM_ENVS)]
+    begun = theirs.learning_rate
+    seen = [begun]
+    for seed in range(3):
+        found, wanted = iterate(ours, envs[0], seed), iterate(theirs, envs[1], seed)
+        assert found == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-14)
+        seen.append(theirs.learning_rate)
+        torch.testing.assert_close(ours.storage.returns, theirs.storage.returns, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(ours.storage.advantages, theirs.storage.advantages, rtol=1e-9, atol=1e-11)
+    own, other = tensors_of(ours), tensors_of(theirs)
+    assert own.keys() == other.keys()
+    for name, value in other.items():
+        torch.testing.assert_close(own[name], value, rtol=1e-8, atol=1e-11, msg=lambda text, name=name: f"{name}: {text}")
+    rises = {"rises": max(seen) == 1e-2, "falls": min(seen) < begun / 2, "stays": set(seen) == {begun}, None: True}
+    assert rises[rates], seen
+
+
+def test_what_cannot_be_captured_is_refused_by_name():
+    with pytest.raises(TgdslError, match="CapturedPPO does without use_mixed_precision: take rsl_rl's own PPO"):
+        algorithm_of(True, Drifting(NUM_ENVS), use_mixed_precision=True)
+    with pytest.raises(TgdslError, match="does without optimizer sgd"):
+        algorithm_of(True, Drifting(NUM_ENVS), optimizer="sgd")
+
+
+def test_it_goes_on_where_it_was_saved(tmp_path):
+    """Another one that loads what was saved makes the next iteration the same, on environments in the same state."""
+    env = Drifting(NUM_ENVS)
+    first = algorithm_of(True, env, rnd=RND)
+    iterate(first, env, 0)
+    torch.save(first.save(), tmp_path / "saved.pt")
+    other = algorithm_of(True, env, rnd=RND, learning_rate=5e-3)
+    with torch.no_grad():
+        for parameter in other.actor.parameters():
+            parameter += 1.0
+    other.load(torch.load(tmp_path / "saved.pt", weights_only=True), None, True)
+    other.rnd.reward_normalizer.total.copy_(first.rnd.reward_normalizer.total)
+    again = copy.deepcopy(env)
+    assert iterate(first, env, 1) == iterate(other, again, 1)
+    assert first.learning_rate == other.learning_rate
+    for name, value in tensors_of(first).items():
+        assert torch.equal(tensors_of(other)[name], value), name

@@ -1,0 +1,262 @@
+"""Runs: what is written, going on after a kill at any instant, and what cannot be written."""
+
+import csv
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from small_runs import small_learner
+
+from tgdsl.errors import FileError, TgdslError
+from tgdsl.rl.train import folder as folders
+from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
+from tgdsl.rl.train.folder import RunFolder, differences, made_from
+from tgdsl.rl.train.run import DivergedError, Run
+
+EVERY = 1e-9
+"""A checkpoint after each iteration."""
+
+
+def begun(base, name="run", every=EVERY, **overrides):
+    """Return a run that has begun, and its learner."""
+    learner, loaded = small_learner(base, **overrides)
+    folder = RunFolder(base / name)
+    folder.check(is_resumed=False)
+    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    return Run(learner, folder, every), learner
+
+
+def networks(learner):
+    algorithm = learner.algorithm
+    models = (algorithm.actor, algorithm.critic, algorithm.rnd.predictor, algorithm.rnd.state_normalizer)
+    return [value.clone() for model in models for value in model.state_dict().values()]
+
+
+def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
+    """Networks, optimisers, rate, random numbers; and environments that go on to draw what they had not drawn."""
+    run, learner = begun(tmp_path)
+    run.learn(3, float("inf"))
+    state = read_checkpoint(run._folder.checkpoint)
+    assert (state["iteration"], state["samples"]) == (3, 3 * 4 * 4)
+    other, _ = small_learner(tmp_path, seed=5)
+    restore(other, state, run._folder.checkpoint)
+    assert all(torch.equal(one, two) for one, two in zip(networks(learner), networks(other), strict=True))
+    assert (other.iteration, other.samples) == (3, 48)
+    assert other.algorithm.learning_rate == learner.algorithm.learning_rate
+    moments = [each.algorithm.optimizer.state_dict()["state"] for each in (learner, other)]
+    for i, own in moments[0].items():
+        assert all(torch.equal(value, moments[1][i][name]) for name, value in own.items())
+    assert torch.equal(torch.get_rng_state(), state["processes"][0]["cpu"])
+    assert torch.equal(other.env.resets, learner.env.resets + 1)
+    assert torch.equal(other.env.steps, learner.env.steps)
+    assert other.algorithm.rnd.update_counter == learner.algorithm.rnd.update_counter == 12
+    other.iterate()
+    assert other.iteration == 4
+
+
+def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
+    run, learner = begun(tmp_path)
+    run.learn(1, float("inf"))
+    state = state_of(learner, 0.0)
+    sizes = [write_checkpoint(state, tmp_path / f"{slim}.pt", slim) for slim in (False, True)]
+    assert sizes == [(tmp_path / f"{slim}.pt").stat().st_size for slim in (False, True)] and sizes[1] < sizes[0]
+    slim = read_checkpoint(tmp_path / "True.pt")
+    other, _ = small_learner(tmp_path)
+    restore(other, slim, tmp_path / "True.pt")
+    assert all(torch.equal(one, two) for one, two in zip(networks(learner), networks(other), strict=True))
+    own, kept = (each.algorithm.optimizer.state_dict()["state"][0]["exp_avg"] for each in (learner, other))
+    assert kept.dtype == torch.float32
+    torch.testing.assert_close(kept, own, rtol=2**-8, atol=0)
+
+
+def test_other_groups_networks_and_files_are_refused_by_name(tmp_path):
+    run, _ = begun(tmp_path)
+    file = run._folder.checkpoint
+    state = read_checkpoint(file)
+    other, _ = small_learner(tmp_path, train__actor="[proprio]")
+    with pytest.raises(CheckpointError, match=r"learned from the groups .*priv_proprio.*, not .*'proprio'"):
+        restore(other, state, file)
+    other, _ = small_learner(tmp_path, train__networks__hidden="[9]")
+    with pytest.raises(CheckpointError, match=r"its networks are of other sizes: .*mlp"):
+        restore(other, state, file)
+    more, _ = small_learner(tmp_path, num_envs=5)
+    restore(more, state, file)  # of another number of environments: these begin anew
+    assert int(more.env.steps.sum()) == 0
+    for content in (b"", b"no checkpoint", file.read_bytes()[:1000]):
+        (tmp_path / "other.pt").write_bytes(content)
+        with pytest.raises(CheckpointError, match=r"other\.pt: cannot read this checkpoint"):
+            read_checkpoint(tmp_path / "other.pt")
+    torch.save({"actor": 1}, tmp_path / "other.pt")
+    with pytest.raises(CheckpointError, match="this is no checkpoint of `tgdsl train` or `tgdsl distill`"):
+        read_checkpoint(tmp_path / "other.pt")
+    with pytest.raises(CheckpointError, match=r"none\.pt: there is no checkpoint"):
+        read_checkpoint(tmp_path / "none.pt")
+
+
+def test_what_a_folder_says(tmp_path):
+    run, learner = begun(tmp_path)
+    run.learn(3, float("inf"))
+    folder = run._folder
+    said = json.loads(folder.run.read_text())["starts"]
+    assert len(said) == 1
+    assert said[0]["spec"]["train"]["networks"]["hidden"] == [8] and said[0]["spec"]["rewards"]["success"] == 150
+    assert said[0]["taxels"] == learner.env.touch.taxels_id and len(said[0]["module"]) == 64
+    assert {"python", "torch", "rsl-rl-lib", "tgdsl"} <= said[0]["versions"].keys()
+    assert (folder.path / "task.yaml").read_bytes() == (tmp_path / "task.yaml").read_bytes()
+    assert (folder.path / "sensors.yaml").read_bytes() == (tmp_path / "sensors.yaml").read_bytes()
+    with (folder.path / "taxels.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    table = learner.env.touch.taxels["bit"]
+    own = [row for row in rows if row["sensor"] == "bit"]
+    assert [float(row["pos_0"]) for row in own] == table["pos"][:, 0].tolist()
+    curve = folder.rows()
+    assert [row["iteration"] for row in curve] == ["1", "2", "3"]
+    assert [int(row["samples"]) for row in curve] == [16, 32, 48]
+    assert all(float(row["Loss/value"]) > 0 for row in curve)
+
+
+def test_the_first_rows_of_a_curve_may_have_no_episodes(tmp_path):
+    """Episodes of 8 steps, iterations of 4: the second one is the first that has any."""
+    run, _ = begun(tmp_path, train__desynchronise=False)
+    run.learn(3, float("inf"))
+    found = [(row["episodes"], row["Episode/steps"], row["Reward/spin"] == "nan") for row in run._folder.rows()]
+    assert found == [("0", "nan", True), ("4", "8", False), ("0", "nan", True)]
+
+
+def test_how_documents_differ():
+    before = {"a": {"b": 1, "c": [1, 2]}, "d": 2.0}
+    assert differences(before, {"a": {"b": 3, "c": [1, 2]}, "e": 4}) == ["a.b: 1, now 3", "d: 2.0, now null", "e: null, now 4"]
+
+
+def test_losses_that_are_no_numbers_end_a_run_before_its_checkpoint(tmp_path):
+    run, learner = begun(tmp_path)
+    run.learn(1, float("inf"))
+    with torch.no_grad():
+        next(learner.algorithm.critic.parameters()).fill_(torch.nan)
+    with pytest.raises(DivergedError, match=r"iteration 2: Loss/value is nan.*checkpoint\.pt is from before"):
+        run.learn(3, float("inf"))
+    assert read_checkpoint(run._folder.checkpoint)["iteration"] == 1
+
+
+def test_a_run_ends_in_time_and_checkpoints_come_in_time(tmp_path, monkeypatch):
+    """By a clock that each iteration moves on by 3 s: a checkpoint before another one would make it more than 10 s."""
+    run, learner = begun(tmp_path, every=10.0)
+    now, iterate = [0.0], learner.iterate
+    monkeypatch.setattr("tgdsl.rl.train.run.time.monotonic", lambda: now[0])
+
+    def slow():
+        now[0] += 3.0
+        return iterate()
+
+    monkeypatch.setattr(learner, "iterate", slow)
+    saved, save = [], run.save
+    monkeypatch.setattr(run, "save", lambda: saved.append(learner.iteration) or save())
+    run.learn(1000, 26.0)
+    assert (learner.iteration, saved) == (9, [3, 6, 9])
+    assert run.seconds == 27.0
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from small_runs import small_learner
+from tgdsl.rl.train import checkpoint
+from tgdsl.rl.train.folder import RunFolder, made_from
+from tgdsl.rl.train.run import Run
+
+base, place = Path(sys.argv[2]), sys.argv[3]
+learner, loaded = small_learner(base)
+folder = RunFolder(base / "run")
+folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+run = Run(learner, folder, 1e-9)
+run.learn(2, float("inf"))
+owner, name = {
+    "rollout": (learner.env, "step"),
+    "update": (learner.algorithm, "_take_step"),
+    "curve": (folder.__class__, "add_row"),
+    "writing": (os, "fsync"),
+    "replacing": (os, "replace"),
+}[place]
+before = getattr(owner, name)
+
+def killed(*arguments, **named):
+    if place in ("curve", "replacing"):
+        before(*arguments, **named)
+    elif place == "writing":
+        pass
+    else:
+        before(*arguments, **named)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+setattr(owner, name, killed)
+run.learn(100, float("inf"))
+"""
+
+
+@pytest.mark.parametrize(
+    ("place", "iteration"),
+    [
+        pytest.param("rollout", 2, marks=pytest.mark.slow),
+        pytest.param("update", 2, marks=pytest.mark.slow),
+        pytest.param("curve", 2, marks=pytest.mark.slow),
+        ("writing", 2),
+        pytest.param("replacing", 3, marks=pytest.mark.slow),
+    ],
+)
+def test_a_run_that_is_killed_goes_on(tmp_path, place, iteration):
+    """SIGKILL in the third iteration: in its rollout, update, after its row was written, and around its checkpoint."""
+    learner, loaded = small_learner(tmp_path)
+    arguments = [sys.executable, "-c", KILLED, str(Path(__file__).parents[2] / "helpers"), str(tmp_path), place]
+    environ = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(arguments, capture_output=True, text=True, env=environ)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    folder = RunFolder(tmp_path / "run")
+    folder.check(is_resumed=True)
+    state = read_checkpoint(folder.checkpoint)
+    assert state["iteration"] == iteration
+    assert len([file for file in folder.path.iterdir() if file.name.startswith(".")]) == (place == "writing")
+    restore(learner, state, folder.checkpoint)
+    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    assert not [file for file in folder.path.iterdir() if file.name.startswith(".")]
+    Run(learner, folder, EVERY, state["seconds"]).learn(5, float("inf"))
+    assert [row["iteration"] for row in folder.rows()] == ["1", "2", "3", "4", "5"]
+    assert read_checkpoint(folder.checkpoint)["iteration"] == 5
+    assert len(json.loads(folder.run.read_text())["starts"]) == 2
+
+
+def test_a_folder_that_cannot_be_written_is_named_before_a_run_begins(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FileError, match=r"file/run/checkpoint\.pt: .*file is a file, expected a folder"):
+        RunFolder(tmp_path / "file" / "run").check(is_resumed=False)
+    (tmp_path / "run" / "checkpoint.pt").mkdir(parents=True)
+    with pytest.raises(TgdslError, match="this folder holds a run"):
+        RunFolder(tmp_path / "run").check(is_resumed=False)
+    with pytest.raises(TgdslError, match=r"there is no checkpoint\.pt to go on with"):
+        RunFolder(tmp_path).check(is_resumed=True)
+
+
+def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path, monkeypatch):
+    learner, loaded = small_learner(tmp_path)
+    folder = RunFolder(tmp_path / "run")
+    folder.begin(made_from(loaded, learner.env, 0, {}, 1), loaded, learner.env)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(FileError, match=r"run/checkpoint\.pt: File too large"):
+            Run(learner, folder, EVERY)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, before)
+    assert not folder.checkpoint.exists()
+    full = type("Usage", (), {"free": 1000})()
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: full)
+    with pytest.raises(FileError, match=r"checkpoint\.pt: 0 MiB are free on the disk, expected 0 MiB for checkpoints"):
+        Run(learner, folder, EVERY)

@@ -1,0 +1,63 @@
+"""Documents of temperatures that the docs and the examples show: they compile, and a palm warms."""
+
+from pathlib import Path
+
+import pytest
+from heat_scenes import heat_module
+
+import tgdsl
+
+ROOT = Path(__file__).parents[3]
+BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "heat.md").read_text().split("```yaml\n")[1:]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", BLOCKS)
+def test_what_the_docs_show_compiles(text, tmp_path):
+    path = tmp_path / "heat.yaml"
+    path.write_text(text.replace("palm_cube.xml", str(ROOT / "examples" / "palm_cube.xml")))
+    touch = tgdsl.compile(path)
+    assert [output.name for output in touch.outputs] == ["heat", "heat/heat", "heat/objects"]
+
+
+@pytest.mark.slow
+def test_a_warm_cube_warms_the_palm():
+    """What the links gain since the episode began is what the cube lost: 0.25 kg of it rests on the palm."""
+    touch = tgdsl.compile(ROOT / "examples" / "warm_palm.yaml")
+    sim = tgdsl.simulate(touch, 1, substeps=5, keyframe="rest")
+    first = touch(sim.state())["heat/objects"]
+    for _ in range(20):
+        sim.step(sim.model.key("rest").ctrl)
+        readings = touch(sim.state())
+    lost = (first - readings["heat/objects"])[0, 0, 1]
+    assert lost > 1.0
+    assert readings["heat/heat"][0, :, 0].sum() == pytest.approx(float(lost), rel=1e-3)
+    assert 22.0 <= readings["heat"].min() < readings["heat"].max() < 45.0
+
+
+@pytest.mark.parametrize("sensor", [{"spacing": "0.02 mm"}, {"cells": [1500, 1000, 500]}])
+def test_too_many_cells_are_a_located_mistake(sensor, tmp_path):
+    """7.5e8 of them, in a box of 30 × 20 × 10 mm."""
+    (field,) = sensor
+    message = rf"sensors\.heat\.{field}: its links have 7\.5e\+08 cells, expected at most 1,000,000"
+    with pytest.raises(tgdsl.SpecError, match=message):
+        heat_module(tmp_path, {"a": [0.03, 0.02, 0.01]}, {"material": "copper", **sensor})
+
+
+def test_a_link_that_is_a_plane_is_a_located_mistake(tmp_path):
+    (tmp_path / "floor.xml").write_text(
+        '<mujoco><worldbody><body name="floor"><geom type="plane" size="1 1 .1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "heat.yaml").write_text(
+        "tgdsl: 1\nrobot: {model: floor.xml}\nsensors:\n  heat: {kind: temperature_grid, links: floor, cells: [1, 1, 1], material: steel}\n"
+    )
+    with pytest.raises(tgdsl.SpecError, match=r"heat\.yaml:4:.*sensors\.heat\.links: .*plane.*has no bounded surface"):
+        tgdsl.compile(tmp_path / "heat.yaml")
+
+
+def test_rows_of_one_number_of_each_link_name_links(tmp_path):
+    for outputs in ("cells", "max", "mean"):
+        module = heat_module(
+            tmp_path, {"a": [0.01] * 3, "b": [0.02] * 3}, {"material": "steel", "cells": [1, 1, 1], "outputs": outputs}
+        )
+        assert module.rows["heat"]["link"].tolist() == ["a", "b"]

@@ -1,0 +1,118 @@
+"""Readings of boxes: their places and colours by closed forms, what a terminal shows of them, and a picture."""
+
+import numpy as np
+import pytest
+import torch
+from heat_scenes import heat_module
+from matplotlib.colors import Normalize
+from scipy.spatial.transform import Rotation
+
+import tgdsl
+from tgdsl.view.boxes import boxes_of, is_boxed
+from tgdsl.view.overview import drawing as overview_drawing
+from tgdsl.view.overview import drawn_outputs, overview
+from tgdsl.view.style import WARMTH
+from tgdsl.view.table import table
+from tgdsl.view.taxels import Pose
+
+TOLERANCE = 1e-12  # metres: a rotation and a sum in float64
+SIDES = {"a": [0.03, 0.02, 0.01], "b": [0.02, 0.02, 0.02]}
+POSE = Pose(
+    np.array([[0, 0, 0], [0.1, 0.2, 0.3], [-0.1, 0, 0]]), np.array([[1.0, 0, 0, 0], [0.5, 0.5, 0.5, 0.5], [1, 0, 0, 0]])
+)
+
+
+@pytest.fixture
+def build(tmp_path):
+    def built(**sensor):
+        touch = heat_module(tmp_path, SIDES, {"material": "copper", "cells": [3, 2, 1], **sensor})
+        return touch, tgdsl.simulate(touch, 2)
+
+    return built
+
+
+def reading(touch, values):
+    """Return a reading whose second environment holds some values."""
+    one = torch.as_tensor(values, dtype=torch.float64)[:, None]
+    return {touch.outputs[0].name: torch.stack([torch.zeros_like(one), one])}
+
+
+def test_cells_lie_side_by_side_in_their_box(build):
+    touch, _ = build()
+    rows = touch.rows["heat"]
+    for link, sides in SIDES.items():
+        own = rows[rows["link"] == link]
+        np.testing.assert_allclose(own["size"], np.tile(np.array(sides) / [3, 2, 1], (6, 1)), atol=TOLERANCE)
+        expected = (own["cell"] + 0.5) * own["size"] - 0.5 * np.array(sides)
+        np.testing.assert_allclose(own["pos"], expected, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("outputs", ["max", "mean"])
+def test_a_whole_link_is_one_box(build, outputs):
+    touch, _ = build(outputs=outputs)
+    np.testing.assert_allclose(touch.rows["heat"]["size"], list(SIDES.values()), atol=TOLERANCE)
+    np.testing.assert_allclose(touch.rows["heat"]["pos"], 0, atol=TOLERANCE)
+    assert [output.name for output in drawn_outputs(touch)] == ["heat"]
+    assert not is_boxed(touch, touch.outputs[1])
+
+
+def test_a_point_has_the_colour_of_its_cell(build):
+    """Cell (i, j) of link a is at 20 + i + 10 j °C: at its middle, near its corners, and a little outside, in a turned body."""
+    touch, sim = build()
+    rows = touch.rows["heat"]
+    values = np.where(rows["link"] == "a", 20.0 + rows["cell"][:, 0] + 10.0 * rows["cell"][:, 1], -7.0)
+    boxes = boxes_of(touch, touch.outputs[0], reading(touch, values)["heat"], 1)
+    assert (boxes.norm.vmin, boxes.norm.vmax) == (-7.0, 32.0)
+    paint = boxes.painter(sim.model, POSE)
+    turn = Rotation.from_quat(POSE.quat[1], scalar_first=True)
+    for within in ([0, 0, 0], [0.49, -0.49, 0.49], [-0.49, 0.49, 0.7]):
+        at = rows["pos"][:6] + np.array(within) * rows["size"][:6]
+        found = paint(POSE.pos[1] + turn.apply(at), np.full(6, sim.model.body("a").id))
+        np.testing.assert_allclose(found, WARMTH(Normalize(-7, 32)(values[:6]))[:, :3], atol=TOLERANCE)
+    assert np.isnan(paint(np.zeros((1, 3)), np.array([0]))).all()  # the world stays grey
+
+
+def test_cells_inside_are_not_seen(build):
+    """Of 4 × 3 × 3 cells two are inside; normals of what is exposed cancel over each link."""
+    touch, _ = build(cells=[4, 3, 3])
+    boxes = boxes_of(touch, touch.outputs[0], reading(touch, np.arange(72.0))["heat"], 1)
+    assert len(boxes.chosen) == 2 * (36 - 2)
+    assert boxes.layout.area.sum() == pytest.approx(2 * (6e-4 + 3e-4 + 2e-4) + 6 * 4e-4)
+    np.testing.assert_allclose(boxes.layout.area @ boxes.layout.normal, 0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("values", "low", "high"), [([22.0] * 12, 21.5, 22.5), ([-5.0] + [40.0] * 11, -5, 40)])
+def test_the_range_of_the_colours(build, values, low, high):
+    touch, _ = build()
+    given = reading(touch, values)["heat"]
+    norm = boxes_of(touch, touch.outputs[0], given, 1).norm
+    assert (norm.vmin, norm.vmax) == (low, high)
+    norm = boxes_of(touch, touch.outputs[0], given, 1, (0.0, 50.0)).norm
+    assert (norm.vmin, norm.vmax, norm(-5.0)) == (0.0, 50.0, 0.0)
+
+
+def test_the_picture_is_written_with_a_bar_in_degrees(build, tmp_path):
+    touch, sim = build(outputs="surface", noise="clean")
+    values = reading(touch, np.linspace(20, 45, 12))
+    figure = overview_drawing(touch, sim, values, env=1, title="warm")
+    panel = figure.axes[0]
+    assert panel.get_title("left") == "heat  ·  temperature_grid"
+    assert "temperature 20.00 … 45.00 °C" in [text.get_text() for text in panel.texts]
+    (bar,) = panel.child_axes
+    assert bar.get_title() == "temperature [°C]"
+    assert bar.get_xlim() == (20.0, 45.0)
+    for view in (None, "left", "30,20"):
+        assert overview(touch, sim, values, tmp_path / "warm.png", env=1, view=view).stat().st_size > 5000
+
+
+def test_a_terminal_shows_a_line_for_each_link(build):
+    touch, _ = build()
+    readings = reading(touch, [20, 21, 22, 23, 24, 25, -5, -5, -5, -5, -5, -4.5])
+    readings["heat/heat"] = torch.zeros(2, 2, 5)
+    assert table(touch, readings, env=1)[:5] == [
+        "heat",
+        "link  cells  temperature [degC]",
+        "────  ─────  ──────────────────",
+        "a         6       20.00 … 25.00",
+        "b         6       -5.00 … -4.50",
+    ]

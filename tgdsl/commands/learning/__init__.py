@@ -1,0 +1,1 @@
+"""Commands of learning: `tgdsl train` and `tgdsl evaluate`."""

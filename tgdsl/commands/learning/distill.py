@@ -1,0 +1,250 @@
+"""`tgdsl distill`: students learn what a teacher does by what they feel, all of them in one simulation."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from tgdsl.commands.arguments import Overrides, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.rl.load import LoadedTask
+    from tgdsl.rl.students.results import Row
+
+Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
+Folder = tyro.conf.arg(metavar="FOLDER")
+Names = tyro.conf.arg(metavar="A,B,…")
+ENVS = 13824
+KEPT = ("teacher", "types", "placements", "noise", "seeds", "resolutions")
+"""What a run that goes on takes from its first start, with the number of environments and the seed."""
+
+
+@dataclass(frozen=True)
+class Distill:
+    """Teach students by DAgger, as the document's `distill` says, and evaluate them; write a table, curves and the students.
+
+    There is one per type, placement, noise and seed, all in one simulation per resolution.
+    """
+
+    task: Task
+    teacher: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """The teacher: a policy with its card, as tgdsl train writes it."""
+    types: Annotated[str | None, Names] = None
+    """What students feel: types as `touch` has them, none among them, or all; default: all."""
+    placements: Annotated[str | None, Names] = None
+    """Link groups that feel; default: the document's `placement`."""
+    noise: Annotated[str | None, Names] = None
+    """Profiles of noise; default: the document's `noise`."""
+    resolutions: Annotated[str | None, Names] = None
+    """How densely they feel: a simulation each, one after the other; default: the document's `resolution`."""
+    seeds: int | None = None
+    """Students of each kind; default: 3."""
+    envs: int | None = None
+    """Environments of a simulation; default: about 13824, so that they divide among the students."""
+    device: str = "cuda"
+    """Where physics, touch and networks are computed: cuda, or cpu."""
+    iterations: int | None = None
+    """Iterations of each simulation, those made before included; default: distill.iterations of the document."""
+    minutes: float | None = None
+    """Time to learn from now on in each simulation [min], start-up not counted; default: no limit."""
+    seed: int | None = None
+    """What is random in the environments follows from it; default: 0."""
+    resume: Annotated[Path | None, Folder] = None
+    """Folder of a run that goes on from its last checkpoints, with the same students and overrides."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder of the run, with one per resolution in it; default: out/NAME_students."""
+    episodes: int = 1000
+    """Episodes of each student's evaluation at the end; 0: none."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Teach.
+
+        Raises:
+            TgdslError: What is wrong, before anything runs.
+        """
+        from tgdsl.rl.load import load_task
+        from tgdsl.rl.students.results import shown, write_table
+
+        if self.resume is not None and self.out is not None:
+            raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
+        folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
+        before = _read(folder / "distill.json") if self.resume else {}
+        overrides = {**before.get("overrides", {}), **parsed_overrides(self.set)}
+        loaded = load_task(self.task, overrides)
+        self._check()
+        asked = self._asked(loaded, before)
+        prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
+        for part in prepared:
+            part.check(is_resumed=self.resume is not None)
+        _write(folder / "distill.json", asked | {"overrides": overrides})
+        rows: list[Row] = []
+        unit = ""
+        for part in prepared:
+            own, unit = part.taught()
+            rows += own
+        if rows:
+            write_table(rows, folder / "table.csv")
+            print(f"{shown(rows, unit)}\ntable: {folder / 'table.csv'}")
+
+    def _check(self) -> None:
+        for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0), ("seeds", 1)):
+            value = getattr(self, name)
+            if value is not None and not value >= least:
+                raise TgdslError(f"--{name} {value}: expected at least {least}")
+
+    def _asked(self, loaded: LoadedTask, before: dict[str, Any]) -> dict[str, Any]:
+        """Return who is taught, by whom and where, as plain values.
+
+        Raises:
+            TgdslError: If a run that goes on shall teach others, or there is no teacher.
+        """
+        spec = loaded.spec
+        given: dict[str, Any] = {
+            "teacher": None if self.teacher is None else str(self.teacher),
+            "types": _names(self.types),
+            "placements": _names(self.placements),
+            "noise": _names(self.noise),
+            "seeds": self.seeds,
+            "resolutions": _names(self.resolutions),
+            "envs": self.envs,
+            "seed": self.seed,
+        }
+        for name, value in given.items():
+            if before and value is not None and value != before[name]:
+                raise TgdslError(f"--{name} {_text(value)}: this run began with {_text(before[name])}; begin another one")
+        default = {"types": ["all"], "placements": [spec.placement], "noise": [spec.noise], "seeds": 3, "seed": 0}
+        default |= {"resolutions": [spec.resolution or "default"], "envs": None, "teacher": None}
+        asked = {name: value if value is not None else before.get(name, default[name]) for name, value in given.items()}
+        if asked["teacher"] is None:
+            raise TgdslError("--teacher FILE is missing: a policy, as tgdsl train writes it")
+        return asked
+
+
+class _Part:
+    """The students of one resolution: one simulation."""
+
+    def __init__(self, command: Distill, resolution: str, asked: dict[str, Any], overrides: dict[str, Any], folder: Path):
+        """See that all fits together.
+
+        Raises:
+            TgdslError: If something does not.
+        """
+        from tgdsl.rl.load import load_task
+        from tgdsl.rl.sensed import check_felt, num_variants
+        from tgdsl.rl.students.keys import check_blocks, feels, student_keys
+        from tgdsl.rl.students.teacher import Teacher
+        from tgdsl.rl.train.folder import RunFolder
+
+        self._command, self._resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
+        own = {} if resolution == "default" else {"resolution": resolution}
+        self._overrides = overrides | own
+        self._loaded = load_task(command.task, self._overrides)
+        types = _known(self._loaded, asked["types"])
+        self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
+        self._teacher = Teacher(Path(asked["teacher"]), self._loaded)
+        unit = len(self._keys) * num_variants(self._loaded)
+        self._envs = asked["envs"] or max(1, ENVS // unit) * unit
+        check_blocks(self._envs, len(self._keys), num_variants(self._loaded))
+        self._felt = feels(self._keys, self._teacher.felt)
+        check_felt(self._loaded, self._felt)
+
+    def check(self, is_resumed: bool) -> None:
+        """See that the folder can be written, that there are such taxels, and that a teacher that feels does so with them.
+
+        Raises:
+            TgdslError: If not.
+        """
+        from tgdsl.rl.sensed import compile_sensed
+
+        self._goes_on = is_resumed and self._folder.checkpoint.is_file()
+        self._folder.check(is_resumed=self._goes_on)
+        self._teacher.check_taxels()
+        if len(self._asked["resolutions"]) > 1:  # else it is compiled next
+            compile_sensed(self._loaded, "cpu", feels=self._felt)
+
+    def taught(self) -> tuple[list[Row], str]:
+        """Teach, write and evaluate; return the table's rows, and the unit of the score."""
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.students.learner import Distiller
+        from tgdsl.rl.train.checkpoint import read_checkpoint, restore
+        from tgdsl.rl.train.folder import made_from
+        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.telling import ProgressBar
+
+        command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
+        state = read_checkpoint(folder.checkpoint) if self._goes_on else None
+        with StatusLine() as progress:
+            env = TouchEnv(loaded, self._envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
+        try:
+            distiller = Distiller(env, loaded, self._teacher.bound(env), self._keys, seed)
+            if state is not None:
+                restore(distiller, state, folder.checkpoint)
+            origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
+            folder.begin(origin | {"students": [key.name for key in distiller.keys]}, loaded, env)
+            run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
+            total = command.iterations or loaded.spec.distill.iterations
+            limit = float("inf") if command.minutes is None else 60.0 * command.minutes
+            print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self._envs} environments: {folder.path}")
+            bar = ProgressBar(total, distiller.iteration, env.task.score_unit)
+            try:
+                run.learn(total, limit, bar.show)
+            finally:
+                bar.close()
+            return self._finish(distiller, origin, run.seconds), env.task.score_unit
+        finally:
+            env.close()
+
+    def _finish(self, distiller: Any, origin: dict[str, Any], seconds: float) -> list[Row]:
+        """Evaluate the students, write them, and return the table's rows."""
+        from tgdsl.rl.playing.evaluation import evaluate_each
+        from tgdsl.rl.students.results import rows_of, write_students
+
+        command, keys = self._command, distiller.keys
+        found = evaluate_each(distiller.env, distiller.acting(), len(keys), command.episodes) if command.episodes else []
+        text = shlex.join(["tgdsl", *sys.argv[1:]])
+        with StatusLine() as progress:
+            students = self._folder.path / "students"
+            write_students(distiller, self._loaded, origin, seconds, text, found, students, progress)
+        if not found:
+            return []
+        plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
+        _write(self._folder.evaluation, plain)
+        return rows_of(keys, found, self._resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
+
+
+def _known(loaded: LoadedTask, types: list[str]) -> list[str]:
+    """Return the types, `all` as all that the sensors' document has sensors for."""
+    from tgdsl.rl.sensed import types_of
+
+    return [name for type_ in types for name in (types_of(loaded) if type_ == "all" else [type_])]
+
+
+def _names(text: str | None) -> list[str] | None:
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _write(file: Path, plain: dict[str, Any]) -> None:
+    from tgdsl.files.write import atomic_write, with_folder
+
+    with_folder(file)
+    atomic_write(file, (json.dumps(plain, indent=2, ensure_ascii=False) + "\n").encode())
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise TgdslError(f"{file}: there is no run of tgdsl distill to go on with: {error}") from error

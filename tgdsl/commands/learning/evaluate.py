@@ -1,0 +1,66 @@
+"""`tgdsl evaluate`: how good a policy is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from tgdsl.commands.arguments import OUT, Overrides, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play episodes without exploration, the same for all policies; print the mean of the score, and its 95 % interval."""
+
+    task: Task
+    policy: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """A learned policy, as for tgdsl play; default: none, the joints are not moved."""
+    groups: tuple[str, ...] = ()
+    """Groups of observations that the policy takes, as for tgdsl play."""
+    episodes: int = 1000
+    """How many episodes count."""
+    envs: int = 256
+    """Environments; of each, as many episodes count."""
+    device: str = "cpu"
+    """Where physics and touch are computed: cpu, or cuda."""
+    seed: int | None = None
+    """What is random in the episodes follows from it; default: one that is the same for all policies."""
+    out: Annotated[Path | None, OUT] = None
+    """A JSON file to write."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Play, and print."""
+        from tgdsl.files.write import atomic_write, check_writable
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.playing.actions import ZeroActor
+        from tgdsl.rl.playing.evaluation import SEED, evaluate
+        from tgdsl.rl.playing.policy import card_of, policy_for
+
+        if self.episodes < 1 or self.envs < 1:
+            raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
+        if self.out is not None:
+            check_writable(self.out)
+        if self.policy is not None:
+            card_of(self.policy)
+        seed = SEED if self.seed is None else self.seed
+        envs = min(self.envs, self.episodes)
+        with StatusLine() as progress:
+            overrides = parsed_overrides(self.set)
+            env = TouchEnv(self.task, envs, device=self.device, seed=seed, overrides=overrides, progress=progress)
+        try:
+            actor = ZeroActor(env) if self.policy is None else policy_for(env, self.policy, self.groups)
+            found = evaluate(env, actor, self.episodes, seed)
+        finally:
+            env.close()
+        print(found)
+        if self.out is not None:
+            atomic_write(self.out, (json.dumps(found.plain(), indent=2) + "\n").encode())

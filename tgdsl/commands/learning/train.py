@@ -1,0 +1,161 @@
+"""`tgdsl train`: a policy is learned in a task's environments."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from tgdsl.commands.arguments import Overrides, parsed_overrides
+from tgdsl.console.progress import StatusLine
+from tgdsl.errors import TgdslError
+
+if TYPE_CHECKING:
+    from tgdsl.rl.load import LoadedTask
+    from tgdsl.rl.train.folder import RunFolder
+    from tgdsl.rl.train.learner import Learner
+    from tgdsl.rl.train.ranks import Ranks
+
+Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
+Folder = tyro.conf.arg(metavar="FOLDER")
+ENVS = 8192
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn a policy by PPO, as the document's `train` says; write checkpoints, the policy, and how good it is."""
+
+    task: Task
+    envs: int | None = None
+    """Environments of each process; default: 8192, or those of the run that goes on."""
+    device: str = "cuda"
+    """Where physics, touch and networks are computed: cuda, or cpu. With torchrun each process takes a GPU."""
+    iterations: int | None = None
+    """Iterations of the whole run, those made before included; default: train.iterations of the document."""
+    minutes: float | None = None
+    """Time to learn from now on [min], start-up not counted; default: no limit."""
+    seed: int | None = None
+    """What all that is random follows from; default: 0, or that of the run that goes on."""
+    resume: Annotated[Path | None, Folder] = None
+    """Folder of a run that goes on from its last checkpoint, with its overrides; with another --out a run of its own begins
+    from there, with those that are given now alone."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
+    """Folder of the run; default: out/NAME of the document, or that of the run that goes on."""
+    episodes: int = 1000
+    """Episodes of the evaluation at the end; 0: none."""
+    set: Overrides = ()
+
+    def run(self) -> None:
+        """Learn.
+
+        Raises:
+            TgdslError: If rsl_rl is not installed, or what else is wrong.
+        """
+        from tgdsl.rl.load import load_task
+
+        try:
+            import tgdsl.rl.train.learner  # noqa: F401
+        except ImportError as error:
+            raise TgdslError(f'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" ({error})') from error
+        from tgdsl.rl.train.checkpoint import read_checkpoint
+        from tgdsl.rl.train.folder import RunFolder
+        from tgdsl.rl.train.ranks import Ranks
+
+        ranks = Ranks.of()
+        device = ranks.device(self.device)
+        folder = RunFolder(self.out or self.resume or Path("out") / self.task.stem)
+        source = RunFolder(self.resume) if self.resume else None
+        before = source.last_start() if source else {}
+        is_same = source is not None and folder.path.resolve() == source.path.resolve()
+        overrides = {**(before.get("overrides", {}) if is_same else {}), **parsed_overrides(self.set)}
+        loaded = load_task(self.task, overrides)
+        self._check()
+        if ranks.is_first:
+            folder.check(is_resumed=is_same)
+        state = read_checkpoint(source.checkpoint) if source else None
+        ranks.join(device)
+        try:
+            self._learn(loaded, folder, ranks, device, overrides, before, state)
+        finally:
+            ranks.leave()
+
+    def _check(self) -> None:
+        """See that numbers make sense.
+
+        Raises:
+            TgdslError: If one does not.
+        """
+        for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0)):
+            value = getattr(self, name)
+            if value is not None and not value >= least:
+                raise TgdslError(f"--{name} {value}: expected at least {least}")
+
+    def _learn(
+        self,
+        loaded: LoadedTask,
+        folder: RunFolder,
+        ranks: Ranks,
+        device: str,
+        overrides: dict[str, Any],
+        before: dict[str, Any],
+        state: dict[str, Any] | None,
+    ) -> None:
+        from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.train.checkpoint import restore
+        from tgdsl.rl.train.folder import differences, made_from
+        from tgdsl.rl.train.learner import Learner
+        from tgdsl.rl.train.run import Run
+        from tgdsl.rl.train.telling import ProgressBar
+
+        envs = self.envs or before.get("envs", ENVS)
+        seed = self.seed if self.seed is not None else before.get("seed", 0)
+        with StatusLine() as progress:
+            env = TouchEnv(loaded, envs, device=device, seed=seed, first_env=ranks.rank * envs, progress=progress)
+        try:
+            learner = Learner(env, loaded, seed, ranks)
+            if state is not None and self.resume is not None:
+                restore(learner, state, self.resume / "checkpoint.pt")
+            origin = made_from(loaded, env, seed, overrides, ranks.size)
+            if ranks.is_first:
+                for line in differences(before.get("spec", origin["spec"]), origin["spec"]):
+                    print(f"changed since the run began: {line}")
+                folder.begin(origin, loaded, env)
+            run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
+            if ranks.is_first and not run.has_board:
+                print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
+            total = self.iterations or loaded.spec.train.iterations
+            limit = float("inf") if self.minutes is None else 60.0 * self.minutes
+            bar = ProgressBar(total, learner.iteration, env.task.score_unit) if ranks.is_first else None
+            try:
+                run.learn(total, limit, bar.show if bar is not None else None)
+            finally:
+                if bar is not None:
+                    bar.close()
+            if ranks.is_first:
+                self._finish(learner, folder, origin, run.seconds)
+        finally:
+            env.close()
+
+    def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], seconds: float) -> None:
+        """Write the policy, evaluate it, and say so."""
+        from tgdsl.files.write import atomic_write
+        from tgdsl.rl.playing.evaluation import evaluate
+        from tgdsl.rl.playing.policy import policy_for
+        from tgdsl.rl.train.policies import card_of, write_policy
+
+        command = shlex.join(["tgdsl", *sys.argv[1:]])
+        card = card_of(learner, origin, seconds, command)
+        write_policy(learner, card, folder.policy)
+        print(
+            f"policy: {folder.policy}, after {learner.iteration} iterations, {learner.samples:,} steps, {seconds / 60:.1f} min"
+        )
+        if self.episodes:
+            found = evaluate(learner.env, policy_for(learner.env, folder.policy), self.episodes)
+            write_policy(learner, card | {"score": found.plain()}, folder.policy)
+            atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2) + "\n").encode())
+            print(found)

@@ -1,0 +1,112 @@
+"""Errors of readings relative to their magnitude, with intervals.
+
+Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+Readings = Float[np.ndarray, "step env row channel"]
+RESAMPLES, TAILS = 400, (2.5, 97.5)
+"""Bootstrap samples, and the percentiles that an interval reaches from and to."""
+
+
+class Interval(NamedTuple):
+    """A number, and the 95 % interval around it."""
+
+    value: float
+    low: float
+    high: float
+
+    def overlaps(self, other: Interval) -> bool:
+        """Whether two intervals have a point in common: the numbers then count as equal."""
+        return self.low <= other.high and other.low <= self.high
+
+
+class Magnitude(NamedTuple):
+    """What errors of a reading are relative to.
+
+    Attributes:
+        rest: Median of each channel.
+        scale: Largest difference of a channel from its median, or of one of the same quantity (`force` of `force_x`); 1 where
+            nothing ever changes.
+        active: Where the exact reading is not at its median: elsewhere nothing is felt, as a rule.
+    """
+
+    rest: Float[np.ndarray, " channel"]
+    scale: Float[np.ndarray, " channel"]
+    active: Bool[np.ndarray, "step env row channel"]
+
+
+class Errors(NamedTuple):
+    """Errors of a reading.
+
+    Attributes:
+        rms: Root of the sum of squared errors over the number of active readings.
+        largest: The largest.
+        p99: What 99 of 100 active readings' errors do not exceed; errors of the others count too.
+        is_finite: Whether all readings are finite numbers.
+    """
+
+    rms: Interval
+    largest: Interval
+    p99: float
+    is_finite: bool
+
+
+def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:
+    """Return what errors of a reading are relative to.
+
+    Args:
+        expected: The exact readings.
+        quantities: What each channel is a component of.
+    """
+    rest = np.median(expected.reshape(-1, expected.shape[-1]), axis=0)
+    away = np.abs(expected - rest)
+    own = away.max(axis=(0, 1, 2), initial=0.0)
+    names = np.array(quantities)
+    scale = np.array([own[names == name].max() for name in quantities])
+    return Magnitude(rest, np.where(scale > 0, scale, 1.0), away > 0)
+
+
+def errors_of(found: Readings, expected: Readings, magnitude: Magnitude, is_relative: bool = True, seed: int = 0) -> Errors:
+    """Return the errors of readings, each relative to its channel's magnitude.
+
+    Intervals are a bootstrap's over environments, whose states depend on each other in time but not among themselves.
+
+    Args:
+        found: The readings.
+        expected: The exact ones.
+        magnitude: What they are relative to.
+        is_relative: Whether errors are divided by the magnitude.
+        seed: Of the bootstrap.
+    """
+    is_finite = bool(np.isfinite(found).all())
+    error = np.abs(found - expected) / (magnitude.scale if is_relative else 1.0)
+    error = np.where(np.isfinite(error), error, np.inf)
+    squares, worst = (error**2).sum(axis=(0, 2, 3)), error.max(axis=(0, 2, 3), initial=0.0)
+    counts = magnitude.active.sum(axis=(0, 2, 3))
+    chosen = np.random.default_rng(seed).integers(error.shape[1], size=(RESAMPLES, error.shape[1]))
+    rms = np.sqrt(squares[chosen].sum(axis=1) / np.maximum(counts[chosen].sum(axis=1), 1))
+    return Errors(
+        rms=_interval(float(np.sqrt(squares.sum() / max(counts.sum(), 1))), rms),
+        largest=_interval(float(worst.max(initial=0.0)), worst[chosen].max(axis=1)),
+        p99=_exceeded_by(error, int(counts.sum()) // 100),
+        is_finite=is_finite,
+    )
+
+
+def _interval(value: float, samples: Float[np.ndarray, " sample"]) -> Interval:
+    low, high = np.percentile(samples, TAILS, method="nearest")
+    return Interval(value, min(float(low), value), max(float(high), value))
+
+
+def _exceeded_by(error: Readings, count: int) -> float:
+    """Return the least of the errors that no more than so many exceed."""
+    flat = error.reshape(-1)
+    return float(np.partition(flat, len(flat) - 1 - count)[len(flat) - 1 - count]) if count < len(flat) else 0.0

@@ -1,0 +1,102 @@
+"""Recorded states: some fields of them for a module that wants fewer, and what a module reads of them.
+
+Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from tgdsl.errors import StateError, listed
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SHAPES, SceneState
+from tgdsl.plan.inputs import Inputs
+
+AXES = ("body", "pair", "object", "heated", "joint", "actuator")
+"""Axes of the fields whose entries have names."""
+TOGETHER = 1e-6
+"""Distances [m] that differ by less count as equal where a row is looked for by its place."""
+
+
+def names_of(inputs: Inputs) -> dict[str, list[str]]:
+    """Return what stands at each place of each named axis of a state's fields."""
+    pairs = [f"{pair.link} – {pair.object}" for pair in inputs.pairs]
+    own = (inputs.bodies, pairs, inputs.objects, inputs.heated, inputs.joints, inputs.actuators)
+    return {axis: list(names) for axis, names in zip(AXES, own, strict=True)}
+
+
+def narrowed(state: SceneState, have: dict[str, list[str]], inputs: Inputs) -> SceneState:
+    """Return what a module wants of a state that has more.
+
+    Args:
+        state: The state.
+        have: What stands at its places: `names_of` the module that it was recorded for.
+        inputs: What is wanted.
+
+    Raises:
+        StateError: If it has less.
+    """
+    want = names_of(inputs)
+    for axis in AXES:
+        if missing := [name for name in want[axis] if name not in have[axis]]:
+            raise StateError(f"these states lack the {axis} {listed(missing)}: they are of another document")
+    places = {axis: torch.tensor([have[axis].index(name) for name in want[axis]], dtype=torch.int64) for axis in AXES}
+    values: dict[str, Any] = {}
+    for name in (name for name in inputs.fields if name in SHAPES):
+        value = getattr(state, name)
+        if value is None:
+            raise StateError(f"these states have no {name}: they are of another document")
+        for dim, axis in enumerate(SHAPES[name], start=1):
+            if axis == "slot":
+                if value.shape[dim] < inputs.slots:
+                    raise StateError(f"these states have {value.shape[dim]} contacts of a pair, expected {inputs.slots}")
+                value = value.narrow(dim, 0, inputs.slots)
+            elif isinstance(axis, str):
+                value = value.index_select(dim, places[axis].to(value.device))
+        values[name] = value
+    parts = tuple(narrowed(part, have, inputs) for part in state.substeps)
+    return SceneState(**values, dt=state.dt, substeps=parts)
+
+
+def readings_of(touch: TactileModule, states: Sequence[SceneState], name: str) -> Float[np.ndarray, "step env row channel"]:
+    """Return what a module reads of states that follow each other, from a reset on; samples of blocks are rows."""
+    touch.free()
+    found = []
+    with torch.no_grad():
+        for state in states:
+            reading = touch(state.to(touch.device))[name].double().cpu()
+            found.append(reading.flatten(1, -2))
+    touch.free()
+    return torch.stack(found).numpy()
+
+
+def rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:
+    """Return which rows of another module's reading are where each row of a module's is; None: they are the same rows.
+
+    That is the row of the same link whose place is nearest; where several are as near, the reading is their mean.
+
+    Raises:
+        StateError: If rows differ and have no places.
+    """
+    here, there = (touch.rows.get(name) for touch in (own, other))
+    if here is None or there is None or (len(here) == len(there) and (here == there).all()):
+        return None
+    columns = here.dtype.names or ()
+    if not {"link", "pos"} <= set(columns):
+        raise StateError(f'readings of "{name}" differ in their rows, which have no places: {", ".join(columns)}')
+    found = []
+    for link, pos in zip(here["link"], here["pos"], strict=True):
+        at = np.flatnonzero(there["link"] == link)
+        distance = np.linalg.norm(there["pos"][at] - pos, axis=1)
+        found.append(at[distance <= distance.min() + TOGETHER])
+    return found
+
+
+def taken(readings: Float[np.ndarray, "step env row channel"], rows: list[np.ndarray] | None) -> np.ndarray:
+    """Return readings at rows of `rows_at`."""
+    return readings if rows is None else np.stack([readings[:, :, at].mean(axis=2) for at in rows], axis=2)

@@ -1,0 +1,1 @@
+"""Speed against error, oracles, and the state of an installation."""

@@ -1,0 +1,150 @@
+"""A bench as one HTML file that opens without a network: its tables, and a plot of speed against error for each sensor."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from html import escape
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from tgdsl.module.accuracy.errors import Interval
+from tgdsl.report.bench.results import Measured, Report, Subject
+from tgdsl.view.style import FAINT, INK
+
+FLOOR = 1e-9
+"""Errors below this are drawn here: an axis of powers of ten has no zero."""
+OWN, FRONT = "#c0392b", "#1f6f8b"
+STYLE = """
+body{font:15px/1.5 system-ui,sans-serif;color:#2b2f36;max-width:1100px;margin:2em auto;padding:0 1em}
+table{border-collapse:collapse;font-size:13px;margin:1em 0;width:100%}
+th,td{padding:.25em .6em;text-align:right;border-bottom:1px solid #e3e5e8;white-space:nowrap}
+th:first-child,td:first-child{text-align:left}
+tr.own td{font-weight:600;color:#c0392b} tr.front td:first-child::before{content:"● ";color:#1f6f8b}
+svg{max-width:100%;height:auto} .note{color:#7b828c;font-size:13px} nav a{margin-right:1em}
+"""
+
+
+def page(report: Report) -> str:
+    """Return the HTML file of a bench."""
+    names = [subject.name for subject in report.subjects]
+    links = "".join(f'<a href="#{escape(name)}">{escape(name)}</a>' for name in names)
+    return "\n".join(
+        [
+            "<!DOCTYPE html>",
+            '<html lang="en"><head><meta charset="utf-8">',
+            f"<title>tgdsl bench: {escape(report.document)}</title><style>{STYLE}</style></head><body>",
+            f"<h1>{escape(report.document)}: speed against error</h1>",
+            f'<p class="note">{escape(report.states)}.<br>{escape(report.machine)}.</p>',
+            "<p>● on the front: nothing else is better in time or error and worse in neither; where 95 % intervals overlap, "
+            "two count as equal. Red: what the compiler takes now. Errors: relative to the largest change of a quantity.</p>",
+            f"<nav>{links}</nav>",
+            *(_section(subject, i) for i, subject in enumerate(report.subjects)),
+            "</body></html>",
+        ]
+    )
+
+
+def _section(subject: Subject, index: int) -> str:
+    scales = ", ".join(f"{name} {scale}" for name, scale in subject.magnitudes.items())
+    lines = [
+        f'<section id="{escape(subject.name)}"><h2>{escape(subject.name)} <small>{escape(subject.kind)}</small></h2>',
+        f"<p>Errors are against: {escape(subject.reference)}. Magnitudes: {escape(scales)}. {escape(subject.check)}</p>",
+        plot(subject, f"tgdsl{index}"),
+        _table(subject),
+    ]
+    lines += [f'<p class="note">not to be had: {escape(label)}: {escape(why)}</p>' for label, why in subject.left_out]
+    return "\n".join([*lines, "</section>"])
+
+
+def _table(subject: Subject) -> str:
+    header, *rows = cells_of(subject)
+    lines = ["<table><tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in header) + "</tr>"]
+    for point, row in zip(subject.points, rows, strict=True):
+        marks = " ".join(name for name, is_on in (("own", point.is_own), ("front", point.is_on_front)) if is_on)
+        lines.append(f'<tr class="{marks}">' + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>")
+    return "\n".join([*lines, "</table>"])
+
+
+def cells_of(subject: Subject) -> Iterator[tuple[str, ...]]:
+    """Yield the header and a row for each variant, for people to read."""
+    own = subject.own
+    times = tuple(f"ms, {num} envs" for num in own.times)
+    costs = ("operations", "constants", "state", "output")
+    yield ("variant", "precision", "RMS error", "99 % within", "largest", "RMS, verified", *times, "× now", *costs)
+    for point in subject.points:
+        spans = tuple(_span(interval, 1e3, ".3g") for interval in point.times.values())
+        cost = (point.cost.constants, point.cost.state, point.cost.output)
+        operations = "–" if point.cost.operations is None else f"{point.cost.operations}"
+        yield (
+            point.label,
+            point.precision,
+            _span(point.chosen.rms, 1.0, ".1e"),
+            f"{point.chosen.p99:.1e}",
+            f"{point.chosen.largest.value:.1e}" if point.chosen.is_finite and point.verified.is_finite else "not finite",
+            f"{point.verified.rms.value:.1e}",
+            *spans,
+            f"{point.time.value / own.time.value:.2f}",
+            operations,
+            *map(_bytes, cost),
+        )
+
+
+def _span(interval: Interval, factor: float, form: str) -> str:
+    value, low, high = (f"{factor * part:{form}}" for part in interval)
+    return f"{value} [{low}, {high}]"
+
+
+def _bytes(size: int) -> str:
+    return f"{size / 2**20:.1f} MiB" if size >= 2**20 else f"{size / 2**10:.1f} KiB" if size >= 2**10 else f"{size} B"
+
+
+def plot(subject: Subject, salt: str) -> str:
+    """Return a plot of time against RMS error as SVG, to stand in HTML.
+
+    Args:
+        subject: What is drawn.
+        salt: What makes the identifiers in it differ from those of other plots.
+    """
+    figure = Figure(figsize=(9.5, 4.2))
+    axes = figure.add_subplot()
+    for i, point in enumerate(subject.points):
+        _draw(axes, point, i)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(f"time of a call, {max(subject.points[0].times)} environments [ms]")
+    axes.set_ylabel("RMS error, of the magnitude")
+    axes.grid(True, which="major", color="#e3e5e8", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.margins(0.12)
+    figure.tight_layout()
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "none"}):
+        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    drawn = text.getvalue()
+    drawn = re.sub(r'<g id="[^"]*"', "<g", drawn)  # nothing refers to groups, and their names are the same in all plots
+    return re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", drawn[drawn.index("<svg") :]).replace("xlink:href", "href")
+
+
+def _draw(axes: Axes, point: Measured, index: int) -> None:
+    times, errors = ([factor * part for part in own] for factor, own in ((1e3, point.time), (1.0, point.chosen.rms)))
+    x, (y, low, high) = times, (max(part, FLOOR) for part in errors)
+    color = OWN if point.is_own else FRONT if point.is_on_front else FAINT
+    is_marked = point.is_own or point.is_on_front
+    axes.errorbar(
+        x[0],
+        y,
+        xerr=[[max(x[0] - x[1], 0.0)], [max(x[2] - x[0], 0.0)]],
+        yerr=[[max(y - low, 0.0)], [max(high - y, 0.0)]],
+        fmt="o" if point.is_on_front else "s",
+        color=color,
+        markersize=7 if is_marked else 5,
+        elinewidth=0.9,
+    )
+    label = f"{point.label}, {point.precision}" + (" (now)" if point.is_own else "")
+    offset = (6, 5 if index % 2 else -11)
+    axes.annotate(label, (x[0], y), textcoords="offset points", xytext=offset, fontsize=7.5, color=INK)

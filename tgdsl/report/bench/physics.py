@@ -1,0 +1,162 @@
+"""The physics under other options: how far objects and joints end up from where a fine run has them, and what a step takes.
+
+Shapes: `step` control steps, `env` environments, `actuator` actuators, `coordinate` joint angles and positions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import SimulationError
+from tgdsl.module.accuracy.errors import errors_of, magnitude_of
+from tgdsl.module.module import TactileModule
+from tgdsl.plan.plan import Plan
+from tgdsl.report.bench.front import front_of
+from tgdsl.report.bench.recording import varied
+from tgdsl.report.bench.results import Cost, Measured, Subject
+from tgdsl.report.bench.timing import median_of
+from tgdsl.runtime.scripted import Script
+from tgdsl.scene.scene import scene_model
+from tgdsl.sensors.known import known_kinds
+
+FINE = 4
+"""How many times smaller the time step of the fine run is."""
+ITERATIONS, TOLERANCE = 400, 1e-12
+"""Of the solver in the fine run."""
+
+
+class Setting(NamedTuple):
+    """MuJoCo's options, and physics steps per control step."""
+
+    label: str
+    options: dict[str, Any]
+    substeps: int
+    is_own: bool = False
+
+
+def settings(model: mujoco.MjModel, substeps: int) -> list[Setting]:
+    """Return options that trade speed for error; all control steps are equally long.
+
+    Args:
+        model: The scene.
+        substeps: Physics steps of a control step, as the user has them.
+    """
+    step, cones = model.opt.timestep, ("pyramidal", "elliptic")
+    found = [Setting(f"as written: {cones[model.opt.cone]} cone, time step {1e3 * step:g} ms", {}, substeps, True)]
+    found.append(Setting(f"{cones[1 - model.opt.cone]} cone", {"cone": cones[1 - model.opt.cone]}, substeps))
+    found += [Setting(f"{n} iterations", {"iterations": n}, substeps) for n in (1, 3, 10) if n != model.opt.iterations]
+    for times in (substeps, 0.5):
+        if substeps / times >= 1 and times != 1:
+            own = round(substeps / times)
+            found.append(Setting(f"time step {1e3 * step * times:g} ms", {"timestep": step * times}, own))
+    return found
+
+
+def measure_physics(
+    plan: Plan, script: Script, num_envs: int, steps: int, substeps: int, seed: int, progress: Progress = silent
+) -> Subject:
+    """Return the physics of a scene under several options.
+
+    Errors are of joint angles and positions along the run, relative to how far they move, against a run with a time step
+    `FINE` times smaller, as the document's cone has it. Step by step all runs take turns, on the CPU.
+
+    Args:
+        plan: A Plan of the scene.
+        script: How it is run.
+        num_envs: Environments.
+        steps: Control steps, about.
+        substeps: Physics steps of each.
+        seed: Of what differs between environments.
+        progress: Is told what is done.
+
+    Raises:
+        SimulationError: If the scene cannot be simulated.
+    """
+    model = scene_model(plan.scene)
+    fine = {"timestep": model.opt.timestep / FINE, "iterations": ITERATIONS, "tolerance": TOLERANCE}
+    tried = [*settings(model, substeps), Setting("fine", fine, FINE * substeps)]
+    phases = 1 if script.keyframes is None and script.closing is None else 3
+    seconds = steps / phases * substeps * model.opt.timestep
+    runs = [script.begin(TactileModule(plan, known_kinds()), num_envs, own.substeps, seconds, own.options) for own in tried]
+    controls = _controls(runs[0].controls, runs[0].sim.model, num_envs, seed)
+    found: list[list[np.ndarray]] = [[] for _ in tried]
+    times: list[list[float]] = [[] for _ in tried]
+    faults: dict[int, str] = {}
+    for i, control in enumerate(controls):
+        progress(f"physics: step {i + 1} of {len(controls)} under {len(tried)} settings")
+        for k, run in enumerate(runs):
+            if k in faults:
+                continue
+            start = time.perf_counter()
+            try:
+                run.sim.step(control)
+            except SimulationError as error:
+                faults[k] = str(error)
+                continue
+            times[k].append(time.perf_counter() - start)
+            found[k].append(run.sim.qpos.cpu().numpy().copy())
+    for run in runs:
+        run.sim.close()
+    if len(tried) - 1 in faults or 0 in faults:
+        raise SimulationError(faults.get(len(tried) - 1) or faults[0])
+    return _subject(tried, faults, found, times, model, num_envs, seed)
+
+
+def _controls(controls: np.ndarray, model: mujoco.MjModel, num_envs: int, seed: int) -> Float[np.ndarray, "step env actuator"]:
+    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
+    return varied(controls, ranges, num_envs, seed)
+
+
+def _subject(
+    tried: list[Setting],
+    faults: dict[int, str],
+    found: list[list[np.ndarray]],
+    times: list[list[float]],
+    model: mujoco.MjModel,
+    num_envs: int,
+    seed: int,
+) -> Subject:
+    """Return the settings with their errors."""
+    columns, quantities = coordinates(model)
+    paths = {k: np.stack(own)[:, :, None, columns] for k, own in enumerate(found) if k not in faults}
+    exact = paths[len(tried) - 1]
+    magnitude = magnitude_of(exact, quantities)
+    cost = Cost(None, 0, 8 * (model.nq + model.nv), 8 * (model.nq + model.nv))
+    points = []
+    for k, setting in enumerate(tried[:-1]):
+        if k in faults:
+            continue
+        chosen, verified = (
+            errors_of(paths[k][:, i::2], exact[:, i::2], magnitude._replace(active=magnitude.active[:, i::2]), seed=seed)
+            for i in (0, 1)
+        )
+        time_of_step = {num_envs: median_of(np.array(times[k]))}
+        points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))
+    on_front = front_of([(point.time, point.chosen.rms) for point in points])
+    units = {"angle": "rad", "position": "m"}
+    scales = {name: f"{scale:.4g} {units[name]}" for name, scale in zip(quantities, magnitude.scale, strict=True)}
+    points = [dataclasses.replace(point, is_on_front=own) for point, own in zip(points, on_front, strict=True)]
+    what = f"time step 1/{FINE}, up to {ITERATIONS} iterations to {TOLERANCE:g}"
+    left_out = tuple((tried[k].label, why) for k, why in faults.items())
+    return Subject("physics", "physics", what, "", scales, tuple(points), left_out)
+
+
+def coordinates(model: mujoco.MjModel) -> tuple[list[int], list[str]]:
+    """Return which of `qpos` are joint angles and positions, and which of both each is; orientations are left out."""
+    columns, quantities = [], []
+    for joint in range(model.njnt):
+        first, kind = int(model.jnt_qposadr[joint]), int(model.jnt_type[joint])
+        if kind == mujoco.mjtJoint.mjJNT_FREE:
+            columns += [first, first + 1, first + 2]
+            quantities += ["position"] * 3
+        elif kind != mujoco.mjtJoint.mjJNT_BALL:
+            columns.append(first)
+            quantities.append("angle" if kind == mujoco.mjtJoint.mjJNT_HINGE else "position")
+    return columns, quantities

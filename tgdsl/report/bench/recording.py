@@ -1,0 +1,188 @@
+"""States that errors are measured on: of a run of the scene, or of a file.
+
+Shapes: `step` control steps, `env` environments, `actuator` actuators.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import StateError, TgdslError
+from tgdsl.files.write import atomic_open, with_folder
+from tgdsl.module.accuracy.states import names_of, narrowed
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SHAPES, SceneState
+from tgdsl.plan.inputs import Inputs
+from tgdsl.runtime.scripted import Script, script_of
+
+LEAST_ENVS = 2
+"""Half of the environments choose, the other half verify."""
+SWAY, PERIODS = 0.03, (0.05, 0.4)
+"""Amplitude of what is added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
+REACH = (0.5, 1.1)
+"""How far each environment's controls go from their start, of the script's own."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """States of a scene, one after the other.
+
+    Attributes:
+        states: The states.
+        names: What stands at each place of the axes of their fields.
+        source: Where they are from.
+    """
+
+    states: tuple[SceneState, ...]
+    names: dict[str, list[str]]
+    source: str
+
+    @property
+    def num_envs(self) -> int:
+        """Number of environments."""
+        assert self.states[0].body_pos is not None
+        return self.states[0].body_pos.shape[0]
+
+    def for_module(self, inputs: Inputs) -> list[SceneState]:
+        """Return what a module wants of them.
+
+        Raises:
+            StateError: If they are of another document.
+        """
+        return [narrowed(state, self.names, inputs) for state in self.states]
+
+
+def varied(
+    controls: Float[np.ndarray, "step actuator"], ranges: Float[np.ndarray, "actuator 2"], num_envs: int, seed: int
+) -> Any:
+    """Return a script's controls as each environment has them: it goes further or less far, and sways.
+
+    Args:
+        controls: The script's.
+        ranges: Lowest and highest control of each actuator; 0 and 0: it has none.
+        num_envs: Environments.
+        seed: What differs between environments follows from it.
+
+    Returns:
+        (step, env, actuator); the first environment's are the script's own.
+    """
+    rng = np.random.default_rng(seed)
+    num_steps, num = controls.shape
+    reach = rng.uniform(*REACH, size=(num_envs, 1))
+    period, phase = rng.uniform(*PERIODS, size=(num_envs, num)), rng.uniform(0, 2 * np.pi, size=(num_envs, num))
+    reach[0], is_own = 1.0, np.arange(num_envs)[:, None] == 0
+    time = np.linspace(0, 1, num_steps)[:, None, None]
+    width = ranges[:, 1] - ranges[:, 0]
+    sway = np.where(is_own, 0.0, SWAY * width * (np.sin(2 * np.pi * time / period + phase) - np.sin(phase)))
+    found = controls[0] + reach * (controls[:, None] - controls[0]) + sway
+    return np.where(width > 0, np.clip(found, ranges[:, 0], ranges[:, 1]), found)
+
+
+def record(
+    touch: TactileModule,
+    num_envs: int,
+    *,
+    steps: int = 90,
+    substeps: int = 5,
+    seed: int = 0,
+    script: Script | None = None,
+    progress: Progress = silent,
+) -> Recording:
+    """Run a module's scene by its script on the CPU, and keep every state.
+
+    Args:
+        touch: The module.
+        num_envs: Environments.
+        steps: Control steps, about.
+        substeps: Physics steps of each.
+        seed: Of what differs between environments.
+        script: How it is run; default: as `tgdsl run` does.
+        progress: Is told what is done.
+
+    Raises:
+        TgdslError: If there are fewer than two environments or no steps.
+        SimulationError: If the scene cannot be simulated.
+    """
+    if num_envs < LEAST_ENVS or steps < 1:
+        raise TgdslError(f"{num_envs} environments of {steps} steps: expected at least {LEAST_ENVS}, and at least one step")
+    from tgdsl.scene.scene import scene_model
+
+    script = script or script_of(touch, progress=progress)
+    phases = 1 if script.keyframes is None and script.closing is None else 3
+    seconds = steps / phases * substeps * scene_model(touch.plan.scene).opt.timestep
+    sim, controls = script.begin(touch, num_envs, substeps, seconds)
+    found = []
+    model = sim.model
+    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
+    for control in varied(controls, ranges, num_envs, seed):
+        progress(f"recording states: {len(found) + 1} of {len(controls)}")
+        sim.step(control)
+        found.append(_copy(sim.state()))
+    sim.close()
+    touch.free()
+    what = f"{len(found)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
+    return Recording(tuple(found), names_of(touch.inputs), f"scripted run: {what}")
+
+
+def _copy(state: SceneState) -> SceneState:
+    own = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    values: dict[str, Any] = {name: value.clone() if isinstance(value, Tensor) else value for name, value in own.items()}
+    return SceneState(**{**values, "substeps": tuple(_copy(part) for part in state.substeps)})
+
+
+def save_recording(recording: Recording, path: Path) -> None:
+    """Write states as an `.npz` file: each field (step, env, …), `dt` (step,) [s], and `names:<axis>`.
+
+    Raises:
+        FileError: If it cannot be written.
+        TgdslError: If the states have substeps, which such a file does not hold.
+    """
+    if any(state.substeps for state in recording.states):
+        raise TgdslError(f"{path}: these states have substeps, which a file of states does not hold")
+    first = recording.states[0]
+    fields = [name for name in SHAPES if getattr(first, name) is not None]
+    arrays = {name: torch.stack([getattr(state, name) for state in recording.states]).cpu().numpy() for name in fields}
+    arrays |= {f"names:{axis}": np.array(names, dtype=str) for axis, names in recording.names.items()}
+    if first.dt is not None:
+        arrays["dt"] = np.array([state.dt for state in recording.states])
+    with atomic_open(with_folder(path)) as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def load_recording(path: Path) -> Recording:
+    """Read states that `save_recording` wrote.
+
+    Raises:
+        StateError: If the file cannot be read, is none of states, or holds too few.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, EOFError, ValueError, BadZipFile, TypeError, AttributeError) as error:
+        raise StateError(f"{path}: expected an .npz file of states: {error}") from error
+    fields = [name for name in SHAPES if name in arrays]
+    if "body_pos" not in fields or "names:body" not in arrays:
+        raise StateError(
+            f"{path}: expected states, with the arrays body_pos and names:body; found {', '.join(arrays) or 'none'}"
+        )
+    steps, envs = arrays["body_pos"].shape[:2]
+    if envs < LEAST_ENVS or not steps:
+        raise StateError(f"{path}: {steps} steps of {envs} environments: expected at least {LEAST_ENVS}, and at least one step")
+    if wrong := [name for name in fields if arrays[name].shape[:2] != (steps, envs)]:
+        raise StateError(f"{path}: {wrong[0]} has shape {arrays[wrong[0]].shape}, expected ({steps}, {envs}, …)")
+    tensors = {name: torch.from_numpy(arrays[name]) for name in fields}
+    dt: Sequence[float | None] = arrays["dt"].tolist() if "dt" in arrays else [None] * steps
+    states = [SceneState(**{name: value[i] for name, value in tensors.items()}, dt=dt[i]) for i in range(steps)]  # type: ignore[arg-type]
+    names = {name.removeprefix("names:"): own.tolist() for name, own in arrays.items() if name.startswith("names:")}
+    return Recording(tuple(states), names, f"{path}: {steps} steps in {envs} environments")

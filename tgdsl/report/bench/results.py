@@ -1,0 +1,123 @@
+"""What a bench finds, and its rows for a table or a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tgdsl.module.accuracy.errors import Errors, Interval
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a variant takes, counted.
+
+    Attributes:
+        operations: Elementary operations of one environment's call; None: not counted.
+        constants: Of all environments together [bytes].
+        state: What each environment carries from call to call [bytes].
+        output: What each environment's call returns [bytes].
+    """
+
+    operations: int | None
+    constants: int
+    state: int
+    output: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A variant, measured.
+
+    Attributes:
+        label: What to call it.
+        precision: Of what is computed and returned.
+        is_own: Whether it is what the compiler takes now.
+        chosen: Errors on the environments that the front is drawn from, relative to the reading's magnitude.
+        verified: The same on the others.
+        times: Median time of a call [s], by the number of environments.
+        cost: What it takes, counted.
+        is_on_front: Whether no other is better in time or error, and worse in neither; where intervals overlap two are equal.
+    """
+
+    label: str
+    precision: str
+    is_own: bool
+    chosen: Errors
+    verified: Errors
+    times: Mapping[int, Interval]
+    cost: Cost
+    is_on_front: bool = False
+
+    @property
+    def time(self) -> Interval:
+        """Median time of a call with the most environments [s]."""
+        return self.times[max(self.times)]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A sensor, or the physics, in all variants.
+
+    Attributes:
+        name: Its name.
+        kind: Its kind.
+        reference: What errors are measured against.
+        check: How far that is from the kind's float64 definition; empty: not compared.
+        magnitudes: What each quantity's errors are relative to, with its unit.
+        points: The variants.
+        left_out: Variants that cannot be had, and why.
+    """
+
+    name: str
+    kind: str
+    reference: str
+    check: str
+    magnitudes: Mapping[str, str]
+    points: tuple[Measured, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+    @property
+    def own(self) -> Measured:
+        """What the compiler takes now."""
+        return next(point for point in self.points if point.is_own)
+
+
+@dataclass(frozen=True)
+class Report:
+    """A bench.
+
+    Attributes:
+        document: The document.
+        machine: Where times were measured.
+        states: Where the states are from.
+        subjects: Sensors, and physics.
+    """
+
+    document: str
+    machine: str
+    states: str
+    subjects: tuple[Subject, ...]
+
+
+def rows_of(report: Report) -> Iterator[dict[str, Any]]:
+    """Yield a row for each variant: what stands in the files."""
+    for subject in report.subjects:
+        own = subject.own
+        for point in subject.points:
+            row: dict[str, Any] = {"subject": subject.name, "kind": subject.kind}
+            row |= {"variant": point.label, "precision": point.precision, "is_own": point.is_own}
+            row |= {"is_on_front": point.is_on_front}
+            for half, errors in (("", point.chosen), ("verified_", point.verified)):
+                row |= _spread(f"{half}rms", errors.rms) | _spread(f"{half}largest", errors.largest)
+                row |= {f"{half}p99": errors.p99, f"{half}is_finite": errors.is_finite}
+            for num_envs, interval in point.times.items():
+                row |= _spread(f"seconds_{num_envs}_envs", interval)
+            row |= {"times_own": point.time.value / own.time.value, "operations": point.cost.operations}
+            row |= {f"{name}_bytes": getattr(point.cost, name) for name in ("constants", "state", "output")}
+            yield row
+
+
+def _spread(name: str, interval: Interval) -> dict[str, float]:
+    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}

@@ -1,0 +1,260 @@
+"""What an installation has: packages, devices, compilers and caches, and what follows where something is missing.
+
+Nothing is imported that need not be: a package is known by its metadata, a compiler by its program.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+from tgdsl.errors import TgdslError
+from tgdsl.files import cache
+
+Level = Literal["fault", "slower", "missing", "note"]
+"""`fault`: what is installed computes wrongly, or refuses to work; `slower`: the same readings, later; `missing`: tgdsl can do
+something that is not to be had; `note`: nothing is to be done."""
+
+WITHOUT: Mapping[str, tuple[Level, str]] = {
+    "gymnasium": ("missing", "no vector environments of gymnasium: TouchEnv and rsl_rl's adapter remain"),
+    "imageio-ffmpeg": ("missing", "`tgdsl play --video` is refused"),
+    "mujoco-warp": ("missing", 'physics on a GPU is refused: `tgdsl.simulate(device="cuda")`; MuJoCo on the CPU remains'),
+    "pycollada": ("missing", "Collada meshes (.dae) of URDF files are refused"),
+    "pyserial": ("missing", "a real hand cannot be connected; its emulator and logs remain"),
+    "ray": ("missing", "`tgdsl sweep` is refused; single runs remain"),
+    "rsl-rl-lib": ("missing", "`tgdsl train` is refused; environments remain"),
+    "tensordict": ("missing", "`tgdsl train` and the adapter for rsl_rl are refused"),
+    "triton": ("slower", "on a GPU, torch's operations stand in for the kernels written in Triton; a CPU needs none"),
+    "warp-lang": ("missing", "`query: raycast` is refused; analytic shapes and distance grids remain"),
+}
+"""What follows if a package is not installed that tgdsl can do without."""
+CPP = "C++, for modules on a CPU"
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that tgdsl uses.
+
+    Attributes:
+        name: Its name.
+        installed: The version that is installed; None: it is not.
+        wanted: The versions that tgdsl works with, as pip writes them.
+        extra: The extra that brings it, as in `pip install "tgdsl[gpu]"`; empty: it always comes.
+    """
+
+    name: str
+    installed: str | None
+    wanted: str
+    extra: str
+
+    @property
+    def fits(self) -> bool:
+        """Whether what is installed is among what is wanted; without the package, True."""
+        return self.installed is None or Requirement(f"x{self.wanted}").specifier.contains(self.installed, prereleases=True)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a user should know.
+
+    Attributes:
+        level: How bad it is.
+        what: What was found.
+        then: What follows, or what to do.
+    """
+
+    level: Level
+    what: str
+    then: str
+
+
+@dataclass(frozen=True)
+class Installation:
+    """What was found.
+
+    Attributes:
+        system: Python, operating system, processor, by name.
+        packages: The packages that tgdsl uses.
+        devices: Where a module can be, and what of it torch says.
+        compilers: What compiles kernels, by name: its place or version; None: there is none.
+        caches: Folders of what was compiled or computed before, and their sizes [bytes]; None: there is no such folder.
+        findings: What a user should know, the worst first.
+    """
+
+    system: Mapping[str, str]
+    packages: tuple[Package, ...]
+    devices: Mapping[str, str]
+    compilers: Mapping[str, str | None]
+    caches: Mapping[str, int | None]
+    findings: tuple[Finding, ...]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing that was found is a fault."""
+        return all(finding.level != "fault" for finding in self.findings)
+
+
+def examine() -> Installation:
+    """Look at this installation.
+
+    Raises:
+        TgdslError: If tgdsl itself is not installed, so that nobody knows what it wants.
+    """
+    known, places = packages(), devices()
+    compiled_by = compilers(known)
+    return Installation(system(), known, places, compiled_by, caches(), findings(known, compiled_by, places))
+
+
+def system() -> dict[str, str]:
+    """Return tgdsl's version, Python's, the operating system's, and how many processors there are."""
+    return {
+        "tgdsl": importlib.metadata.version("tgdsl"),
+        "Python": platform.python_version(),
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+        "processors": str(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+    }
+
+
+def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
+    """Return the packages that tgdsl uses, those of its own development left out.
+
+    Args:
+        requirements: As in the metadata of a package; default: tgdsl's.
+
+    Raises:
+        TgdslError: If tgdsl is not installed.
+    """
+    if requirements is None:
+        try:
+            requirements = importlib.metadata.requires("tgdsl") or []
+        except importlib.metadata.PackageNotFoundError as error:
+            raise TgdslError("tgdsl is not installed, it is only imported: pip install -e .") from error
+    found: dict[str, Package] = {}
+    for text in requirements:
+        own = Requirement(text)
+        marker = str(own.marker or "")
+        extra = match[1] if (match := re.search(r'extra == "(\w+)"', marker)) else ""
+        if own.marker is not None and not own.marker.evaluate({"extra": extra}):
+            continue
+        name = own.name.lower().replace("_", "-").replace(".", "-")
+        if extra == "dev" and name not in WITHOUT:
+            continue
+        if name not in found or found[name].extra == "dev":
+            found[name] = Package(name, installed_version(name), str(own.specifier), extra)
+    return tuple(sorted(found.values(), key=lambda package: (package.extra != "", package.name)))
+
+
+def installed_version(name: str) -> str | None:
+    """Return the version of a package; None if it is not installed."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def devices() -> dict[str, str]:
+    """Return where a module can be, by torch's name."""
+    import torch
+
+    found = {"cpu": f"{torch.get_num_threads()} threads"}
+    for i in range(torch.cuda.device_count()):
+        own = torch.cuda.get_device_properties(i)
+        found[f"cuda:{i}"] = f"{own.name}, {own.total_memory / 2**30:.0f} GiB, compute capability {own.major}.{own.minor}"
+    return found
+
+
+def compilers(known: Sequence[Package]) -> dict[str, str | None]:
+    """Return what compiles kernels."""
+    from tgdsl.module.calls import cpp_compiler
+
+    versions = {package.name: package.installed for package in known}
+    return {
+        CPP: cpp_compiler(),
+        "Triton, for modules on a GPU": versions.get("triton"),
+        "Warp, for physics on a GPU": versions.get("warp-lang"),
+    }
+
+
+def caches() -> dict[str, int | None]:
+    """Return the folders of what is kept between runs, and their sizes [bytes]."""
+    from tgdsl.tensors.torch_internals import inductor_cache
+
+    sizes: dict[str, int | None] = {str(cache.folder()): sum(entry.size for entry in cache.entries())}
+    for folder in (inductor_cache(), _warp_cache()):
+        sizes[str(folder)] = folder_size(folder) if folder.is_dir() else None
+    return sizes
+
+
+def _warp_cache() -> Path:
+    """Return where Warp keeps its kernels: it has a folder for each version."""
+    if own := os.environ.get("WARP_CACHE_PATH"):
+        return Path(own)
+    shared = os.environ.get("XDG_CACHE_HOME")
+    return (Path(shared) if shared else Path(os.path.expanduser("~/.cache"))) / "warp"
+
+
+def folder_size(folder: Path) -> int:
+    """Return the size of all files below a folder [bytes]."""
+    return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
+
+
+def findings(known: Sequence[Package], compiled_by: Mapping[str, str | None], places: Mapping[str, str]) -> tuple[Finding, ...]:
+    """Return what a user should know of some packages, compilers and devices, the worst first."""
+    has_gpu = any(name.startswith("cuda") for name in places)
+    found = [*_wrong_versions(known), *_known_faults(known), *_not_there(known, has_gpu)]
+    if compiled_by[CPP] is None:
+        found.append(Finding("slower", "no C++ compiler (g++, clang++ or $CXX)", "`module.compile()` on a CPU leaves it eager"))
+    if not has_gpu:
+        found.append(
+            Finding("note", "torch sees no GPU", "everything runs on the CPU; `python -m torch.utils.collect_env` says more")
+        )
+    order: tuple[Level, ...] = ("fault", "slower", "missing", "note")
+    return tuple(sorted(found, key=lambda finding: order.index(finding.level)))
+
+
+def _wrong_versions(known: Sequence[Package]) -> list[Finding]:
+    found = []
+    for package in known:
+        install = f'pip install "{package.name}{package.wanted}"'
+        if not package.extra and package.installed is None:
+            found.append(Finding("fault", f"{package.name} is not installed, and tgdsl cannot do without it", install))
+        elif not package.fits:
+            found.append(Finding("fault", f"{package.name} is {package.installed}, expected {package.wanted}", install))
+    return found
+
+
+def _known_faults(known: Sequence[Package]) -> list[Finding]:
+    """Return faults of what is installed that tgdsl's own range of versions does not tell of."""
+    versions = {package.name: package.installed for package in known}
+    found = []
+    mujoco, warp = versions.get("mujoco"), versions.get("mujoco-warp")
+    if mujoco and Version(mujoco) == Version("4.0.0"):
+        what = "MuJoCo 4.0.0 has a fault in its solver where Jacobians are sparse"
+        found.append(Finding("fault", what, "forces are wrong there: take another version"))
+    if mujoco and warp and Version(mujoco).release[:2] != Version(warp).release[:2]:
+        what = f"MuJoCo {mujoco} beside MuJoCo Warp {warp}"
+        found.append(Finding("fault", what, "their models differ between such versions: take the same of both"))
+    torch = versions.get("torch")
+    if torch and Version(torch) >= Version("2.11"):
+        what = f"torch {torch} compiles a copy wrongly whose source is changed after it (pytorch#198131)"
+        found.append(Finding("note", what, "tgdsl compiles nothing that does so; look out in a step of your own"))
+    return found
+
+
+def _not_there(known: Sequence[Package], has_gpu: bool) -> list[Finding]:
+    found = []
+    for package in known:
+        if package.installed is None and package.name in WITHOUT and (has_gpu or package.name != "triton"):
+            level, then = WITHOUT[package.name]
+            extra = f'pip install "tgdsl[{package.extra}]"' if package.extra != "dev" else f"pip install {package.name}"
+            found.append(Finding(level, f"{package.name} is not installed", f"{then} ({extra})"))
+    return found

@@ -1,0 +1,146 @@
+"""How good a policy is: episodes without exploration, the same for all policies.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.actor import Actor
+
+SEED = 1_000_003
+"""What is random in the episodes follows from it, whatever a policy was learned with."""
+Z95 = 1.959963984540054
+CHECKED_EVERY = 40
+"""Control steps after which the host looks whether all episodes have ended."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What episodes were; intervals are of 95 %.
+
+    Attributes:
+        task: The task.
+        unit: Unit of the score.
+        episodes: How many there were.
+        envs: In how many environments.
+        seed: What was random in them follows from it.
+        score: Mean of the score.
+        score_interval: Its interval.
+        held: Share of the episodes that did not end for good: without a drop.
+        held_interval: Its interval, Wilson's.
+        episode_return: Mean of the sum of rewards.
+        seconds: Mean of the duration [s].
+        faults: How many a fault ended.
+    """
+
+    task: str
+    unit: str
+    episodes: int
+    envs: int
+    seed: int
+    score: float
+    score_interval: tuple[float, float]
+    held: float
+    held_interval: tuple[float, float]
+    episode_return: float
+    seconds: float
+    faults: int
+
+    def plain(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        low, high = self.score_interval
+        least, most = self.held_interval
+        return (
+            f"score {self.score:.3f} {self.unit} (95 %: {low:.3f} to {high:.3f}) in {self.episodes:,} episodes; "
+            f"{self.held:.1%} (95 %: {least:.1%} to {most:.1%}) without a drop"
+        )
+
+
+def evaluate(env: TouchEnv, actor: Actor, episodes: int = 1000, seed: int = SEED) -> Evaluation:
+    """Let an actor act, and return how good that was: see `evaluate_each`."""
+    return evaluate_each(env, actor, 1, episodes, seed)[0]
+
+
+def evaluate_each(env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000, seed: int = SEED) -> list[Evaluation]:
+    """Let an actor act, and return how good that was in each block of environments.
+
+    Each environment's first episodes count, as many of each, so that short ones do not count more often than long ones.
+
+    Args:
+        env: The environments; they begin anew.
+        actor: Who acts.
+        blocks: How many blocks they are: as many environments each, one block after the other.
+        episodes: How many episodes count of each block.
+        seed: What all that is random in the environments follows from.
+    """
+    size = env.num_envs // blocks
+    quota = torch.full((blocks, size), episodes // size, dtype=torch.int64, device=env.device)
+    quota[:, : episodes % size] += 1
+    quota = quota.flatten()
+    done, sums = torch.zeros_like(quota), torch.zeros((6, env.num_envs), dtype=torch.float64, device=env.device)
+    obs, index = env.reset(seed), 0
+    actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+    while index % CHECKED_EVERY or bool((done < quota).any()):
+        step = env.step(actor(obs))
+        info, obs, index = step.info, step.obs, index + 1
+        counts = info.ended & (done < quota)
+        score = info.score.double()
+        told = [score, score.square(), ~step.terminated, info.episode_return, info.episode_steps, info.faults]
+        sums += torch.where(counts, torch.stack([value.double() for value in told]), 0.0)
+        done += counts
+        actor.begin(info.ended)
+    each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
+    return [_evaluation(env, own, episodes, min(size, episodes), seed) for own in each]
+
+
+def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int) -> Evaluation:
+    """Return what episodes were, by sums over them."""
+    total, squares, held, paid, steps, faults = sums
+    mean = total / episodes
+    share = held / episodes
+    return Evaluation(
+        task=env.spec.task,
+        unit=env.task.score_unit,
+        episodes=episodes,
+        envs=envs,
+        seed=seed,
+        score=mean,
+        score_interval=mean_interval(mean, squares, episodes),
+        held=share,
+        held_interval=share_interval(share, episodes),
+        episode_return=paid / episodes,
+        seconds=steps / episodes * env.control_step,
+        faults=round(faults),
+    )
+
+
+def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:
+    """Return the 95 % interval of a mean.
+
+    Args:
+        mean: The mean.
+        squares: Sum of the squares.
+        num: How many numbers there were; of one alone nothing is known.
+    """
+    if num < 2:
+        return -math.inf, math.inf
+    half = Z95 * math.sqrt(max(0.0, squares - num * mean**2) / (num - 1) / num)
+    return mean - half, mean + half
+
+
+def share_interval(share: float, num: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share of a number of trials."""
+    z = Z95
+    middle = (share + z * z / (2 * num)) / (1 + z * z / num)
+    half = z / (1 + z * z / num) * math.sqrt(share * (1 - share) / num + z * z / (4 * num * num))
+    return max(0.0, middle - half), min(1.0, middle + half)

@@ -1,0 +1,183 @@
+"""Who is taught in which environments: a student per type, placement, noise and seed, each in a block of its own.
+
+Shapes: `feature` numbers of a group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.layout.layout import Layout
+from tgdsl.module.taxels.tables import image_indices
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import ACTOR_GROUPS
+from tgdsl.rl.sensed import GROUP, PER_LINK, SENSED, Felt
+from tgdsl.rl.students.encoders import Encoder, Grid
+from tgdsl.rl.students.spec import StudentNetworksSpec
+from tgdsl.rl.students.student import Architecture
+
+NONE = "none"
+"""The type that feels nothing."""
+
+
+class StudentError(TgdslError):
+    """Students that cannot be dealt out."""
+
+
+@dataclass(frozen=True)
+class StudentKey:
+    """Who is taught.
+
+    Attributes:
+        felt: What it feels; None: nothing.
+        seed: What its first weights follow from.
+    """
+
+    felt: Felt | None
+    seed: int
+
+    @property
+    def kind(self) -> tuple[str, str, str]:
+        """Type, placement and noise; the latter two are empty of one that feels nothing."""
+        return (NONE, "", "") if self.felt is None else (self.felt.type, self.felt.placement, self.felt.noise)
+
+    @property
+    def name(self) -> str:
+        """Its name, which is a file's too."""
+        return "-".join([*(part for part in self.kind if part), f"s{self.seed}"]).replace("*", "_").replace("/", "_")
+
+
+def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequence[str], seeds: int) -> list[StudentKey]:
+    """Return a student per type, placement, noise and seed; of those that feel nothing, one per seed.
+
+    Args:
+        types: Types by name; `all`: those that there are.
+        placements: Where they feel.
+        noises: Profiles of noise.
+        seeds: How many of each.
+
+    Raises:
+        StudentError: If there is no such type, something is named twice, or nobody is taught.
+    """
+    known = [NONE, *SENSED]
+    chosen = [name for type_ in types for name in (known if type_ == "all" else [type_])]
+    for name in chosen:
+        if name not in known:
+            raise StudentError(f'there is no type "{name}"; {did_you_mean(name, known, "types")}')
+    for what, names in (("types", chosen), ("placements", placements), ("noise", noises)):
+        if len(set(names)) < len(names):
+            raise StudentError(f"{what} {', '.join(names)}: one is named twice")
+        if not names:
+            raise StudentError(f"{what}: expected one at least")
+    if seeds < 1:
+        raise StudentError(f"{seeds} seeds, expected 1 at least")
+    felts = [
+        None if type_ == NONE else Felt(type_, placement, noise)
+        for type_ in chosen
+        for placement in placements
+        for noise in noises
+    ]
+    return [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
+
+
+def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:
+    """Return all that is felt, each once; `also` by a teacher."""
+    return list(dict.fromkeys(felt for felt in (*(key.felt for key in dealt), also) if felt is not None))
+
+
+def check_blocks(num_envs: int, num_students: int, num_variants: int) -> None:
+    """See that environments divide into blocks in which all variants of the object are, equally often.
+
+    Raises:
+        StudentError: If they do not.
+    """
+    unit = num_students * num_variants
+    if num_envs % unit:
+        of = f", {num_variants} variants of the object in the environments of each" if num_variants > 1 else ""
+        lower, upper = num_envs // unit * unit, (num_envs // unit + 1) * unit
+        near = f"{lower} or {upper}" if lower else f"{upper}"
+        raise StudentError(f"{num_envs} environments do not divide among {num_students} students{of}: expected {near}")
+
+
+def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
+    """Return the groups of observations that all students see, with `tactile_sensors` where touch stands among them.
+
+    Raises:
+        SpecError: If a group that is named is not there.
+    """
+    named = loaded.spec.distill.groups
+    for i, name in enumerate(named or ()):
+        if name not in groups:
+            what = f'there is no group of observations "{name}"'
+            raise loaded.error(("distill", "groups", i), what, did_you_mean(name, groups, "groups"))
+    if named:
+        return [*named, GROUP]
+    return [name for name in ACTOR_GROUPS if name in groups or name == GROUP]
+
+
+def seen_by(key: StudentKey, names: Sequence[str]) -> list[str]:
+    """Return the groups of observations that a student sees, in their order."""
+    own = [key.felt.group] if key.felt else []
+    return [group for name in names for group in (own if name == GROUP else [name])]
+
+
+def architecture(loaded: LoadedTask, env: TouchEnv, key: StudentKey, names: Sequence[str]) -> Architecture:
+    """Return a student's networks: students whose networks are equal are stacked.
+
+    Args:
+        loaded: The task's document.
+        env: The environments.
+        key: The student.
+        names: What `groups_of` returned.
+
+    Raises:
+        StudentError: If images are wanted of a type whose links are not all on grids.
+    """
+    own, parts = loaded.spec.distill.networks, []
+    for name in seen_by(key, names):
+        size = env.groups[name]
+        if key.felt is not None and name == key.felt.group:
+            encoder = _touch_encoder(own, key.felt, env.felt[name].layout, size)
+        else:
+            encoder = Encoder(own.kind, own.encoder.hidden, own.encoder.size)
+        parts.append((size, encoder))
+    heads = tuple(decoder.hidden for decoder in loaded.spec.distill.decoders.values())
+    return Architecture(tuple(parts), own.hidden, env.num_actions, heads, own.eps, own.clip)
+
+
+def _touch_encoder(own: StudentNetworksSpec, felt: Felt, layout: Layout, size: int) -> Encoder:
+    widths, kind = own.touch_encoder, own.touch_kind
+    if kind in ("cnn", "convrnn") and felt.type not in PER_LINK and layout.num_taxels and size % layout.num_taxels == 0:
+        return Encoder(kind, own.convolution.channels, widths.size, own.convolution.kernel, grid_of(layout, size, felt))
+    plain = {"cnn": "mlp", "convrnn": "lstm"}
+    return Encoder("lstm" if plain.get(kind, kind) == "lstm" else "mlp", widths.hidden, widths.size)
+
+
+def grid_of(layout: Layout, size: int, felt: Felt) -> Grid:
+    """Return where the taxels of a group stand in images.
+
+    Args:
+        layout: The taxels.
+        size: Size of the group.
+        felt: What it is of, for errors.
+
+    Raises:
+        StudentError: If the taxels of a link are on no grid.
+    """
+    try:
+        images = image_indices(layout)
+    except TgdslError as error:
+        raise StudentError(f"{felt.group}: {error}; take networks.touch_kind mlp") from error
+    if missing := [link.name for link in layout.links if link.name not in images]:
+        what = f"the taxels of {', '.join(missing)} are on no grid, and have no image"
+        raise StudentError(f"{felt.group}: {what}; take networks.touch_kind mlp")
+    shape = (len(images), max(len(image) for image in images.values()), max(image.shape[1] for image in images.values()))
+    cells = np.full(shape, -1, dtype=np.int64)
+    for link, image in enumerate(images.values()):
+        cells[link, : image.shape[0], : image.shape[1]] = image
+    return Grid(size // layout.num_taxels, layout.num_taxels, shape, tuple(cells.ravel().tolist()))

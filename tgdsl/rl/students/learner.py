@@ -1,0 +1,315 @@
+"""DAgger: students act, each in its block of environments, and learn what the teacher would have done there.
+
+An iteration is a rollout of `steps` control steps and `epochs` passes through it, a gradient step per `gradient_length` control
+steps. On a GPU, who acts and each pass are CUDA graphs, and the host waits once per iteration.
+
+Shapes: `env` environments, `student` students of a stack, `row` environments of a block, `joint`, `target` as in `student.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from tgdsl.errors import did_you_mean
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.students import losses
+from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
+from tgdsl.rl.students.rollout import Rollout, joined
+from tgdsl.rl.students.student import Architecture, Student, forgotten
+from tgdsl.rl.students.teacher import BoundTeacher
+from tgdsl.rl.train.graphs import Captured
+from tgdsl.rl.train.iteration import Clock, EpisodeTally, Iteration
+from tgdsl.rl.train.ranks import Ranks
+from tgdsl.tensors.torch_internals import copy_each
+
+
+class Distiller:
+    """Teaches students.
+
+    Attributes:
+        env: The environments.
+        ranks: The processes: one.
+        rollouts: The students by stack, in the order of their blocks.
+        groups: Groups of observations of each student by name.
+        iteration: How many iterations were made.
+        samples: How many control steps these took in all environments.
+    """
+
+    rates = "distill.learning_rate"
+    """What of the document makes smaller steps."""
+
+    def __init__(self, env: TouchEnv, loaded: LoadedTask, teacher: BoundTeacher, keys: Sequence[StudentKey], seed: int):
+        """Make the students; torch's own random generators are seeded.
+
+        Args:
+            env: The environments; they divide by the number of students.
+            loaded: Their task's document.
+            teacher: The teacher.
+            keys: The students.
+            seed: What is random in their actions follows from.
+
+        Raises:
+            SpecError: If a group of observations or a privileged number that is named is not there.
+            StudentError: If images are wanted of taxels on no grid.
+        """
+        self.env, self.ranks, self._teacher, self._spec = env, Ranks(), teacher, loaded.spec.distill
+        self.iteration = self.samples = 0
+        self._targets = self._checked_targets(loaded)
+        names = groups_of(loaded, env.groups)
+        stacked: dict[Architecture, list[StudentKey]] = {}
+        for key in keys:
+            stacked.setdefault(architecture(loaded, env, key, names), []).append(key)
+        self.rollouts: list[Rollout] = []
+        for networks, members in stacked.items():
+            self.rollouts.append(self._rollout(networks, members, names, env.num_envs // len(keys)))
+        self.keys = [key for own in self.rollouts for key in own.keys]
+        seen = [each for own in self.rollouts for each in own.seen]
+        self.groups = {key.name: list(each) for key, each in zip(self.keys, seen, strict=True)}
+        self._allocate()
+        torch.manual_seed(seed)
+
+    def iterate(self) -> Iteration:
+        """Make a rollout, and learn from it."""
+        self.roll()
+        self.learn()
+        return self._told()
+
+    @property
+    def episode_names(self) -> list[str]:
+        """What iterations tell of the episodes that ended, in those that had any."""
+        return [*self._tally.names, *(f"Score/{key.name}" for key in self.keys)]
+
+    def roll(self) -> None:
+        """Make a rollout; the host does not wait for a GPU, but for captures at the first calls."""
+        obs = self._begin()
+        self._clock.start()
+        for own in self.rollouts:
+            own.begun.copy_(own.memory)
+        for t in range(self._spec.steps):
+            self._see(obs)
+            self._chosen()
+            self._keep(t)
+            step = self.env.step(self._action)
+            obs, ended = step.obs, step.info.ended
+            self._ended[t].copy_(ended)
+            self._forget(ended)
+            self._tally.add(step)
+            counted = torch.stack([torch.ones_like(step.info.score), step.info.score]).double()
+            self._scores += torch.where(ended, counted, 0.0)
+        self._obs = obs
+        self._clock.split()
+
+    def learn(self) -> None:
+        """Learn from the rollout; likewise."""
+        self._losses.zero_()
+        for _ in range(self._spec.epochs):
+            self._learned()
+        self._looked()
+        self.iteration += 1
+        self.samples += self._spec.steps * self.env.num_envs
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is learned, and what learning goes on from."""
+        return {"stacks": [own.stack.state_dict() for own in self.rollouts]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved.
+
+        Raises:
+            RuntimeError: If networks are of other sizes; likewise ValueError and KeyError.
+        """
+        for own, saved in zip(self.rollouts, state["stacks"], strict=True):
+            own.stack.load_state_dict(saved)
+        for captured in (self._chosen, self._learned, self._looked):
+            captured.forget()
+
+    def go_on(self, steps: Tensor) -> None:
+        """Begin episodes that count as having lasted so many control steps, in place of any at random."""
+        self.go_on_from(self.env.reset())
+        self.env.steps.copy_(steps)
+
+    def go_on_from(self, obs: Mapping[str, Tensor]) -> None:
+        """Go on in environments that were put where others were; what was remembered of their episodes is forgotten."""
+        self._obs, self._is_begun = dict(obs), True
+        everyone = torch.ones(self.env.num_envs, dtype=torch.bool, device=self.env.device)
+        self._forget(everyone)
+
+    def student(self, index: int) -> Student:
+        """Return a copy of a student, on the CPU, by its number among `keys`."""
+        for own in self.rollouts:
+            if index < len(own.keys):
+                return own.stack.student(index)
+            index -= len(own.keys)
+        raise IndexError(index)
+
+    def acting(self) -> Actor:
+        """Return who acts in all environments: each student in its block, from now on by the weights that it has now."""
+        return ActingStudents(self)
+
+    # What is captured
+
+    def _choose(self) -> None:
+        """Have the teacher say what should be done, and each student act."""
+        with torch.no_grad():
+            self._label.copy_(self._teacher(self._seen))
+            for own, x in zip(self.rollouts, self._inputs, strict=True):
+                x.copy_(own.inputs(self._seen))
+                made = own.stack(x, own.memory)
+                own.memory.copy_(made.memory)
+                self._asked[own.envs].copy_(made.action.flatten(0, 1))
+            self._action.copy_(self._asked)
+            if self._spec.std:
+                self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
+
+    def _epoch(self) -> None:
+        """Go through the rollout once."""
+        spec, held = self._spec, [own.begun for own in self.rollouts]
+        for first in range(0, spec.steps, spec.gradient_length):
+            steps, count = slice(first, first + spec.gradient_length), 0
+            for i, own in enumerate(self.rollouts):
+                errors, held[i] = self._descend(own, steps, held[i])
+                self._losses[count : count + len(own.keys)] += errors
+                count += len(own.keys)
+
+    def _descend(self, own: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
+        """Take one gradient step of a stack; return the errors of its actions, and what it remembers then."""
+        spec = self._spec
+        told = total = torch.zeros(len(own.keys), device=memory.device)
+        parts = [steps] if own.stack.memory == 0 else [slice(t, t + 1) for t in range(steps.start, steps.stop)]
+        with torch.enable_grad():
+            for part in parts:  # without memory all steps are rows
+                x, before = (joined(values[part]) for values in (own.x, own.before))
+                label, targets, ended = (
+                    joined(own.split(values[part], 1)) for values in (self._labels, self._privileged, self._ended[..., None])
+                )
+                made = own.stack(x, memory if own.stack.memory else x[..., :0])
+                error = losses.behaviour(made.action, label, before, self._std, spec.clip) / len(parts)
+                told = told + error.detach()
+                total = total + error
+                if self._targets:
+                    total = total + losses.decoded(made.told, targets, self._scales, self._weights) / len(parts)
+                memory = forgotten(made.memory, ended[..., 0]) if own.stack.memory else memory
+            own.stack.descend(total)
+        return told, memory.detach()
+
+    def _look(self) -> None:
+        """Take what was seen into account in the students' normalisation."""
+        for own in self.rollouts:
+            for x in own.x:
+                own.stack.look(x)
+
+    # The rest
+
+    def _rollout(self, networks: Architecture, keys: list[StudentKey], names: Sequence[str], rows: int) -> Rollout:
+        """Make a stack, and room for its rollout."""
+        first = self.rollouts[-1].envs.stop if self.rollouts else 0
+        seen = tuple(tuple(seen_by(key, names)) for key in keys)
+        return Rollout.made(networks, tuple(keys), seen, first, rows, self._spec, self.env.device)
+
+    def _allocate(self) -> None:
+        """Make room for a rollout, and what is captured."""
+        env, spec, device = self.env, self._spec, self.env.device
+        num, actions, steps = env.num_envs, env.num_actions, spec.steps
+        seen = dict.fromkeys((*self._teacher.groups, *(name for names in self.groups.values() for name in names)))
+        self._seen = {name: torch.zeros((num, env.groups[name]), device=device) for name in seen}
+        self._inputs = [torch.zeros_like(own.x[0]) for own in self.rollouts]
+        self._action, self._asked, self._label = (torch.zeros((num, actions), device=device) for _ in range(3))
+        self._labels = torch.zeros((steps, num, actions), device=device)
+        self._ended = torch.zeros((steps, num), dtype=torch.bool, device=device)
+        self._privileged = torch.zeros((steps, num, len(self._targets)), device=device)
+        heads = spec.decoders.values()
+        self._scales, self._weights = (
+            torch.tensor([getattr(head, name) for head in heads], device=device) for name in ("scale", "weight")
+        )
+        self._std = self._teacher.std if spec.loss == "inverse_variance" else None
+        self._losses = torch.zeros(len(self.keys), device=device)
+        self._scores = torch.zeros((2, num), dtype=torch.float64, device=device)
+        has_tf32 = spec.precision == "tf32"
+        self._chosen = Captured(self._choose, device, has_tf32)
+        self._learned = Captured(self._epoch, device, has_tf32)
+        self._looked = Captured(self._look, device)
+        self._clock, self._tally, self._is_begun = Clock(device), EpisodeTally(), False
+
+    def _begin(self) -> dict[str, Tensor]:
+        """Return the observations to act on; at the first call, begin episodes, the first of which end at random times."""
+        if not self._is_begun:
+            self.go_on_from(self.env.reset())
+            self.env.steps.copy_(torch.randint_like(self.env.steps, self.env.max_steps))
+        return self._obs
+
+    def _see(self, obs: Mapping[str, Tensor]) -> None:
+        copy_each(list(self._seen.values()), [obs[name] for name in self._seen])
+
+    def _keep(self, t: int) -> None:
+        """Keep what was seen, asked for and said."""
+        self._labels[t].copy_(self._label)
+        for own, x in zip(self.rollouts, self._inputs, strict=True):
+            own.x[t].copy_(x)
+            own.before[t].copy_(own.split(self._asked))
+        if self._targets:
+            privileged = self.env.task.decoded(self.env.now)
+            self._privileged[t].copy_(torch.stack([privileged[name] for name in self._targets], dim=1))
+
+    def _forget(self, ended: Bool[Tensor, " env"]) -> None:
+        for own in self.rollouts:
+            own.memory.copy_(forgotten(own.memory, own.split(ended)))
+        self._teacher.begin(ended)
+
+    def _told(self) -> Iteration:
+        """Return what the last iteration was: the host waits for the device here, and only here."""
+        sums, count = self._tally.taken(), len(self.keys)
+        scores = self._scores.view(2, count, -1).sum(dim=2).flatten()
+        updates = self._spec.epochs * self._spec.steps // self._spec.gradient_length
+        told = torch.cat([sums, scores, (self._losses / updates).double().to(sums.device)]).tolist()
+        self._scores.zero_()
+        rollout, update = self._clock.stop()
+        made = self._tally.means(told[: len(sums)])
+        ended, score, loss = (told[len(sums) + i * count :][:count] for i in range(3))
+        for key, number, total, error in zip(self.keys, ended, score, loss, strict=True):
+            made |= {f"Score/{key.name}": total / number} if number else {}
+            made[f"Loss/{key.name}"] = error
+        return Iteration(round(told[0]), made, rollout, update)
+
+    def _checked_targets(self, loaded: LoadedTask) -> list[str]:
+        """Return the privileged numbers that decoders tell.
+
+        Raises:
+            SpecError: If the task has no such number.
+        """
+        named = list(self._spec.decoders)
+        known = list(self.env.task.decoded(self.env.now)) if named else []
+        for name in named:
+            if name not in known:
+                what = f'the task has no privileged number "{name}"'
+                raise loaded.error(("distill", "decoders", name), what, did_you_mean(name, known, "numbers"))
+        return named
+
+
+class ActingStudents(Actor):
+    """All students, each in its block."""
+
+    def __init__(self, distiller: Distiller):
+        """Begin episodes."""
+        self._rollouts = distiller.rollouts
+        self._memory = [torch.zeros_like(own.memory) for own in self._rollouts]
+
+    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        """Return the actions of each student for what its own environments let it see."""
+        actions = []
+        with torch.no_grad():
+            for i, own in enumerate(self._rollouts):
+                made = own.stack(own.inputs(obs), self._memory[i])
+                self._memory[i] = made.memory
+                actions.append(made.action.flatten(0, 1))
+        return torch.cat(actions)
+
+    def begin(self, ended: Bool[Tensor, " env"]) -> None:
+        """Forget episodes that have ended."""
+        self._memory = [forgotten(memory, own.split(ended)) for memory, own in zip(self._memory, self._rollouts, strict=True)]

@@ -1,0 +1,162 @@
+"""What students have learned: a policy file each, and a table of their scores.
+
+An interval over seeds and episodes is the wider one of two: Student's, of the means of the seeds, which spread by both but are
+few; and that of all episodes, as if seeds made no difference.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
+
+from scipy.stats import t as student_t
+
+from tgdsl.console.progress import Progress
+from tgdsl.console.tables import text_table
+from tgdsl.files.write import atomic_write, with_folder
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.evaluation import Evaluation
+from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+from tgdsl.rl.students.keys import StudentKey
+from tgdsl.rl.students.learner import Distiller
+from tgdsl.rl.students.student import deployed
+from tgdsl.rl.students.teacher import own_task
+from tgdsl.rl.train.policies import made_card, write_module
+
+
+class Row(NamedTuple):
+    """Students that differ in their seeds alone.
+
+    Attributes:
+        type: What they feel.
+        placement: Where.
+        resolution: How densely.
+        noise: With what noise.
+        seeds: How many they are.
+        score: Mean of the score.
+        low: Lower bound of its 95 % interval.
+        high: Upper bound.
+        held: Share of the episodes that did not end for good.
+        episodes: How many there were.
+        samples: Control steps of each student.
+        minutes: How long they have learned, with all others of the simulation [min].
+    """
+
+    type: str
+    placement: str
+    resolution: str
+    noise: str
+    seeds: int
+    score: float
+    low: float
+    high: float
+    held: float
+    episodes: int
+    samples: int
+    minutes: float
+
+
+def rows_of(
+    keys: Sequence[StudentKey], found: Sequence[Evaluation], resolution: str, samples: int, minutes: float
+) -> list[Row]:
+    """Return the rows of students.
+
+    Args:
+        keys: The students.
+        found: How good each is.
+        resolution: How densely they feel.
+        samples: Control steps of each.
+        minutes: How long all have learned together [min].
+    """
+    kinds: dict[tuple[str, str, str], list[Evaluation]] = {}
+    for key, own in zip(keys, found, strict=True):
+        kinds.setdefault(key.kind, []).append(own)
+    rows = []
+    for (type_, placement, noise), own in kinds.items():
+        low, high = interval(own)
+        score, held = fmean(each.score for each in own), fmean(each.held for each in own)
+        episodes = sum(each.episodes for each in own)
+        place = resolution if placement else ""
+        rows.append(Row(type_, placement, place, noise, len(own), score, low, high, held, episodes, samples, minutes))
+    return rows
+
+
+def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean score over seeds and episodes."""
+    scores, num = [each.score for each in found], len(found)
+    halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in found]
+    half = math.sqrt(sum(own**2 for own in halves)) / num
+    if num > 1:
+        half = max(half, float(student_t.ppf(0.975, num - 1)) * stdev(scores) / math.sqrt(num))
+    return fmean(scores) - half, fmean(scores) + half
+
+
+def write_table(rows: Sequence[Row], file: Path) -> None:
+    """Write rows as CSV.
+
+    Raises:
+        FileError: If that cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Row._fields)
+    writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+    atomic_write(file, text.getvalue().encode())
+
+
+def shown(rows: Sequence[Row], unit: str) -> str:
+    """Return rows as a table for people, the best first."""
+    cells = []
+    for row in sorted(rows, key=lambda own: -own.score):
+        place = " ".join(part for part in (row.placement, row.resolution, row.noise) if part)
+        bounds = f"{row.low:.3f} to {row.high:.3f}" if math.isfinite(row.low) else "–"
+        cells.append((row.type, place, f"{row.seeds}", f"{row.score:.3f}", bounds, f"{row.held:.1%}", f"{row.samples:,}"))
+    return text_table(("type", "where", "seeds", f"score [{unit}]", "95 %", "held", "steps of each"), cells)
+
+
+def write_students(
+    distiller: Distiller,
+    loaded: LoadedTask,
+    origin: Mapping[str, Any],
+    seconds: float,
+    command: str,
+    found: Sequence[Evaluation],
+    folder: Path,
+    progress: Progress,
+) -> None:
+    """Write each student as a policy file, with its card, for `tgdsl play --policy` and `tgdsl evaluate`.
+
+    Args:
+        distiller: Who has taught.
+        loaded: The task's document.
+        origin: What the run was made from.
+        seconds: How long it took [s].
+        command: How to make the run again.
+        found: How good each student is; empty: that is not known.
+        folder: Where to.
+        progress: Is told what is being done.
+
+    Raises:
+        FileError: If one cannot be written.
+    """
+    with_folder(folder / "any")
+    alone: dict[Felt | None, Any] = {}
+    for i, key in enumerate(distiller.keys):
+        if key.felt not in alone:
+            progress(f"taxels of {key.name}")
+            alone[key.felt] = compile_sensed(own_task(loaded, key.felt), "cpu").touch
+        touch, names = alone[key.felt], distiller.groups[key.name]
+        sizes = {GROUP if key.felt and name == key.felt.group else name: distiller.env.groups[name] for name in names}
+        own = own_task(loaded, key.felt).spec
+        chosen = {"touch": own.touch, "placement": own.placement, "noise": own.noise}
+        run = dict(origin) | {"spec": own.model_dump(mode="json"), "taxels": touch.taxels_id, "seed": key.seed}
+        run["overrides"] = dict(origin["overrides"]) | chosen
+        card = made_card(distiller, sizes, run, seconds, command)
+        card["samples"] = distiller.samples // len(distiller.keys)
+        card |= {"std": None, "teacher": origin["teacher"], "score": found[i].plain() if found else None}
+        write_module(lambda i=i: deployed(distiller.student(i)), touch, card, folder / f"{key.name}.pt")

@@ -1,0 +1,107 @@
+"""How students are taught: the numbers of DAgger, of their networks and of what their latent is decoded to.
+
+Source of the defaults: Chung et al., *Tactile Genesis*, appendix, "Optimization and Network Hyperparameters" and the table of
+auxiliary losses; the tasks' own departures from them stand in their specs. What the paper leaves open, and is chosen here:
+`steps`, `std`, what `clip` bounds, that errors are means over steps, environments and joints, that decoders take the
+embeddings, and that images of all links share their weights.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StrictInt, model_validator
+
+from tgdsl.fields.models import NonNegative, Positive, Quantity, SpecModel
+from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, Widths
+
+Whole = Annotated[StrictInt, Field(ge=1)]
+Loss = Literal["mse", "inverse_variance"]
+Time = Annotated[float, Quantity("time", gt=0.0)]
+
+
+class DecoderSpec(SpecModel):
+    """A head that tells a privileged number from the embeddings: a loss that is dropped at deployment."""
+
+    weight: NonNegative = 1.0
+    """Weight of its squared error."""
+    scale: Positive = 1.0
+    """Factor on the number."""
+    hidden: Widths = (128, 64)
+    """Widths of its hidden layers."""
+
+
+class ConvolutionSpec(SpecModel):
+    """The network that embeds images of taxels, one per link, all by the same weights."""
+
+    channels: Widths = (16, 32)
+    """Channels of `cnn`'s layers; `convrnn` has one layer, of the first."""
+    kernel: Whole = 3
+    """Width of the kernels [taxel], an odd number."""
+
+    @model_validator(mode="after")
+    def _check(self) -> ConvolutionSpec:
+        if self.kernel % 2 == 0:
+            raise ValueError(f"kernel is {self.kernel}, expected an odd number")
+        return self
+
+
+class StudentNetworksSpec(SpecModel):
+    """Networks of a student: groups are normalised, each is embedded, and the embeddings are mapped together."""
+
+    kind: Literal["mlp", "lstm"] = "mlp"
+    """Kind of the network that embeds each group but touch."""
+    encoder: EncoderSpec = EncoderSpec()
+    """Its widths; an `lstm` has the last one."""
+    touch_kind: Literal["mlp", "lstm", "cnn", "convrnn"] = "mlp"
+    """Kind of the network that embeds touch; of types that have no images, `mlp` in place of `cnn`, `lstm` of `convrnn`."""
+    touch_encoder: EncoderSpec = EncoderSpec(hidden=(64, 64), size=32)
+    """Its widths, likewise."""
+    convolution: ConvolutionSpec = ConvolutionSpec()
+    """The networks of images."""
+    hidden: Widths = WIDTHS
+    """Widths of the hidden layers that follow the embeddings."""
+    eps: Positive = 1e-5
+    """What is added to the standard deviation by which an observation is divided, in the observation's unit."""
+    clip: Positive = 10.0
+    """Bound of normalised observations."""
+
+
+class DistillSpec(SpecModel):
+    """How students are taught."""
+
+    iterations: Whole = 6000
+    """Iterations of the whole run: rollout and update."""
+    steps: Whole = 24
+    """Control steps of each environment per iteration: a multiple of `gradient_length`."""
+    gradient_length: Whole = 2
+    """Control steps of a gradient step, through which recurrent networks are differentiated."""
+    epochs: Whole = 5
+    """How often an update goes through its rollout."""
+    learning_rate: Positive = 1e-4
+    """Learning rate."""
+    max_grad_norm: Positive | None = 2.0
+    """Norm to which the gradient of each student is scaled down; null: it is not."""
+    loss: Loss = "mse"
+    """Mean of (a_s − a_t)², or of (a_s − a_t)²/σ_t², σ_t the standard deviation of the teacher's actions."""
+    clip: Positive | None = None
+    """Bound of a student's change of an action within an update, as PPO bounds values: of the losses of a_s and of
+    a_0 + clamp(a_s − a_0, ±clip) the larger one counts, a_0 being what it asked for in the rollout; null: there is none."""
+    std: NonNegative = 0.0
+    """Standard deviation of what is added to a student's actions in rollouts."""
+    groups: Groups | None = None
+    """Groups of observations that students see beside touch; default: `proprio`, and `goal` if there is one."""
+    networks: StudentNetworksSpec = StudentNetworksSpec()
+    """Networks."""
+    decoders: dict[str, DecoderSpec] = {}
+    """Heads by the privileged number that they tell: see the task."""
+    precision: Literal["float32", "tf32"] = "tf32"
+    """How a GPU multiplies matrices: `float32` or `tf32`."""
+    checkpoint: Time = 10.0
+    """What a run that is killed loses at most, if its iterations are no longer [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> DistillSpec:
+        if self.steps % self.gradient_length:
+            raise ValueError(f"steps is {self.steps}, expected a multiple of gradient_length, {self.gradient_length}")
+        return self

@@ -1,0 +1,141 @@
+"""Students of one architecture, stacked: their weights are one tensor each, and they step together.
+
+A stack of N is N separate trainings: each student has its own weights, normalisation, gradient norm and moments of Adam, which
+are elementwise; nothing is added up over students. `torch.func.vmap` makes batched products of a student's own layers.
+
+Shapes: `student` students of the stack, `row` rows of each, `feature`, `memory`, `joint`, `target` as in `student.py`.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import functional_call, stack_module_state, vmap
+
+from tgdsl.rl.students.student import Architecture, Made, Student
+
+NORM_EPS = 1e-6
+"""What `torch.nn.utils.clip_grad_norm_` adds to a norm."""
+
+
+class Stack:
+    """Students of one architecture.
+
+    Attributes:
+        architecture: Their networks.
+        size: How many there are.
+        memory: How many numbers each remembers of an episode.
+        parameters: Their weights by name, (student, …).
+        buffers: Means and variances of what they have seen, likewise.
+        optimiser: Adam.
+    """
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        seeds: Sequence[int],
+        learning_rate: float,
+        max_grad_norm: float | None,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ):
+        """Make students; torch's own random generators are left as they are.
+
+        Args:
+            architecture: Their networks.
+            seeds: What the first weights of each follow from.
+            learning_rate: Adam's.
+            max_grad_norm: Norm to which the gradient of each is scaled down; None: it is not.
+            device: Where they are.
+            dtype: Their dtype.
+        """
+        self.architecture, self.size, self._max_norm = architecture, len(seeds), max_grad_norm
+        students = [made(architecture, seed).to(device, dtype) for seed in seeds]
+        self.memory = students[0].memory
+        self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
+        self.seen = torch.zeros((), dtype=torch.float64, device=device)
+        self._shape = copy.deepcopy(students[0]).to("meta")
+        is_cuda = self.seen.is_cuda
+        self.optimiser = torch.optim.Adam(
+            list(self.parameters.values()), lr=learning_rate, capturable=is_cuda, fused=True if is_cuda else None
+        )
+        self._called: Any = vmap(self._call)
+
+    def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> Made:
+        """Return what each student makes of its own rows: (student, row, …)."""
+        return Made(*self._called(self.parameters, self.buffers, x, memory))
+
+    def descend(self, losses: Float[Tensor, " student"]) -> None:
+        """Take one step of Adam, each student by its own loss."""
+        weights = list(self.parameters.values())
+        gradients = torch.autograd.grad(losses.sum(), weights)
+        with torch.no_grad():
+            if self._max_norm is not None:
+                squares = torch.stack([gradient.flatten(1).square().sum(dim=1) for gradient in gradients])
+                factor = (self._max_norm / (squares.sum(dim=0).sqrt() + NORM_EPS)).clamp(max=1.0)
+                gradients = [gradient * factor.view(-1, *(1,) * (gradient.ndim - 1)) for gradient in gradients]
+            for weight, gradient in zip(weights, gradients, strict=True):
+                weight.grad = gradient
+        self.optimiser.step()
+
+    @torch.no_grad()
+    def look(self, x: Float[Tensor, "student row feature"]) -> None:
+        """Take rows into account in each student's mean and variance, in place."""
+        num = x.shape[1]
+        rate = (num / (self.seen + num)).to(x.dtype)
+        var, mean = torch.var_mean(x, dim=1, correction=0)
+        own_mean, own_var = self.buffers["mean"], self.buffers["var"]
+        delta = mean - own_mean
+        own_mean += rate * delta
+        own_var += rate * (var - own_var + delta * (mean - own_mean))
+        self.seen += num
+
+    def student(self, index: int) -> Student:
+        """Return a copy of one student, on the CPU."""
+        own = Student(self.architecture)
+        state = {name: value[index].detach().cpu() for name, value in (self.parameters | self.buffers).items()}
+        own.load_state_dict({name: state[name] for name in own.state_dict()})
+        return own
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that teaching goes on from: live tensors."""
+        networks = {name: value.detach() for name, value in self.parameters.items()}
+        kept = {name: self.buffers[name] for name in ("mean", "var")}
+        return {"networks": networks, "seen": kept | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved.
+
+        Raises:
+            RuntimeError: If it is of other networks.
+        """
+        own = self.state_dict()
+        for part in ("networks", "seen"):
+            if own[part].keys() != state[part].keys():
+                raise RuntimeError(f"its {part} are {', '.join(state[part])}")
+            for name, value in own[part].items():
+                found = state[part][name]
+                if found.shape != value.shape:
+                    raise RuntimeError(f"{name} is {tuple(found.shape)}, not {tuple(value.shape)}")
+        with torch.no_grad():
+            for part in ("networks", "seen"):
+                for name, value in own[part].items():
+                    value.copy_(state[part][name])
+        self.optimiser.load_state_dict(dict(state["optimiser"]))
+        for group in self.optimiser.param_groups:  # it may have been saved on another device
+            group |= {"capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+
+    def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
+        return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))
+
+
+def made(architecture: Architecture, seed: int) -> Student:
+    """Return a student whose first weights follow from a seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Student(architecture)

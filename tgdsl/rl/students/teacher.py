@@ -1,0 +1,126 @@
+"""The teacher: a learned policy with its card, which says what each student should have done.
+
+Shapes: `env` environments, `joint` joints that the policy moves.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.policy import Policy, PolicyError, card_of, check_card
+from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
+
+WARM_CALLS = 3
+"""Calls in which TorchScript optimises a policy, before one is captured on a GPU."""
+
+
+class Teacher:
+    """A learned policy, seen to be of this task.
+
+    Attributes:
+        file: Its file.
+        card: Its card.
+        felt: What it feels; None: nothing.
+    """
+
+    def __init__(self, file: Path, loaded: LoadedTask):
+        """Read it, and see that it is for this task and these actions.
+
+        Raises:
+            PolicyError: If it cannot be read, has no card, or was learned in another task, with other joints or actions, or a
+                loss needs the deviations of its actions, which it does not tell.
+        """
+        self.file = file
+        card = card_of(file)
+        if card is None or "spec" not in card:
+            raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
+        self.card, theirs, ours = card, card["spec"], loaded.spec.model_dump(mode="json")
+        if theirs["task"] != ours["task"]:
+            raise PolicyError(f'{file}: this teacher was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
+        steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
+        for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
+            if before != now:
+                raise PolicyError(f"{file}: this teacher was learned with other {name}: {_text(before)}, here {_text(now)}")
+        self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
+        if self.felt and theirs["resolution"] != ours["resolution"]:
+            found, wanted = theirs["resolution"], ours["resolution"]
+            raise PolicyError(f"{file}: this teacher feels with other taxels: resolution {found}, here {wanted}")
+        if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
+            what = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
+            raise PolicyError(f"{file}: {what}; learn it anew, or take distill.loss=mse")
+        self._loaded = loaded
+
+    def check_taxels(self) -> None:
+        """See that a teacher that feels does so with the taxels that there are now.
+
+        Raises:
+            PolicyError: If they are others.
+        """
+        if self.felt is None:
+            return
+        loaded = own_task(self._loaded, self.felt)
+        check_card(self.card, self.file, self.card["joints"], compile_sensed(loaded, "cpu").touch.taxels_id)
+
+    def bound(self, env: TouchEnv) -> BoundTeacher:
+        """Return it for some environments.
+
+        Raises:
+            PolicyError: If joints or groups of observations are others.
+        """
+        return BoundTeacher(self, env)
+
+
+class BoundTeacher:
+    """A teacher in some environments.
+
+    Attributes:
+        groups: Groups of observations that it takes, by their names in the environments.
+        std: Standard deviation of its actions; None if it does not tell.
+    """
+
+    def __init__(self, teacher: Teacher, env: TouchEnv):
+        """See that it fits."""
+        card, file = teacher.card, teacher.file
+        if list(env.joint_names) != list(card["joints"]):
+            moved = (", ".join(names) for names in (card["joints"], env.joint_names))
+            raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
+        names = {name: teacher.felt.group if name == GROUP and teacher.felt else name for name in card["groups"]}
+        for name, size in card["groups"].items():
+            found = env.groups.get(names[name])
+            if found != size:
+                what = "is not there" if found is None else f"has {found} numbers, not {size}: probes or objects are others"
+                raise PolicyError(f'{file}: this teacher sees the group "{name}", which {what}')
+        self.groups = tuple(names.values())
+        self._policy = Policy(file, {name: env.groups[name] for name in self.groups}, env.num_envs, env.num_actions, env.device)
+        self.std = torch.tensor(card["std"], device=env.device) if card.get("std") else None
+        for _ in range(WARM_CALLS):
+            self({name: torch.zeros((env.num_envs, env.groups[name]), device=env.device) for name in self.groups})
+        self.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
+
+    def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
+        """Return what should be done."""
+        return self._policy(obs)
+
+    def begin(self, ended: Tensor) -> None:
+        """Forget what is remembered of episodes that have ended."""
+        self._policy.begin(ended)
+
+
+def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
+    """Return the task of a policy that feels one thing, in environments of its own."""
+    chosen = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
+    spec = loaded.spec.model_copy(update=chosen)
+    return LoadedTask(spec, loaded.task, loaded.source, loaded.folder)
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)

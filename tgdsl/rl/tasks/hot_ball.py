@@ -1,0 +1,247 @@
+"""Find, among balls that look and move alike, the one that is hot, and stay on it: only temperature tells which it is.
+
+An episode begins with the hand above a tilted bin and each ball near a place of its own; which place is the hot ball's is
+random. A grid of temperatures on each finger link is read. With T_ic what that of link i reads in cell c, f_l the hot ball's
+force on fingertip l, d_p the distance from probe p of the fingertips to its surface,
+
+    π_i = clamp((max_c T_ic − T_a)/(T_h − T_a), 0, 1)           progress of a link [1]
+    π   = max_i π_i                                             progress of the hand [1]
+    c   = (max_l |f_l| ≥ f_min)                                 a fingertip is on the hot ball
+    b_t = b_{t−1} or π ≥ 1 − m                                  heat latch, off at the start
+    S   = Σ_t Δt b_t c_t                                        latched contact [s]
+
+Groups: `priv_heat` holds π_i of each link, b and c; `priv_obj_state` and `priv_obj_props` are of the hot ball, as in `groups`.
+The policy must have none of them: `proprio` and `tactile_sensors`, with `touch: temperature`, are what it has.
+
+The reward is the sum of these terms times Δt.
+
+    approach           w · exp(−max(0, min_p d_p)/λ)                             1 1/s
+    contact            w · c                                                     1 1/s
+    progress           w · π                                                     2 1/s
+    latched            w · b c                                                   10 1/s
+    lost               w · (lost in this step)                                   −100 1/s
+    action_rate        w · |a_t − a_{t−1}|²                                      −5e-4 1/s
+    work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
+
+An episode ends for good where the hot ball has left the bin: its middle is below `lost_height`. Score: S.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Task and Success Metric": bin, balls, temperatures, what is observed, π_i,
+the latch with m = 0.12, and S. The paper prints no reward: ours is S's integrand, before it the progress that fires the latch,
+before that the contact without which there is none, and the way there; the latch is worth more than all the others. What is
+`lost`, `action_rate` and `work` have the weights of its tasks in the palm. π is the hot ball's heat, unless a source in the
+links makes some. f_min is ours, so that rounding is no contact. A fingertip that leans on a cold ball too reads the mean of
+both, and never latches. Friction and mass of the hot ball alone would tell it from the others, and so would pushes: they are
+refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from pydantic import model_validator
+from torch import Tensor
+
+from tgdsl.errors import LowerError, SimulationError
+from tgdsl.fields.models import Length, PositiveLength, Quantity, Range, RangeOf, SpecModel, Temperature
+from tgdsl.rl import groups, terms
+from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
+from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks.placing import free_qpos, object_qpos
+
+
+class Rewards(SpecModel):
+    """Weights of the reward's terms; 0 leaves one out."""
+
+    approach: Weight = 1.0
+    """How near the nearest fingertip is to the hot ball [1/s]."""
+    contact: Weight = 1.0
+    """A fingertip is on the hot ball [1/s]."""
+    progress: Weight = 2.0
+    """How hot the hottest finger link is [1/s]."""
+    latched: Weight = 10.0
+    """A fingertip is on the hot ball, and the latch on [1/s]."""
+    lost: Weight = -100.0
+    """The hot ball has left the bin [1/s]."""
+    action_rate: Weight = -5e-4
+    """Change of the action [1/s]."""
+    work: Weight = -5e-3
+    """Power of the drives [1/J]."""
+
+
+class HotBallRandomSpec(RandomSpec):
+    """What is random."""
+
+    xy: Annotated[Range, RangeOf("length")] = (0.0, 0.0)
+    """What is added to each ball's place along the world's x and y, each [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> HotBallRandomSpec:
+        told = [name for name in ("friction", "mass", "push") if getattr(self, name) != getattr(RandomSpec(), name)]
+        if told:
+            raise ValueError(f"`{told[0]}` would be the hot ball's alone and tell it from others: expected it to be left out")
+        return self
+
+
+class HotBallSpec(TaskSpec):
+    """Find the hot ball, and stay on it."""
+
+    others: tuple[str, ...] = ()
+    """Bodies of the other balls: each may be where the keyframe has another one, or the hot one."""
+    randomise: HotBallRandomSpec = HotBallRandomSpec()
+    """What is random."""
+    rewards: Rewards = Rewards()
+    """Weights of the reward's terms."""
+    ambient: Temperature = 22.0
+    """T_a, temperature of the surroundings, as the sensors' document has it [°C]."""
+    target: Temperature = 45.0
+    """T_h, temperature of the hot ball at the start, as the sensors' document has it [°C]."""
+    margin: Annotated[float, Quantity("number", ge=0.0, le=1.0)] = 0.12
+    """m: the latch fires where a link's progress is 1 − m [1]."""
+    min_force: Annotated[float, Quantity("force", gt=0.0)] = 0.05
+    """f_min: less force of the hot ball is no contact [N]."""
+    near_width: PositiveLength = 0.2
+    """λ, decay length of `approach` [m]."""
+    lost_height: Length = 0.06
+    """Where the hot ball's middle is lower, it has left the bin [m]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> HotBallSpec:
+        if self.target <= self.ambient:
+            raise ValueError(f"`target` is {self.target:g} °C, expected more than `ambient`, {self.ambient:g} °C")
+        return self
+
+
+def reference(spec: HotBallSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
+    """Return the terms of the reward [1/s], `is_over` and `score` at each step of one environment, in float64.
+
+    Args:
+        spec: The task's document.
+        record: One row per instant, the first that at the start: `pos`, of the hot ball [m], `joint_vel` [rad/s, m/s],
+            `torque` [N·m, N], `action`, `link_force`, of it on fingertips (step, link, 3) [N], `distance` [m], and `heat`, what
+            grids read (step, cell) [°C].
+        dt: Δt [s].
+    """
+    weights, is_latched, score, rows = spec.rewards, False, 0.0, []
+    for t in range(1, len(record["pos"])):
+        # The largest of clamped progresses is that of the hottest cell.
+        progress = (record["heat"][t].max() - spec.ambient) / (spec.target - spec.ambient)
+        progress = min(1.0, max(0.0, float(progress)))
+        is_latched = is_latched or progress >= 1.0 - spec.margin
+        is_touched = bool(np.linalg.norm(record["link_force"][t], axis=1).max() >= spec.min_force)
+        score += dt * (is_latched and is_touched)
+        is_over = bool(record["pos"][t][2] < spec.lost_height)
+        row = {
+            "approach": weights.approach * math.exp(-max(0.0, record["distance"][t].min()) / spec.near_width),
+            "contact": weights.contact * is_touched,
+            "progress": weights.progress * progress,
+            "latched": weights.latched * (is_latched and is_touched),
+            "lost": weights.lost * is_over,
+            "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
+            "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+        }
+        rows.append(row | {"is_over": is_over, "score": score})
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+class HotBall(Task[HotBallSpec]):
+    """The task."""
+
+    Spec = HotBallSpec
+    senses = ("temperature_grid", "link_contact", "surface_distance")
+    score_unit = "s of latched contact"
+
+    def __init__(self, spec: HotBallSpec, setup: Setup):
+        """Look up the balls, and the cells of each link.
+
+        Raises:
+            LowerError: If another ball is no body that moves freely.
+        """
+        super().__init__(spec, setup)
+        self.places = _places(spec, setup).to(setup.device)
+        self.heat, table = setup.rows["temperature_grid"]
+        self.cells = _cells(np.asarray(table["link"])).to(setup.device)
+        self.progress = self.keep("progress", len(self.cells))
+        self.is_latched, self.is_touched = (self.keep(name, dtype=torch.bool) for name in ("is_latched", "is_touched"))
+        self.held = self.keep("held")
+
+    def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
+        """Give the balls each other's places, from a random one on, and move each a little."""
+        draws, num = self.setup.draws, len(self.places)
+        qpos = self.setup.qpos.repeat(self.setup.num_envs, 1)
+        first = draws.integers("place", episode, 1, 0, num - 1)
+        taken = (torch.arange(num, device=first.device) + first) % num
+        moved = draws.uniform("placement", episode, 2 * num, *self.spec.randomise.xy).to(qpos.dtype)
+        pos = qpos[:, self.places][torch.arange(len(qpos), device=first.device)[:, None], taken]
+        pos[:, :, :2] += moved.view(-1, num, 2)
+        qpos[:, self.places] = pos
+        self.begin(chosen, progress=0.0, is_latched=0.0, is_touched=0.0, held=0.0)
+        return Start({"qpos": qpos})
+
+    def advance(self, now: Now) -> None:
+        """Look at how hot links are and what is touched, and hold the latch."""
+        spec = self.spec
+        reading = now.readings[self.heat].to(self.progress)[:, :, 0]
+        above = reading[:, self.cells].amax(dim=2) - spec.ambient
+        self.progress.copy_((above / (spec.target - spec.ambient)).clamp(0.0, 1.0))
+        self.is_latched |= self.progress.amax(dim=1) >= 1.0 - spec.margin
+        self.is_touched.copy_(now.link_force.norm(dim=2).amax(dim=1) >= spec.min_force)
+        self.held += self.setup.control_step * (self.is_latched & self.is_touched)
+
+    def is_over(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the hot ball has left the bin."""
+        return now.object.pos[:, 2] < self.spec.lost_height
+
+    def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return the terms of the reward: see the top of this page."""
+        weights = self.spec.rewards
+        return {
+            "approach": weights.approach * torch.exp(-now.distance.amin(dim=1).clamp(min=0.0) / self.spec.near_width),
+            "contact": weights.contact * self.is_touched,
+            "progress": weights.progress * self.progress.amax(dim=1),
+            "latched": weights.latched * (self.is_latched & self.is_touched),
+            "lost": weights.lost * self.is_over(now),
+            "action_rate": weights.action_rate * terms.action_rate(now),
+            "work": weights.work * terms.work(now),
+        }
+
+    def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what is privileged: of heat, and of the hot ball."""
+        bits = torch.stack([self.is_latched, self.is_touched], dim=1).to(self.progress)
+        return {
+            "priv_heat": torch.cat([self.progress, bits], dim=1),
+            "priv_obj_state": groups.object_state(now),
+            "priv_obj_props": groups.object_props(now),
+        }
+
+    def score(self) -> Float[Tensor, " env"]:
+        """Return for how long a fingertip was on the hot ball with the latch on [s]."""
+        return self.held
+
+
+def _places(spec: HotBallSpec, setup: Setup) -> Int[Tensor, "ball 7"]:
+    """Return where each ball's position and quaternion stand in `qpos`, the hot one's first.
+
+    Raises:
+        LowerError: If another ball is no body that moves freely, or is named twice.
+    """
+    rows = [object_qpos(setup)]
+    for name in spec.others:
+        try:
+            rows.append(free_qpos(setup.model, name))
+        except SimulationError as error:
+            raise LowerError(str(error), "others") from error
+    if len({row.start for row in rows}) < len(rows):
+        raise LowerError("a ball is named twice, or the object is among them", "others", "expected each of the others once")
+    return torch.tensor([list(range(row.start, row.stop)) for row in rows])
+
+
+def _cells(links: np.ndarray) -> Int[Tensor, "link cell"]:
+    """Return the rows of each link's cells; a link with fewer than others has its first one again."""
+    rows = [np.flatnonzero(links == name) for name in dict.fromkeys(links.tolist())]
+    most = max(len(own) for own in rows)
+    return torch.from_numpy(np.array([np.concatenate([own, np.repeat(own[:1], most - len(own))]) for own in rows]))

@@ -1,0 +1,137 @@
+"""A run's state in one file, from which it goes on; the file is replaced whole, or not at all.
+
+It holds networks, normalisers, optimisers, learning rate, iteration, random generators, and of each environment how often it
+was reset and how long its episode has lasted. Of the physics it holds nothing: a run that goes on begins new episodes, with
+random numbers that were not drawn before, and whose remaining times are as they were; so the file is small, and is written in
+no time. What is lost are the episodes of that moment.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tgdsl.errors import TgdslError
+from tgdsl.files.write import atomic_open
+from tgdsl.rl.train.iteration import Learning
+
+FORMAT = 1
+
+
+class CheckpointError(TgdslError):
+    """A checkpoint that cannot be read, or that is of something else."""
+
+
+def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
+    """Return all that a run goes on from; all processes are asked.
+
+    Args:
+        learner: The learner.
+        seconds: How long it has learned [s].
+    """
+    env = learner.env
+    own = {
+        "resets": env.resets.cpu().clone(),
+        "steps": env.steps.cpu().clone(),
+        "cpu": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state(env.device) if env.device.type == "cuda" else None,
+    }
+    return {
+        "format": FORMAT,
+        "iteration": learner.iteration,
+        "samples": learner.samples,
+        "seconds": seconds,
+        "groups": learner.groups,
+        **learner.state_dict(),
+        "processes": learner.ranks.gathered(own),
+    }
+
+
+def write_checkpoint(state: Mapping[str, Any], file: Path, is_slim: bool = False) -> int:
+    """Write a checkpoint, to the disk.
+
+    Args:
+        state: What `state_of` returned.
+        file: The file; one that is there is replaced.
+        is_slim: Whether the optimisers' moments, two thirds of it, are rounded to bfloat16.
+
+    Returns:
+        Its size [byte].
+
+    Raises:
+        FileError: If it cannot be written; then the file that was there is as it was.
+    """
+    content = io.BytesIO()
+    torch.save(_slim(state) if is_slim else dict(state), content)
+    with atomic_open(file) as opened:
+        opened.write(content.getbuffer())
+        opened.flush()
+        os.fsync(opened.fileno())
+    return content.tell()
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """Return what a checkpoint holds, on the CPU.
+
+    Raises:
+        CheckpointError: If it cannot be read.
+    """
+    if not file.is_file():
+        raise CheckpointError(f"{file}: there is no checkpoint")
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever torch and pickle raise
+        why = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{file}: cannot read this checkpoint: {why}") from error
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise CheckpointError(f"{file}: this is no checkpoint of `tgdsl train` or `tgdsl distill`, or one of another version")
+    return state
+
+
+def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
+    """Have a learner go on from a checkpoint; what its physics was has gone.
+
+    Args:
+        learner: The learner, of the same groups, networks and number of environments.
+        state: What the checkpoint holds.
+        file: Its file, for errors.
+
+    Raises:
+        CheckpointError: If it is of other groups or networks.
+    """
+    rank = learner.ranks.rank
+    if state["groups"] != learner.groups:
+        raise CheckpointError(f"{file}: learned from the groups {state['groups']}, not {learner.groups}")
+    try:
+        learner.load_state_dict(state)
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{file}: its networks are of other sizes: {str(error).splitlines()[-1].strip()}") from error
+    learner.iteration, learner.samples = state["iteration"], state["samples"]
+    own = state["processes"][rank] if rank < len(state["processes"]) else None
+    if own is None or own["resets"].shape != learner.env.resets.shape:
+        return  # of other environments: these begin as in a new run
+    learner.env.resets.copy_(own["resets"])
+    learner.go_on(own["steps"].to(learner.env.device))
+    torch.set_rng_state(own["cpu"])
+    if own["cuda"] is not None and learner.env.device.type == "cuda":
+        torch.cuda.set_rng_state(own["cuda"], learner.env.device)
+
+
+def _slim(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a state whose optimisers' moments are rounded; optimisers widen them again."""
+    if "algorithm" not in state:
+        return dict(state)
+    algorithm = dict(state["algorithm"])
+    for name in [name for name in algorithm if name.endswith("optimizer_state_dict")]:
+        optimiser = dict(algorithm[name])
+        optimiser["state"] = {
+            i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in own.items()}
+            for i, own in optimiser["state"].items()
+        }
+        algorithm[name] = optimiser
+    return dict(state) | {"algorithm": algorithm}

@@ -1,0 +1,237 @@
+"""A run's folder: what it was made from, where it stands, and what it has learned.
+
+- `run.json`: the task with all that its document leaves out, overrides, seed, versions, hashes; an entry per start
+- `task.yaml` and the sensors' document: as they were found
+- `taxels.csv`: the taxels of all sensors
+- `curve.csv`: a row per iteration
+- `checkpoint.pt`: what it goes on from
+- `policy.pt`: the policy without exploration, with its card, for `tgdsl play --policy`
+- `evaluation.json`: the evaluation at the end
+- `events.out.*`: TensorBoard's, if that is installed
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import platform
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from tgdsl.errors import FileError, TgdslError
+from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, with_folder
+from tgdsl.module.module import TactileModule
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import LoadedTask
+
+PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
+COPIES = 3
+"""How many checkpoints must find room on the disk before a run begins: the old one, the new one, and what else is written."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of a run.
+
+    Attributes:
+        path: The folder.
+    """
+
+    path: Path
+
+    @property
+    def run(self) -> Path:
+        """What the run was made from."""
+        return self.path / "run.json"
+
+    @property
+    def curve(self) -> Path:
+        """What each iteration was."""
+        return self.path / "curve.csv"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What the run goes on from."""
+        return self.path / "checkpoint.pt"
+
+    @property
+    def policy(self) -> Path:
+        """What it has learned."""
+        return self.path / "policy.pt"
+
+    @property
+    def evaluation(self) -> Path:
+        """How good that is."""
+        return self.path / "evaluation.json"
+
+    def check(self, is_resumed: bool) -> None:
+        """See that a run can begin or go on here; nothing is made.
+
+        Raises:
+            FileError: If the folder cannot be written.
+            TgdslError: If there is a run already, or none to go on with.
+        """
+        if not is_resumed and (self.run.exists() or self.checkpoint.exists()):
+            raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
+        if is_resumed and not self.checkpoint.is_file():
+            raise TgdslError(f"{self.path}: there is no checkpoint.pt to go on with")
+        check_writable(self.checkpoint)
+
+    def check_room(self, size: int) -> None:
+        """See that checkpoints of a size find room.
+
+        Raises:
+            FileError: If not.
+        """
+        free = shutil.disk_usage(self.path).free
+        if free < COPIES * size:
+            what = f"{free / 2**20:.0f} MiB are free on the disk, expected {COPIES * size / 2**20:.0f} MiB for checkpoints"
+            raise FileError(self.checkpoint, what)
+
+    def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
+        """Write what a run is made from, or that it is made to go on.
+
+        Raises:
+            FileError: If it cannot be written.
+        """
+        with_folder(self.run)
+        self._clean()
+        before = self._read()
+        starts = [*before.get("starts", []), dict(made_from)]
+        atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
+        for file in documents(loaded):
+            atomic_write(self.path / file.name, file.read_bytes())
+        atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
+
+    def last_start(self) -> dict[str, Any]:
+        """Return what the run was made from when it was started last.
+
+        Raises:
+            TgdslError: If that cannot be read.
+        """
+        starts = self._read().get("starts", [])
+        if not starts:
+            raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
+        return starts[-1]
+
+    def rows(self) -> list[dict[str, str]]:
+        """Return the rows of the curve; none if there is no curve."""
+        if not self.curve.is_file():
+            return []
+        with self.curve.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    def keep_rows(self, iterations: int) -> None:
+        """Drop the curve's rows beyond some iterations: those that are made again."""
+        rows = self.rows()
+        whole = [row for row in rows if None not in row.values()]  # not half written when the run was killed
+        kept = [row for row in whole if int(row["iteration"]) <= iterations]
+        if len(kept) < len(rows):
+            text = io.StringIO()
+            writer = csv.DictWriter(text, list(rows[0]), extrasaction="ignore", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(kept)
+            atomic_write(self.curve, text.getvalue().encode())
+
+    def add_row(self, row: Mapping[str, float | int]) -> None:
+        """Add a row to the curve, under the names that its first row had; nan is what is not known.
+
+        Raises:
+            FileError: If it cannot be written.
+        """
+        with as_file_error(self.curve), self.curve.open("a+", newline="", encoding="utf-8") as file:
+            file.seek(0)
+            names = next(csv.reader([file.readline()]), None) or list(row)
+            file.seek(0, io.SEEK_END)
+            writer = csv.DictWriter(file, names, restval="", extrasaction="ignore", lineterminator="\n")
+            if file.tell() == 0:
+                writer.writeheader()
+            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            return json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {}
+        except (OSError, ValueError) as error:
+            raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
+
+    def _clean(self) -> None:
+        """Remove temporary files that a run which was killed has left."""
+        for file in self.path.iterdir():
+            if re.fullmatch(TEMPORARY.pattern + r"\.\w+", file.name):
+                file.unlink(missing_ok=True)
+
+
+def documents(loaded: LoadedTask) -> Sequence[Path]:
+    """Return the files of the task's and the sensors' documents, those that are files."""
+    own = [Path(loaded.source.file), loaded.folder / loaded.spec.document]
+    return [file for file in own if file.is_file()]
+
+
+def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
+    """Return what a run is made from, as plain values."""
+    device = env.device
+    return {
+        "task": loaded.source.file,
+        "overrides": dict(overrides),
+        "seed": seed,
+        "envs": env.num_envs,
+        "processes": processes,
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or platform.machine(),
+        "spec": loaded.spec.model_dump(mode="json"),
+        "groups": env.groups,
+        "joints": list(env.joint_names),
+        "module": hashlib.sha256(env.touch.plan.to_json().encode()).hexdigest(),
+        "taxels": env.touch.taxels_id,
+        "versions": versions(),
+    }
+
+
+def differences(before: Any, now: Any, path: str = "") -> list[str]:
+    """Return how two plain values differ, a line each: `rewards.spin: 2.0, now 3.0`."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        names = dict.fromkeys((*before, *now))
+        return [line for name in names for line in differences(before.get(name), now.get(name), f"{path}.{name}".lstrip("."))]
+    return [] if before == now else [f"{path}: {json.dumps(before)}, now {json.dumps(now)}"]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what a run depends on, of those packages that there are."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def taxel_csv(touch: TactileModule) -> str:
+    """Return the taxels of all sensors as a table: sensor, and the columns of `touch.taxels`, vectors by their components."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    is_begun = False
+    for sensor, table in touch.taxels.items():
+        names = table.dtype.names or ()
+        if not is_begun:
+            writer.writerow(["sensor", *(part for name in names for part in _columns(name, table[name]))])
+            is_begun = True
+        for row in table.tolist():
+            writer.writerow([sensor, *(part for value in row for part in _cells(value))])
+    return text.getvalue()
+
+
+def _columns(name: str, values: Any) -> list[str]:
+    return [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
+
+
+def _cells(value: Any) -> list[str]:
+    return [repr(part) for part in value.tolist()] if hasattr(value, "tolist") and getattr(value, "ndim", 0) else [str(value)]

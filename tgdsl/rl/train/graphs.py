@@ -1,0 +1,91 @@
+"""Work on the same tensors that is done again and again: on a GPU it is captured as a CUDA graph at its third call."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+import torch
+
+T = TypeVar("T")
+EAGER_CALLS = 2
+"""Calls before the one that is captured: they load kernels, and make what lasts."""
+
+
+class Captured(Generic[T]):
+    """A function without arguments that reads and writes the same tensors at each call; on a CPU just that function.
+
+    Each call does the work once: the first two as it stands, on the stream on which the third is captured, so that libraries
+    have their workspaces there; from the third on the graph is replayed. What it returns is in the same tensors from then on.
+    """
+
+    def __init__(self, body: Callable[[], T], device: torch.device | str, has_tf32: bool = False, is_captured: bool = True):
+        """Take the function.
+
+        Args:
+            body: The function; on a GPU it must not wait for a tensor's value.
+            device: Where its tensors are.
+            has_tf32: Whether a GPU multiplies float32 matrices in TF32.
+            is_captured: Whether it may be captured; if not, each call does the work as it stands.
+        """
+        self._body, self._has_tf32, self._is_captured = body, has_tf32, is_captured
+        self._stream = torch.cuda.Stream(device) if torch.device(device).type == "cuda" else None
+        self.forget()
+
+    def forget(self) -> None:
+        """Capture anew: tensors lie elsewhere."""
+        self._calls = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._made: T | None = None
+
+    def __call__(self) -> T:
+        """Do the work."""
+        if self._stream is None:
+            with torch.inference_mode(False):
+                return self._body()
+        if not self._is_captured or (self._graph is None and self._calls < EAGER_CALLS):
+            self._calls += 1
+            return self._eager(self._stream)
+        if self._graph is None:
+            self._graph, self._made = self._capture(self._stream)
+        self._graph.replay()
+        return self._made  # pyright: ignore[reportReturnType]
+
+    def _eager(self, stream: torch.cuda.Stream) -> T:
+        current = torch.cuda.current_stream(stream.device)
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream), _matmul(self._has_tf32), torch.inference_mode(False):
+            made = self._body()
+        current.wait_stream(stream)
+        return made
+
+    def _capture(self, stream: torch.cuda.Stream) -> tuple[torch.cuda.CUDAGraph, T]:
+        """Capture the work without doing it; nothing may be collected meanwhile: what Warp frees breaks it."""
+        graph = torch.cuda.CUDAGraph()
+        gc.collect()
+        was_enabled = gc.isenabled()
+        gc.disable()
+        try:
+            with (
+                _matmul(self._has_tf32),
+                torch.inference_mode(False),
+                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            ):
+                made = self._body()
+        finally:
+            if was_enabled:
+                gc.enable()
+        return graph, made
+
+
+@contextlib.contextmanager
+def _matmul(has_tf32: bool) -> Iterator[None]:
+    """Multiply matrices in TF32 or in float32, and as before afterwards."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high" if has_tf32 else "highest")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -1,0 +1,147 @@
+"""What an iteration is, whoever learns: its episodes, added up on the device and read once, and how long it took.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from tgdsl.rl.env import Step, TouchEnv
+from tgdsl.rl.train.ranks import Ranks, summed
+
+OWN = ("Episode/return", "Episode/steps", "Episode/score", "Episode/dropped", "Episode/fault")
+"""Of an episode that has ended, besides each term: return, steps, score, whether it ended for good, and by a fault."""
+
+
+class EpisodeTally:
+    """Sums over the episodes that have ended.
+
+    Attributes:
+        names: What is told of them, known from the first control step on.
+    """
+
+    def __init__(self):
+        """Begin."""
+        self.names: list[str] = []
+        self._sums: Tensor | None = None
+
+    def add(self, step: Step) -> None:
+        """Add a control step; the host does not wait."""
+        info = step.info
+        told = [info.episode_return, info.episode_steps, info.score, step.terminated, info.faults, *info.episode_terms.values()]
+        values = torch.stack([info.ended.double(), *(each.double() for each in told)])
+        kept = torch.where(info.ended, values, 0.0).sum(dim=1)
+        if self._sums is None:
+            self.names = [*OWN, *(f"Reward/{name}" for name in info.episode_terms)]
+            self._sums = torch.zeros_like(kept)
+        self._sums += kept
+
+    def taken(self) -> Tensor:
+        """Return the sums over all processes, the number of episodes first, and begin anew; the host does not wait."""
+        assert self._sums is not None
+        made = self._sums.clone()
+        summed(made)
+        self._sums.zero_()
+        return made
+
+    def means(self, sums: list[float]) -> dict[str, float]:
+        """Return means over episodes by name, of sums that were taken; none if no episode has ended."""
+        count = sums[0]
+        return {name: total / count for name, total in zip(self.names, sums[1:], strict=True)} if count else {}
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What an iteration was, over all processes.
+
+    Attributes:
+        episodes: How many episodes ended.
+        told: Means over these episodes, and what else there is to tell, by the names that TensorBoard groups: `Episode/score`.
+        rollout: Duration of the rollout [s].
+        update: Duration of the update [s].
+    """
+
+    episodes: int
+    told: dict[str, float]
+    rollout: float
+    update: float
+
+
+@runtime_checkable
+class Learning(Protocol):
+    """Who learns: what a run and its checkpoints ask for.
+
+    Attributes:
+        env: The environments.
+        ranks: The processes.
+        groups: Groups of observations of each network.
+        iteration: How many iterations were made.
+        samples: How many control steps these took, over all processes and environments.
+        rates: What of the document makes smaller steps.
+    """
+
+    env: TouchEnv
+    ranks: Ranks
+    groups: dict[str, list[str]]
+    iteration: int
+    samples: int
+    rates: str
+
+    @property
+    def episode_names(self) -> list[str]:
+        """What iterations tell of the episodes that ended, in those that had any."""
+        ...
+
+    def iterate(self) -> Iteration:
+        """Make a rollout, and learn from it."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what is learned, and what learning goes on from."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from what was saved; it may hold more than `state_dict` returned."""
+        ...
+
+    def go_on(self, steps: Tensor) -> None:
+        """Begin episodes that count as having lasted so many control steps."""
+        ...
+
+
+class Clock:
+    """Measures rollout and update; on a GPU by events, which nobody waits for."""
+
+    def __init__(self, device: torch.device):
+        """Begin."""
+        self._is_gpu, self._marks = device.type == "cuda", []
+
+    def start(self) -> None:
+        """Begin the rollout."""
+        self._marks = [self._mark()]
+
+    def split(self) -> None:
+        """End the rollout, begin the update."""
+        self._marks.append(self._mark())
+
+    def stop(self) -> tuple[float, float]:
+        """Return the durations of rollout and update [s]; the device must be done."""
+        begun, middle, end = *self._marks, self._mark()
+        if not self._is_gpu:
+            return middle - begun, end - middle
+        end.synchronize()
+        return 1e-3 * begun.elapsed_time(middle), 1e-3 * middle.elapsed_time(end)
+
+    def _mark(self) -> Any:
+        if not self._is_gpu:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event

@@ -1,0 +1,92 @@
+"""Learned policies as files: TorchScript for `tgdsl play --policy`, with a card in it that says what the policy is."""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from tgdsl.files.write import atomic_write
+from tgdsl.module.module import TactileModule
+from tgdsl.rl.playing.policy import CARD
+from tgdsl.rl.train.folder import taxel_csv
+from tgdsl.rl.train.iteration import Learning
+
+if TYPE_CHECKING:
+    from tgdsl.rl.train.learner import Learner
+
+KEPT = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "versions", "spec")
+"""What a card says of what a run was made from."""
+
+
+def card_of(learner: Learner, run: Mapping[str, Any], seconds: float, command: str) -> dict[str, Any]:
+    """Return what is to be known of a policy, as plain values.
+
+    Args:
+        learner: The learner.
+        run: What its run was made from.
+        seconds: How long it has learned [s].
+        command: How to learn it again.
+    """
+    groups = {name: learner.env.groups[name] for name in learner.groups["actor"]}
+    std = dict(learner.algorithm.actor.named_parameters()).get("distribution.std_param")
+    return made_card(learner, groups, run, seconds, command) | {"std": None if std is None else std.tolist()}
+
+
+def made_card(
+    learner: Learning, groups: Mapping[str, int], run: Mapping[str, Any], seconds: float, command: str
+) -> dict[str, Any]:
+    """Return what all cards have: see `card_of`.
+
+    Args:
+        learner: Who has learned.
+        groups: Groups of observations that the policy takes, with their sizes.
+        run: What the run was made from.
+        seconds: How long it has learned [s].
+        command: How to learn it again.
+    """
+    return {
+        "groups": dict(groups),
+        "joints": list(learner.env.joint_names),
+        "iterations": learner.iteration,
+        "samples": learner.samples,
+        "minutes": round(seconds / 60.0, 2),
+        "command": command,
+        "score": None,
+        **{name: run[name] for name in KEPT},
+    }
+
+
+def write_policy(learner: Learner, card: Mapping[str, Any], file: Path) -> None:
+    """Write a policy without exploration, and its card beside it as JSON, for people.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    write_module(lambda: learner.algorithm.get_policy().as_jit(), learner.env.touch, card, file)
+
+
+def write_module(scripted: Callable[[], Any], touch: TactileModule, card: Mapping[str, Any], file: Path) -> None:
+    """Write a policy, and its card beside it.
+
+    Args:
+        scripted: Returns the policy as TorchScript.
+        touch: The module whose taxels it feels with.
+        card: What is to be known of it.
+        file: The file.
+
+    Raises:
+        FileError: If it cannot be written.
+    """
+    content = io.BytesIO()
+    text = json.dumps(card, indent=2, ensure_ascii=False) + "\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
+        torch.jit.save(scripted(), content, _extra_files={CARD: text, "taxels.csv": taxel_csv(touch)})
+    atomic_write(file, content.getvalue())
+    atomic_write(file.with_suffix(".json"), text.encode())

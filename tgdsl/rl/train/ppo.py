@@ -1,0 +1,305 @@
+"""rsl_rl's PPO, whose rollout and update wait for no tensor's value, and are captured as CUDA graphs on a GPU.
+
+`class_name: tgdsl.rl.train.ppo:CapturedPPO` gives it to rsl_rl. It does what rsl_rl 5.5's own PPO does, with these
+departures: the learning rate is a tensor on the device; gradients are those of `torch.autograd.grad`, in one buffer; to learn
+draws no actions; over several processes, advantages are normalised by mean and deviation of all of them.
+
+Shapes: `env` environments, `joint` joints that the policy moves, `row` rows of a mini-batch.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.modules.distribution import Distribution
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from tgdsl.errors import TgdslError
+from tgdsl.rl.train.graphs import Captured
+from tgdsl.rl.train.ranks import num_processes, summed
+from tgdsl.rl.train.rnd import Distillation
+from tgdsl.tensors.torch_internals import copy_each
+
+LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
+"""Bounds of the adaptive learning rate, and by what it changes: rsl_rl's."""
+LOSSES = ("value", "surrogate", "entropy", "rnd")
+
+
+class CapturedPPO(PPO):
+    """rsl_rl's PPO, captured.
+
+    Attributes:
+        rate: The learning rate.
+        losses: Means of the last update: value, surrogate, entropy, and error of random network distillation.
+    """
+
+    def __init__(
+        self,
+        actor: MLPModel,
+        critic: MLPModel,
+        storage: RolloutStorage,
+        *,
+        learning_rate: float = 1e-3,
+        device: str = "cpu",
+        rnd_cfg: dict[str, Any] | None = None,
+        precision: str = "tf32",
+        **options: Any,
+    ):
+        """Make the algorithm.
+
+        Args:
+            actor: The policy.
+            critic: Its value.
+            storage: Holds a rollout.
+            learning_rate: Learning rate, at the start where it is adaptive.
+            device: Where all tensors are.
+            rnd_cfg: Options of random network distillation; None: there is none.
+            precision: As `TrainSpec` has it; without effect on a CPU.
+            options: Those of rsl_rl's PPO.
+
+        Raises:
+            TgdslError: If something is asked for that cannot be captured.
+        """
+        _refuse(actor, critic, options)
+        kind = next(actor.parameters()).dtype
+        self.rate = torch.zeros((), dtype=torch.float32 if torch.device(device).type == "cuda" else kind, device=device)
+        super().__init__(actor, critic, storage, learning_rate=learning_rate, device=device, rnd_cfg=None, **options)
+        if rnd_cfg is not None:
+            self.rnd = Distillation(storage.num_envs, device=device, **rnd_cfg)
+        self._collect_gradients()
+        self.losses = torch.zeros(len(LOSSES), dtype=kind, device=device)
+        self._kl = self._flat[-1:]
+        rows = storage.num_envs * storage.num_transitions_per_env
+        self._rows = rows // self.num_mini_batches
+        self._order = torch.zeros(rows // self.num_mini_batches * self.num_mini_batches, dtype=torch.int64, device=device)
+        self._obs = storage.observations[0].clone()
+        is_cuda, tf32 = self._flat.is_cuda, precision != "float32"
+        self._autocast = {"device_type": "cuda", "dtype": torch.bfloat16, "enabled": is_cuda and precision == "bfloat16"}
+        self._chosen = Captured(self._choose, device, tf32)
+        self._judged = Captured(self._surprise, device, tf32, is_captured=not self.is_multi_gpu)  # all processes join in it
+        self._returned = Captured(self._returns, device, tf32)
+        self._learned = Captured(self._epoch, device, tf32)
+        self._parts = [Captured(lambda i=i: self._differentiate(i), device, tf32) for i in range(self.num_mini_batches)]
+        self._applied = Captured(self._take_step, device)
+
+    @property
+    def learning_rate(self) -> float:
+        """The learning rate; to read it waits for the device."""
+        return float(self.rate)
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float | Tensor) -> None:
+        self.rate.fill_(rate)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Draw actions, (env, joint), and remember what led to them; they hold until the next call."""
+        self._see(obs)
+        made = self.transition
+        made.actions, made.values, made.actions_log_prob, made.distribution_params = self._chosen()
+        self._value, made.hidden_states = made.values, (None, None)
+        made.observations = self._obs
+        return made.actions
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
+        """Keep what a control step has brought: see rsl_rl."""
+        own = self.transition
+        paid = rewards.clone()
+        own.dones = dones
+        if "time_outs" in extras:
+            paid += self.gamma * self._value[:, 0] * extras["time_outs"]
+        if self.rnd is not None:
+            own.observations = self._obs.clone()
+            self._see(obs)
+            self.intrinsic_rewards = self._judged() * self.rnd.next_weight()
+            paid += self.intrinsic_rewards
+        own.rewards = paid
+        self.storage.add_transition(own)
+        own.clear()
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns and advantages of the rollout; advantages are normalised over all processes."""
+        self._see(obs)
+        self._returned()
+        with torch.no_grad():
+            advantages = self.storage.advantages
+            num = advantages.numel() * num_processes()
+            mean = advantages.sum()
+            summed(mean)
+            advantages -= mean / num
+            squares = advantages.square().sum()
+            summed(squares)
+            advantages /= (squares / (num - 1)).sqrt() + 1e-8
+
+    def update(self) -> dict[str, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Learn from the rollout; return the means of the losses, on the device."""
+        self.losses.zero_()
+        self._order.copy_(torch.randperm(len(self._order), device=self.device))
+        for _ in range(self.num_learning_epochs):
+            if not self.is_multi_gpu:
+                self._learned()
+                continue
+            for part in self._parts:
+                part()
+                summed(self._flat)
+                self._flat /= self.gpu_world_size
+                self._applied()
+        self.losses /= self.num_learning_epochs * self.num_mini_batches
+        obs = self.storage.observations.flatten(0, 1)
+        for part in (self.actor, self.critic, self.rnd):
+            if part is not None:
+                part.update_normalization(obs)
+        self.storage.clear()
+        return {name: self.losses[i] for i, name in enumerate(LOSSES) if name != "rnd" or self.rnd is not None}
+
+    def load(self, loaded_dict: dict[str, Any], load_cfg: dict[str, Any] | None, strict: bool) -> bool:
+        """Take over what was saved: see rsl_rl; what was captured is captured anew."""
+        is_loaded = super().load(loaded_dict, load_cfg, strict)
+        own = [self.optimizer, *([self.rnd.optimizer] if self.rnd else [])]
+        for group in (group for optimizer in own for group in optimizer.param_groups):
+            group |= {"fused": True, "capturable": self._flat.is_cuda}  # it may have been saved on another device
+        for group in self.optimizer.param_groups:
+            self.rate.fill_(float(group["lr"]))
+            group["lr"] = self.rate
+        for captured in (self._chosen, self._judged, self._returned, self._learned, *self._parts, self._applied):
+            captured.forget()
+        return is_loaded
+
+    def broadcast_parameters(self) -> None:
+        """Give all processes the first one's networks."""
+        models = [self._raw_actor, self._raw_critic, *([self.rnd.predictor, self.rnd.target] if self.rnd else [])]
+        for model in models:
+            for tensor in model.state_dict().values():
+                torch.distributed.broadcast(tensor, src=0)
+
+    # What is captured
+
+    def _collect_gradients(self) -> None:
+        """Have all gradients, and after them the policy's divergence, in one buffer; and optimisers that stay on the device."""
+        networks = [*self.actor.parameters(), *self.critic.parameters()]
+        self._weights = [parameter for parameter in networks if parameter.requires_grad]
+        self._predictor = list(self.rnd.predictor.parameters()) if self.rnd is not None else []
+        every = [*self._weights, *self._predictor]
+        self._flat = torch.zeros(sum(p.numel() for p in every) + 1, dtype=every[0].dtype, device=self.device)
+        parts = self._flat[:-1].split([p.numel() for p in every])
+        for parameter, part in zip(every, parts, strict=True):
+            parameter.grad = part.view_as(parameter)
+        self._gradients = [parameter.grad for parameter in every if parameter.grad is not None]
+        is_cuda = self._flat.is_cuda
+        kind: Any = type(self.optimizer)
+        self.optimizer = kind(networks, lr=self.rate, fused=True, capturable=is_cuda)
+        if self.rnd is not None:
+            rate = self.rnd.optimizer.param_groups[0]["lr"]
+            self.rnd.optimizer = torch.optim.Adam(self._predictor, lr=rate, fused=True, capturable=is_cuda)
+
+    def _see(self, obs: TensorDict) -> None:
+        names = list(self._obs.keys())
+        copy_each([self._obs[name] for name in names], [obs[name] for name in names])
+
+    def _policy(self, obs: TensorDict) -> Distribution:
+        """Return the policy's distribution."""
+        actor = self.actor
+        assert actor.distribution is not None
+        with torch.autocast(**self._autocast):
+            made = actor.mlp(actor.get_latent(obs))
+        actor.distribution.update(made.to(self._flat.dtype))
+        return actor.distribution
+
+    def _judge(self, obs: TensorDict) -> Tensor:
+        """Return the critic's values, (row, 1)."""
+        with torch.autocast(**self._autocast):
+            return self.critic(obs).to(self._flat.dtype)
+
+    def _choose(self) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+        with torch.no_grad():
+            distribution = self._policy(self._obs)
+            actions = distribution.sample()
+            params = tuple(each.contiguous() for each in distribution.params)
+            return actions, self._judge(self._obs), distribution.log_prob(actions), params
+
+    def _surprise(self) -> Tensor:
+        assert isinstance(self.rnd, Distillation)
+        return self.rnd.surprise(self._obs)
+
+    def _returns(self) -> None:
+        with torch.no_grad():
+            own, value = self.storage, self._judge(self._obs)
+            advantage = torch.zeros_like(value)
+            for step in reversed(range(own.num_transitions_per_env)):
+                goes_on = 1.0 - own.dones[step].float()
+                delta = own.rewards[step] + goes_on * self.gamma * value - own.values[step]
+                advantage = delta + goes_on * self.gamma * self.lam * advantage
+                value = own.values[step]
+                own.returns[step] = advantage + value
+            own.advantages.copy_(own.returns - own.values)
+
+    def _epoch(self) -> None:
+        for i in range(self.num_mini_batches):
+            self._differentiate(i)
+            self._take_step()
+
+    def _differentiate(self, i: int) -> None:
+        """Compute the gradients of mini-batch i, and how far the policy has moved."""
+        own, rows = self.storage, self._order[i * self._rows : (i + 1) * self._rows]
+        with torch.no_grad():
+            obs = TensorDict({name: each.flatten(0, 1)[rows] for name, each in own.observations.items()}, [len(rows)])
+            actions, values, chance, returns, advantages = (
+                each.flatten(0, 1)[rows]
+                for each in (own.actions, own.values, own.actions_log_prob, own.returns, own.advantages)
+            )
+            before = tuple(each.flatten(0, 1)[rows] for each in own.distribution_params or ())
+        with torch.enable_grad():
+            distribution = self._policy(obs)
+            ratio = (distribution.log_prob(actions) - chance[:, 0]).exp()
+            gain = advantages[:, 0]
+            surrogate = torch.max(-gain * ratio, -gain * ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)).mean()
+            value = self._value_loss(self._judge(obs), values, returns)
+            entropy = distribution.entropy.mean()
+            loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+            error = self.rnd.compute_loss(obs) if self.rnd is not None else torch.zeros_like(loss)
+            found = [*torch.autograd.grad(loss, self._weights)]
+            found += torch.autograd.grad(error, self._predictor) if self._predictor else []
+        with torch.no_grad():
+            copy_each(self._gradients, found)
+            params = tuple(each.detach() for each in distribution.params)
+            self._kl.copy_(distribution.kl_divergence(before, params).mean())
+            self.losses += torch.stack([value, surrogate, entropy, error]).detach()
+
+    def _value_loss(self, found: Tensor, before: Tensor, wanted: Tensor) -> Tensor:
+        squares = (found - wanted).square()
+        if not self.use_clipped_value_loss:
+            return squares.mean()
+        near = before + (found - before).clamp(-self.clip_param, self.clip_param)
+        return torch.max(squares, (near - wanted).square()).mean()
+
+    def _take_step(self) -> None:
+        """Adapt the learning rate, and make a step of the optimisers."""
+        with torch.no_grad():
+            if self.schedule == "adaptive" and self.desired_kl is not None:
+                kl, rate = self._kl[0], self.rate
+                slower = (rate / RATE_FACTOR).clamp(min=LEAST_RATE)
+                faster = torch.where(kl > 0.0, (rate * RATE_FACTOR).clamp(max=MOST_RATE), rate)
+                kept = torch.where(kl < self.desired_kl / 2.0, faster, rate)
+                rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, kept))
+            nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+            nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+            self.optimizer.step()
+            if self.rnd is not None:
+                self.rnd.optimizer.step()
+
+
+def _refuse(actor: MLPModel, critic: MLPModel, options: dict[str, Any]) -> None:
+    """Refuse what cannot be captured.
+
+    Raises:
+        TgdslError: If it is asked for.
+    """
+    asked = {name: options.get(name) for name in ("symmetry_cfg", "use_mixed_precision", "normalize_advantage_per_mini_batch")}
+    asked["recurrent networks"] = actor.is_recurrent or critic.is_recurrent
+    asked[f"optimizer {options.get('optimizer')}"] = options.get("optimizer", "adam") not in ("adam", "adamw")
+    if wrong := [name for name, value in asked.items() if value]:
+        raise TgdslError(f"CapturedPPO does without {', '.join(wrong)}: take rsl_rl's own PPO")

@@ -1,0 +1,117 @@
+"""The processes that learn together, as torchrun starts them, each with environments of its own.
+
+With one process nothing is done. The backend is NCCL on GPUs and gloo on CPUs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, distributed
+
+from tgdsl.errors import TgdslError
+
+
+class RankError(TgdslError):
+    """Processes that cannot learn together."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Which process of how many this is.
+
+    Attributes:
+        rank: Number of this process, from 0.
+        size: How many there are.
+        local: Its number among those of this host: its GPU.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local: int = 0
+
+    @staticmethod
+    def of(environ: Mapping[str, str] = os.environ) -> Ranks:
+        """Return what torchrun says.
+
+        Raises:
+            RankError: If its variables make no sense.
+        """
+        try:
+            found = Ranks(
+                *(int(environ.get(name, least)) for name, least in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
+            )
+        except ValueError as error:
+            raise RankError(f"RANK, WORLD_SIZE and LOCAL_RANK are set by torchrun, and are whole numbers: {error}") from error
+        if not 0 <= found.rank < found.size or found.local < 0:
+            raise RankError(f"RANK is {found.rank} and WORLD_SIZE {found.size}: expected a rank from 0 below the size")
+        return found
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process writes and tells."""
+        return self.rank == 0
+
+    @property
+    def rsl_rl(self) -> dict[str, int] | None:
+        """What rsl_rl's `multi_gpu` takes."""
+        return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.size} if self.size > 1 else None
+
+    def device(self, device: str) -> str:
+        """Return this process's device: "cuda" is one GPU each.
+
+        Raises:
+            RankError: If several processes shall share a GPU that is named.
+        """
+        if self.size == 1 or device.partition(":")[0] != "cuda":
+            return device
+        if device != "cuda":
+            raise RankError(f'device is "{device}", and {self.size} processes take a GPU each; expected "cuda"')
+        return f"cuda:{self.local}"
+
+    def join(self, device: str) -> None:
+        """Meet the other processes, if there are any and they have not met."""
+        if self.size == 1 or distributed.is_initialized():
+            return
+        is_gpu = device.partition(":")[0] == "cuda"
+        if is_gpu:
+            torch.cuda.set_device(device)
+        distributed.init_process_group("nccl" if is_gpu else "gloo", rank=self.rank, world_size=self.size)
+
+    def leave(self) -> None:
+        """Part from the others."""
+        if self.size > 1 and distributed.is_initialized():
+            distributed.destroy_process_group()
+
+    def agreed(self, choices: tuple[bool, ...], device: torch.device | str) -> tuple[bool, ...]:
+        """Return the first process's choices."""
+        if self.size == 1:
+            return choices
+        told = torch.tensor(choices, dtype=torch.int32, device=device)
+        distributed.broadcast(told, src=0)
+        return tuple(bool(each) for each in told.tolist())
+
+    def gathered(self, own: Any) -> list[Any]:
+        """Return what each process has, in all of them."""
+        if self.size == 1:
+            return [own]
+        every: list[Any] = [None] * self.size
+        distributed.all_gather_object(every, own)
+        return every
+
+
+def summed(*tensors: Tensor) -> None:
+    """Replace each tensor by its sum over all processes, if there are several; the host does not wait."""
+    if distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1:
+        for tensor in tensors:
+            distributed.all_reduce(tensor)
+
+
+def num_processes() -> int:
+    """Return how many processes there are."""
+    is_joined = distributed.is_available() and distributed.is_initialized()
+    return distributed.get_world_size() if is_joined else 1

@@ -1,0 +1,128 @@
+"""A run: iterations until enough were made or time is over, with checkpoints on the way, so that it may be killed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tgdsl.errors import TgdslError
+from tgdsl.rl.train.checkpoint import state_of, write_checkpoint
+from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.train.iteration import Iteration, Learning
+from tgdsl.rl.train.telling import Board
+
+
+class DivergedError(TgdslError):
+    """A policy whose losses are no numbers any more."""
+
+
+Shown = Callable[[Mapping[str, float | int], float], None]
+"""Is told what an iteration was, as `curve.csv` has it, and how much time is left [s]."""
+
+
+class Run:
+    """A run in its folder.
+
+    Attributes:
+        seconds: How long it has learned [s]; to make environments and to evaluate is not learning.
+    """
+
+    def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
+        """Write the first checkpoint: a folder or disk that cannot take it is found now.
+
+        Args:
+            learner: The learner.
+            folder: Its folder, which `RunFolder.begin` has begun.
+            every: Time between checkpoints [s].
+            seconds: How long it has learned before [s].
+
+        Raises:
+            FileError: If no checkpoint can be written, or the disk has no room for others.
+        """
+        self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
+        self._rate = 0.0
+        self._writes = learner.ranks.is_first
+        if self._writes:
+            folder.keep_rows(learner.iteration)
+        size = self.save()
+        if self._writes:
+            folder.check_room(size)
+        self._board = Board(folder.path, learner.iteration) if self._writes else None
+
+    @property
+    def has_board(self) -> bool:
+        """Whether this process writes for TensorBoard."""
+        return self._board is not None and self._board.is_there
+
+    def save(self) -> int:
+        """Write a checkpoint; return its size [byte], 0 of a process that writes none."""
+        state = state_of(self._learner, self.seconds)
+        return write_checkpoint(state, self._folder.checkpoint) if self._writes else 0
+
+    def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
+        """Learn.
+
+        Args:
+            iterations: Iterations of the whole run, those made before included.
+            seconds: Time from now on [s]; may be infinite.
+            shown: Is shown each iteration.
+
+        Raises:
+            DivergedError: If the losses are no numbers any more; the last checkpoint is from before.
+            FileError: If something cannot be written; likewise.
+        """
+        learner, before = self._learner, self.seconds
+        begun = saved = time.monotonic()
+        is_over = learner.iteration >= iterations
+        try:
+            while not is_over:
+                start = time.monotonic()
+                made = learner.iterate()
+                now = time.monotonic()
+                self.seconds = before + now - begun
+                self._refuse_diverged(made)
+                self._tell(made, now - start, iterations, seconds - (now - begun), shown)
+                is_over = learner.iteration >= iterations or now - begun >= seconds
+                is_due = is_over or now - saved + (now - start) > self._every
+                is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
+                if is_due:
+                    self.save()
+                    saved = now  # until it is written, what was there before counts
+        finally:
+            if self._board is not None:
+                self._board.close()
+
+    def _tell(self, made: Iteration, duration: float, iterations: int, time_left: float, shown: Shown | None) -> None:
+        """Write an iteration into curve and TensorBoard, and show it."""
+        if not self._writes:
+            return
+        learner = self._learner
+        samples = learner.samples // learner.iteration
+        self._rate = duration if not self._rate else 0.9 * self._rate + 0.1 * duration
+        perf = {"Perf/total_fps": samples / duration, "Perf/collection_time": made.rollout, "Perf/learning_time": made.update}
+        row: dict[str, float | int] = {
+            "iteration": learner.iteration,
+            "samples": learner.samples,
+            "seconds": self.seconds,
+            "steps_per_second": samples / self._rate,
+            "rollout": made.rollout,
+            "update": made.update,
+            "episodes": made.episodes,
+        }
+        self._folder.add_row({**row, **dict.fromkeys(learner.episode_names, math.nan), **made.told})
+        if self._board is not None:
+            self._board.add(made.told | perf, learner.iteration)
+        if shown is not None:
+            shown(row | made.told, max(0.0, min(time_left, (iterations - learner.iteration) * self._rate)))
+
+    def _refuse_diverged(self, made: Iteration) -> None:
+        wrong: dict[str, Any] = {name: value for name, value in made.told.items() if name.startswith("Loss/")}
+        wrong = {name: value for name, value in wrong.items() if not math.isfinite(value)}
+        if wrong:
+            what = ", ".join(f"{name} is {value}" for name, value in wrong.items())
+            raise DivergedError(
+                f"iteration {self._learner.iteration}: {what}; {self._folder.checkpoint} is from before: try a smaller "
+                f"{self._learner.rates}"
+            )

@@ -1,0 +1,123 @@
+"""How a policy is learned: the numbers of PPO, of its networks and of random network distillation.
+
+Source of the defaults: Chung et al., *Tactile Genesis*, appendix, "Optimization and Network Hyperparameters"; the tasks' own
+departures from them stand in their specs. What the paper leaves open, and is chosen here: `eps`, `clip`, the encoders' use by
+both actor and critic, the RND networks' widths and weight, `desynchronise`, `precision`, the checkpoints' times.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, StrictBool, StrictInt, Tag, model_validator
+
+from tgdsl.fields.models import TEXT_OR_OTHER, NonNegative, Positive, Quantity, SpecModel
+
+Whole = Annotated[StrictInt, Field(ge=1)]
+Widths = Annotated[tuple[Whole, ...], Field(min_length=1)]
+Groups = Annotated[tuple[str, ...], Field(min_length=1)]
+Share = Annotated[float, Quantity("number", ge=0.0), Field(le=1.0)]
+Time = Annotated[float, Quantity("time", gt=0.0)]
+Precision = Literal["float32", "tf32", "bfloat16"]
+WIDTHS = (512, 256, 128)
+
+
+class EncoderSpec(SpecModel):
+    """The network that embeds one group of observations."""
+
+    hidden: Widths = WIDTHS
+    """Widths of its hidden layers."""
+    size: Whole = 64
+    """Size of the embedding."""
+
+
+class NetworksSpec(SpecModel):
+    """Networks of actor and critic: groups are normalised, each is embedded, and the embeddings are mapped together."""
+
+    encoder: EncoderSpec = EncoderSpec()
+    """Of each group but touch."""
+    touch_encoder: EncoderSpec = EncoderSpec(hidden=(64, 64), size=32)
+    """Of `tactile_sensors`."""
+    hidden: Widths = WIDTHS
+    """Widths of the hidden layers that follow the embeddings."""
+    initial_std: Positive = 1.0
+    """Standard deviation of the actions at the start."""
+    eps: Positive = 1e-5
+    """What is added to the standard deviation by which an observation is divided, in the observation's unit."""
+    clip: Positive = 10.0
+    """Bound of normalised observations."""
+
+
+class RndSpec(SpecModel):
+    """Random network distillation: what is new to the predictor pays."""
+
+    groups: Groups | None = None
+    """Groups of observations that are looked at; default: `priv_obj_state` if there is one, else those of the actor."""
+    weight: NonNegative = 1.0
+    """Reward per second for one standard deviation of the prediction's error [1/s]."""
+    outputs: Whole = 8
+    """Size of the embedding that is predicted."""
+    predictor: Widths = (256, 128)
+    """Widths of the predictor's hidden layers."""
+    target: Widths = (256, 128)
+    """Widths of the target's hidden layers."""
+    learning_rate: Positive = 1e-3
+    """Learning rate of the predictor."""
+
+
+Rnd = Annotated[Annotated[Literal["off"], Tag("text")] | Annotated[RndSpec, Tag("other")], TEXT_OR_OTHER]
+
+
+class TrainSpec(SpecModel):
+    """How a policy is learned."""
+
+    iterations: Whole = 6000
+    """Iterations of the whole run: rollout and update."""
+    steps: Whole = 24
+    """Control steps of each environment per iteration."""
+    actor: Groups | None = None
+    """Groups of observations that the actor sees; default, the paper's teacher: all but `tactile_sensors`, `priv_obj_props` and
+    `proprio`, which `priv_proprio` contains."""
+    critic: Groups | None = None
+    """Groups of observations that the critic sees; default: those of the default actor, and `priv_obj_props`."""
+    networks: NetworksSpec = NetworksSpec()
+    """Networks of actor and critic."""
+    rnd: Rnd = RndSpec()
+    """Random network distillation, or `off`."""
+    learning_rate: Positive = 1e-3
+    """Learning rate, at the start where it is adaptive."""
+    adaptive: StrictBool = True
+    """Whether the learning rate follows the change of the policy: `desired_kl`."""
+    desired_kl: Positive = 0.01
+    """Divergence of a mini-batch's policy from that of the rollout: above twice of it the rate falls, below half it rises."""
+    epochs: Whole = 5
+    """How often an update goes through its rollout."""
+    mini_batches: Whole = 4
+    """Mini-batches of an epoch."""
+    discount: Share = 0.998
+    """γ."""
+    gae: Share = 0.95
+    """λ of the generalised advantage estimate."""
+    clip: Positive = 0.2
+    """Bound of the change of a probability ratio, and of a value."""
+    entropy: NonNegative = 2e-3
+    """Weight of the entropy."""
+    value: NonNegative = 1.0
+    """Weight of the value's error."""
+    max_grad_norm: Positive = 1.0
+    """Norm to which gradients are scaled down, of actor and critic each."""
+    desynchronise: StrictBool = True
+    """Whether first episodes end at random times, so that later ones do not end together."""
+    precision: Precision = "tf32"
+    """How a GPU multiplies matrices: `float32`, `tf32` (ten bits of mantissa), or `bfloat16` (seven), of which activations then
+    are too; weights, gradients, losses and all else are float32."""
+    checkpoint: Time = 10.0
+    """What a run that is killed loses at most, if its iterations are no longer [s]."""
+
+    @model_validator(mode="after")
+    def _check(self) -> TrainSpec:
+        for name in ("actor", "critic"):
+            groups = getattr(self, name) or ()
+            if len(set(groups)) < len(groups):
+                raise ValueError(f"{name} names a group twice")
+        return self

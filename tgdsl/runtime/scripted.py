@@ -1,0 +1,81 @@
+"""The script that a scene is run by where nothing else is said: keyframes in turn, or the hand closes on an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from tgdsl.console.progress import Progress, silent
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.closing.closing import START, Closing, closing_of
+from tgdsl.runtime.rollout import Controls, controls_between, default_keyframes, held_controls, scripted_controls
+from tgdsl.scene.options import Options
+from tgdsl.scene.scene import scene_model
+
+
+class Run(NamedTuple):
+    """A scene at its start, and the controls that it is stepped through."""
+
+    sim: BatchSimulation
+    controls: Controls
+
+
+@dataclass(frozen=True)
+class Script:
+    """How a scene is run.
+
+    Attributes:
+        keyframes: Keyframes whose controls are held and moved between, in turn; None: the start is held.
+        closing: How the hand closes on an object, where there are no keyframes.
+        note: What a user should know of it; may be empty.
+    """
+
+    keyframes: tuple[str, ...] | None = None
+    closing: Closing | None = None
+    note: str = ""
+
+    def begin(self, touch: TactileModule, num_envs: int, substeps: int, seconds: float, options: Options | None = None) -> Run:
+        """Start the scene.
+
+        Args:
+            touch: The module that reads it.
+            num_envs: Environments.
+            substeps: Physics steps per control step.
+            seconds: Duration of each hold and of each move [s].
+            options: MuJoCo's options that are to differ from the scene's.
+
+        Raises:
+            SimulationError: If the scene has no such keyframe, or cannot be simulated.
+        """
+        if self.closing is not None:
+            prepare = self.closing.prepare
+            sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=START, options=options, prepare=prepare)
+            return Run(sim, controls_between(self.closing.targets(sim.model.nu), seconds, sim.control_step))
+        if self.keyframes is None:
+            sim = BatchSimulation(touch, num_envs, substeps=substeps, options=options)
+            return Run(sim, held_controls(sim.model, seconds, sim.control_step))
+        model = scene_model(touch.plan.scene)
+        timestep = float((options or {}).get("timestep", model.opt.timestep))  # type: ignore[arg-type]
+        controls = scripted_controls(model, self.keyframes, seconds, substeps * timestep)
+        sim = BatchSimulation(touch, num_envs, substeps=substeps, keyframe=self.keyframes[0], options=options)
+        return Run(sim, controls)
+
+
+def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, progress: Progress = silent) -> Script:
+    """Return how a scene is run.
+
+    Args:
+        touch: The module that reads it.
+        keyframes: Keyframes whose controls are held and moved between; default: `rest` and `squeeze` if the scene has them,
+            else the hand closes on the first object that fits between its fingers, or, if it cannot, the start is held.
+        progress: Is told what is done.
+    """
+    own = default_keyframes(scene_model(touch.plan.scene)) if keyframes is None else keyframes
+    if own or keyframes is not None:
+        return Script(own)
+    progress("finding out how the hand closes")
+    closing = closing_of(touch)
+    if isinstance(closing, str):
+        return Script(note=f"no keyframes rest and squeeze, and the hand does not close ({closing})")
+    return Script(closing=closing, note=f"no keyframes rest and squeeze: {closing}")

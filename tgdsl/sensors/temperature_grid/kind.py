@@ -1,0 +1,220 @@
+"""Temperature grid: heat in links that are divided into cells, and between them and what they touch.
+
+The box of each link is nx × ny × nz cells of one material, and θ_i = T_i − T_a the temperature of one above ambient [K]. A step
+of Δt does, one after the other:
+
+1. contact: C_i θ̇_i = Σ_n g_in (φ_n − θ_i) with the bodies and links that it touches, implicit and for all of them at once
+   (`conduction`); g_in from the patches' areas, both conductivities and the constriction of heat to a small spot (`shares`);
+2. losses: C_i θ̇_i = −A_i [h θ_i + ε σ (T_i⁴ − T_a⁴)] with the exposed area A_i of the cell (`losses`);
+3. a source: C_i θ̇_i = P/N, or q A_i at a face; half of it before 4, half after;
+4. conduction within the link: θ̇ = α ∇²θ between insulated walls, α = k/(ρc) (`diffusion`).
+
+    y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
+
+is what a sensing element of time constant τ reads of it, exact where T is linear between calls. C_i = ρcV_i is the heat
+capacity of a cell [J/K]. Steps 1, 2 and 4 leave no temperature beyond those of bodies and surroundings before, however long Δt
+is, and the splitting between them is of first order in Δt. The patch of a contact has the area of the polygon of contact
+points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
+
+What the objects hold is part of the sensor's state: one temperature each, of a body that conducts from the patch to its middle
+as a cube of its volume would, or a grid of their own with `cells`. A new episode begins at the temperatures that the document
+or the state gives, and its first reading is these.
+
+Sums are compensated: a float32 module keeps what it adds to 2⁻⁴⁸ of a temperature, and what leaves one cell enters another.
+`<sensor>/heat` has by link what it stores above ambient, and what came in at this call from source, radiation, convection and
+contact [J]; `<sensor>/objects` the same of each object, with its temperature.
+
+Source: Incropera et al., *Fundamentals of Heat and Mass Transfer*; Johnson, *Contact Mechanics*, 4.2 (Hertz); the order of
+steps and the lag are the paper's. Departures from it: fluxes act on areas, conduction is implicit, the area of a point contact
+is an area, and the lag is exact: see `paper` for the printed formulas.
+
+Limits: a link is a solid box; material where the box stands over counts, and exposed faces are the box's. Patches do not shade
+faces from losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.errors import LowerError
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.patches import ContactPatches
+from tgdsl.quantities.patches.cells import is_cell, outer_areas, tables
+from tgdsl.sensors.base import Axis, Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.noise import BASE
+from tgdsl.sensors.temperature_grid import grids
+from tgdsl.sensors.temperature_grid.advance import Heat, advanced
+from tgdsl.sensors.temperature_grid.reference import reference
+from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec, alternatives
+
+HEAT = tuple(Channel(name, "J") for name in ("stored", "source", "radiation", "convection", "contact"))
+OBJECTS = (Channel("temperature", "degC"), *(Channel(name, "J") for name in ("stored", "radiation", "convection", "contact")))
+
+
+def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
+    """Divide the links' boxes into cells; what of a step does not depend on Δt is computed."""
+    boxes = grids.boxes(spec, layout, surface_of)
+    count, size = grids.counts(spec, boxes), boxes[:, 1] - boxes[:, 0]
+    there = is_cell(count)
+    made_of = [spec.material_of(link.name) for link in layout.links]
+    for pattern in spec.materials:
+        if not any(fnmatchcase(link.name, pattern) for link in layout.links):
+            known = ", ".join(link.name for link in layout.links)
+            raise LowerError(
+                f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
+            )
+    constants = tables(count, size, spec.exposed) | {
+        "conductivity": np.array([own.conductivity for own in made_of]),
+        "volumetric_heat": np.array([own.density * own.specific_heat for own in made_of]),
+        "ambient": scalar(spec.ambient),
+        "start": scalar(spec.start - spec.ambient),
+        "is_cell": there.astype(np.float64),
+        **_contact(spec, made_of, size),
+    }
+    if spec.emissivity is not None:
+        own = [m.emissivity if spec.emissivity == "material" else spec.emissivity for m in made_of]
+        constants["emissivity"] = np.array(own)
+    if spec.convection is not None:
+        constants["convection"] = scalar(spec.convection)
+    if spec.source is not None:
+        constants |= _source(spec, count, size)
+    shape = there.shape
+    state = {"cells": Memory(shape=shape), "cells_low": Memory(shape=shape)}
+    if spec.feels:
+        state |= {"objects": Memory(shape=ContactPatches), "objects_low": Memory(shape=ContactPatches)}
+    if spec.lag is not None:
+        constants["lag"], state["measured"] = scalar(spec.lag), Memory(shape=shape)
+    rows = _rows(spec, layout, count, boxes)
+    read = np.flatnonzero(_is_read(spec, count, size))
+    if spec.outputs in ("cells", "surface"):
+        if len(read) < there.size:
+            constants["read"] = read
+    else:
+        constants["share"] = there / there.sum(axis=(1, 2, 3), keepdims=True)
+        constants[spec.outputs] = scalar(1.0)
+    constants |= {
+        f"is_{name}": scalar(1.0) for name in (spec.scheme, spec.model) if name in ("spectral", "semi_implicit", "paper")
+    }
+    reports, report_rows = {"heat": HEAT}, {}
+    if spec.feels:
+        reports["objects"], report_rows["objects"] = OBJECTS, Axis("object", len(spec.feels), {"object": spec.feels})
+    return Lowered(
+        channels=(Channel("temperature", "degC"),),
+        constants=constants,
+        state=state,
+        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes),),
+        rows=rows,
+        reports=reports,
+        report_rows=report_rows,
+    )
+
+
+def _contact(spec: TemperatureGridSpec, made_of: list, size: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+    """Return what areas and conductances of patches follow from."""
+    if not spec.feels:
+        return {}
+    found = {}
+    if spec.contact_area == "manifold":
+        moduli = [(own.youngs_modulus, own.poissons_ratio or 0.0) for own in made_of]
+        found["compliance"] = np.array([0.0 if e is None else (1.0 - nu * nu) / e for e, nu in moduli])
+        radius = 0.5 * size.min(axis=1) if spec.curvature_radius is None else np.full(len(size), spec.curvature_radius)
+        found["curvature"] = 1.0 / radius
+    else:
+        found["contact_area"] = scalar(spec.contact_area)
+    if spec.contact_conductance is not None:
+        found["contact_conductance"] = scalar(spec.contact_conductance)
+    return found
+
+
+def _source(spec: TemperatureGridSpec, count: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the heat that is made in each cell (row, x, y, z) [W]; of the paper's formula q/Δ of each row [W/m³]."""
+    source, there = spec.source, is_cell(count)
+    assert source is not None
+    if source.flux is None or source.face is None:
+        return {"source": (source.power or 0.0) * there / there.sum(axis=(1, 2, 3), keepdims=True)}
+    if spec.model == "paper":
+        return {"paper_source": source.flux / (size / count)[:, "xyz".index(source.face[1])]}
+    return {"source": source.flux * outer_areas(count, size, [source.face])}
+
+
+def _is_read(spec: TemperatureGridSpec, count: np.ndarray, size: np.ndarray) -> np.ndarray:
+    return outer_areas(count, size, ("-x", "+x", "-y", "+y", "-z", "+z")) > 0 if spec.outputs == "surface" else is_cell(count)
+
+
+def _rows(spec: TemperatureGridSpec, layout: Layout, count: np.ndarray, boxes: np.ndarray) -> Axis:
+    """Return what is read, with the boxes that it is read of: centres and sides, along their bodies' axes [m]."""
+    sides = boxes[:, 1] - boxes[:, 0]
+    if spec.outputs not in ("cells", "surface"):
+        table = {"link": [link.name for link in layout.links], "pos": 0.5 * (boxes[:, 0] + boxes[:, 1]), "size": sides}
+        return Axis("body", len(boxes), table, np.arange(len(boxes)))
+    row, *at = np.nonzero(_is_read(spec, count, sides))
+    size = (sides / count)[row]
+    pos = boxes[row, 0] + (np.stack(at, axis=1) + 0.5) * size
+    table = {"link": [layout.links[i].name for i in row], "pos": pos, "size": size, "cell": np.stack(at, axis=1)}
+    return Axis("cell", len(row), table, row.astype(np.int64))
+
+
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return temperatures [°C], and by link and object what heat they hold and got [J]."""
+    before = state["cells"]
+    heat = advanced(gathered[ContactPatches], context, constants, state)
+    new = {"cells": heat.cells, "cells_low": heat.cells_low}
+    if "objects" in state:
+        new |= {"objects": heat.objects.flatten(1), "objects_low": heat.objects_low.flatten(1)}
+    seen = heat.cells + heat.cells_low
+    if "lag" in constants:
+        seen = new["measured"] = _lagged(seen, before, state["measured"], constants, context)
+    readings = {"signal": (_output(seen, constants) + constants["ambient"])[:, None], **_reports(heat, constants)}
+    return readings, new
+
+
+def _lagged(after: Tensor, before: Tensor, measured: Tensor, constants: Constants, context: Context) -> Tensor:
+    """Return what an element with a lag measures of temperatures that are linear between calls [K]."""
+    is_first = context.is_first[..., None, None, None]
+    ratio = context.dt / constants["lag"]
+    if "is_paper" in constants:
+        return torch.where(is_first, after, measured + ratio * (after - measured))
+    kept, moved = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
+    return torch.where(is_first, after, after + (measured - before) * kept - (after - before) * moved)
+
+
+def _output(cells: Tensor, constants: Constants) -> Tensor:
+    """Return what is read of cells above ambient, (env, row)."""
+    if "share" not in constants:
+        flat = cells.flatten(1)
+        return flat[:, constants["read"]] if "read" in constants else flat
+    if "mean" in constants:
+        return (cells * constants["share"]).sum(dim=(-3, -2, -1))
+    return torch.where(constants["is_cell"] > 0, cells, -torch.inf).amax(dim=(-3, -2, -1))
+
+
+def _reports(heat: Heat, constants: Constants) -> dict[str, Tensor]:
+    """Return the reports, (env, channel, row)."""
+    reports = {"heat/signal": torch.stack([heat.stored, *heat.gained], dim=1)}
+    if heat.of_objects:
+        above, *rest = heat.of_objects
+        reports["objects/signal"] = torch.stack([above + constants["ambient"], *rest], dim=1)
+    return reports
+
+
+def indices(constants: Mapping[str, np.ndarray], num_taxels: int) -> dict[str, int]:
+    """Return of how many things constants are indices: of cells."""
+    return {"read": constants["is_cell"].size} if "read" in constants else {}
+
+
+TEMPERATURE_GRID = Kind(
+    TemperatureGridSpec,
+    lower,
+    forward,
+    reference,
+    knobs=BASE,
+    is_timed=True,
+    indices=indices,
+    alternatives=alternatives,
+)

@@ -1,0 +1,117 @@
+"""Rows of cells: the links of a sensor, and the objects that are divided into cells, as one batch.
+
+Shapes: `env` environments, or 1 where all are alike; `row` links, then objects with cells; `x`, `y`, `z` cells of the largest.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from tgdsl.geometry import planes
+from tgdsl.geometry.planes import Vec
+from tgdsl.quantities.patches import ContactPatch
+from tgdsl.sensors.base import Constants
+from tgdsl.sensors.temperature_grid.shares import Boxes
+
+
+class Rows(NamedTuple):
+    """What rows are made of.
+
+    Attributes:
+        conductivity: k (env, row) [W/(m·K)].
+        diffusivity: α = k/(ρc) (env, row) [m²/s].
+        capacity: Heat capacity of a cell (env, row) [J/K].
+        emissivity: ε (env, row) [1]; None if nothing radiates.
+        outer: Exposed area of each cell (row, x, y, z) [m²].
+        boxes: The boxes.
+        exponent: By what αΔt/Δ² is multiplied in the exponent (row, mode), of modes from 1 on.
+        cosines: Cosine modes along each axis (row, mode, cell).
+    """
+
+    conductivity: Tensor
+    diffusivity: Tensor
+    capacity: Tensor
+    emissivity: Tensor | None
+    outer: Tensor
+    boxes: Boxes
+    exponent: Vec
+    cosines: Vec
+
+
+def num_cells(rows: Rows) -> tuple[int, int, int]:
+    """Return how many cells there are along each axis, padded."""
+    x, y, z = rows.outer.shape[1:]
+    return x, y, z
+
+
+def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Rows:
+    """Return the rows of a sensor.
+
+    Args:
+        constants: What `lower` folded.
+        patches: What links touch, and what that is made of.
+        is_smooth: Whether modes decay as those of the continuous solid.
+    """
+    objects, grids = patches.objects, list(patches.topology.grids)
+    tables, size = dict(constants), patches.boxes[:, 1] - patches.boxes[:, 0]
+    corner = patches.boxes[:, 0]
+    k, heat = constants["conductivity"][None], constants["volumetric_heat"][None]
+    emissivity = constants["emissivity"][None] if "emissivity" in constants else None
+    if grids:
+        tables = {name: _joined(constants[name], table) for name, table in patches.cells.items()}
+        size = torch.cat([size, torch.stack([part[grids] for part in objects.size], dim=-1)])
+        corner = torch.cat([corner, torch.stack([part[grids] for part in objects.corner], dim=-1)])
+        k, heat = (_beside(own, part[:, grids]) for own, part in ((k, objects.conductivity), (heat, objects.volumetric_heat)))
+        emissivity = None if emissivity is None else _beside(emissivity, objects.emissivity[:, grids])
+    count = planes.split(tables["count"])
+    sides = planes.split(size)
+    step = planes.vec(side / n for side, n in zip(sides, count, strict=True))
+    boxes = Boxes(planes.split(corner), sides, step, count)
+    name = "smooth" if is_smooth else "square"
+    return Rows(
+        conductivity=k,
+        diffusivity=k / heat,
+        capacity=heat * (step[0] * step[1] * step[2]),
+        emissivity=emissivity,
+        outer=tables["outer"],
+        boxes=boxes,
+        exponent=planes.vec(tables[f"{name}_{axis}"] for axis in "xyz"),
+        cosines=planes.vec(tables[f"cosine_{axis}"] for axis in "xyz"),
+    )
+
+
+def is_there(rows: Rows) -> Tensor:
+    """Return 1 for the cells that a row has (row, x, y, z)."""
+    parts = []
+    for axis, size in enumerate(num_cells(rows)):
+        place = torch.arange(size, device=rows.outer.device)
+        shape = [len(rows.outer), 1, 1, 1]
+        shape[1 + axis] = size
+        parts.append((place[None] < rows.boxes.count[axis][:, None]).to(rows.outer.dtype).reshape(shape))
+    return parts[0] * parts[1] * parts[2]
+
+
+def padded(cells: Tensor, num_cells: tuple[int, int, int]) -> Tensor:
+    """Return cells (…, x, y, z) with more of them, of value 0."""
+    lack = [want - found for want, found in zip(num_cells, cells.shape[-3:], strict=True)]
+    return pad(cells, (0, lack[2], 0, lack[1], 0, lack[0])) if any(lack) else cells
+
+
+def _beside(links: Tensor, objects: Tensor) -> Tensor:
+    """Return values of links (1, link) and of objects (env, object) as (env, row)."""
+    return torch.cat([links.expand(len(objects), -1), objects], dim=1)
+
+
+def _joined(links: Tensor, objects: Tensor) -> Tensor:
+    """Return two tables one below the other, each padded to the larger shape; a mode that is not there has eigenvalue 1."""
+    shape = [max(a, b) for a, b in zip(links.shape[1:], objects.shape[1:], strict=True)]
+    filling = 1.0 if links.ndim == 2 else 0.0
+    parts = []
+    for table in (links, objects):
+        lack = [want - found for want, found in zip(shape, table.shape[1:], strict=True)]
+        parts.append(pad(table, [n for lacking in reversed(lack) for n in (0, lacking)], value=filling))
+    return torch.cat(parts)

@@ -1,0 +1,164 @@
+"""Readings of boxes: temperatures of a link's cells, or of whole links, where they are in the world and how warm they are.
+
+Shapes: `box` boxes of one reading.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from tgdsl.layout.layout import Layout
+from tgdsl.module.memory.history import last_step
+from tgdsl.module.module import TactileModule
+from tgdsl.module.outputs import Output
+from tgdsl.runtime.source import Simulator
+from tgdsl.view.markers import Markers
+from tgdsl.view.scene import Paint, Seen, draw_image, draw_scale_bar, rendered
+from tgdsl.view.style import INK, WARMTH
+from tgdsl.view.taxels import Pose, in_world
+
+Array = np.ndarray
+FLAT = 0.5
+"""Half of the range of the colours where all that is read is the same [the reading's unit]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """The boxes of one reading in one environment, and what they read.
+
+    Attributes:
+        layout: Those at the surface of their link, as taxels: centre, mean normal and area of what is exposed.
+        chosen: Which boxes these are: the others are hidden inside.
+        size: Their sides, along the axes of their body [m].
+        value: What each reads, hidden ones too.
+        label: Quantity and unit.
+        unit: Unit, as it is printed.
+        ends: Lowest and highest of the colours; None: those of the values.
+    """
+
+    layout: Layout
+    chosen: Int[Array, " shown"]
+    size: Float[Array, "shown 3"]
+    value: Float[Array, " box"]
+    label: str
+    unit: str
+    ends: tuple[float, float] | None = None
+
+    @property
+    def norm(self) -> Normalize:
+        """The range of the colours: as it was asked for, or one that holds all values."""
+        if self.ends is not None:
+            return Normalize(*self.ends, clip=True)
+        low, high = float(self.value.min()), float(self.value.max())
+        return Normalize(low - FLAT, high + FLAT) if high - low < 1e-6 * max(1.0, abs(high)) else Normalize(low, high)
+
+    @property
+    def headline(self) -> str:
+        """The range of what is read: `temperature 22.00 … 24.13 °C`."""
+        return f"{self.label.split(' [')[0]} {span(self.value)} {self.unit}"
+
+    def markers(self, model: mujoco.MjModel, pose: Pose) -> Markers:
+        """Return the boxes at the surface as markers; those count as read that differ most from the middle value."""
+        bodies = [self.layout.links[i].body for i in self.layout.link_id]
+        pos, normal = in_world(model, pose, bodies, self.layout.pos, self.layout.normal)
+        own = np.abs(self.value[self.chosen] - np.median(self.value))
+        own = np.where(own >= 0.5 * own.max(), own, 0.0) if own.max() > 1e-6 else np.zeros(len(own))
+        return Markers(pos, normal, np.sqrt(self.layout.area), own, self.label, self.unit)
+
+    def painter(self, model: mujoco.MjModel, pose: Pose) -> Paint:
+        """Return what colours a point of a link's surface: the box there, or the nearest one."""
+        bodies = [model.body(link.body).id for link in self.layout.links]
+        trees = {body: (self.layout.link_id == i).nonzero()[0] for i, body in enumerate(bodies)}
+        colour = WARMTH(self.norm(self.value[self.chosen]))[:, :3]
+
+        def paint(points: Float[Array, "point 3"], body: Int[Array, " point"]) -> Float[Array, "point 3"]:
+            found = np.full(points.shape, np.nan)
+            for own, members in trees.items():
+                at = np.flatnonzero(body == own)
+                if len(at) and len(members):
+                    local = Rotation.from_quat(pose.quat[own], scalar_first=True).inv().apply(points[at] - pose.pos[own])
+                    sides = self.size[members[0]]  # the same for all boxes of a link: nearest in sides is the box itself
+                    near = KDTree(self.layout.pos[members] / sides).query(local / sides)[1]
+                    found[at] = colour[members[near]]
+            return found
+
+        return paint
+
+
+def is_boxed(touch: TactileModule, output: Output) -> bool:
+    """Return whether each row of a reading is a box of a link: its table has the box's centre and sides."""
+    names = (touch.rows[output.name].dtype.names or ()) if output.name in touch.rows else ()
+    return {"pos", "size"} <= set(names) and bool({"link", "body"} & set(names)) and len(output.channels) == 1
+
+
+def boxes_of(
+    touch: TactileModule, output: Output, values: Tensor, env: int, temperatures: tuple[float, float] | None = None
+) -> Boxes:
+    """Return the boxes of a reading in one environment, and what they read; of stacked calls the last one.
+
+    Args:
+        touch: The module.
+        output: Which reading: one of boxes, see `is_boxed`.
+        values: The reading of all environments.
+        env: Which environment.
+        temperatures: Lowest and highest of the colours of temperatures [°C]; default: those that are read.
+    """
+    table, links = touch.rows[output.name], touch.plan.sensor_of(output.name).links
+    named = table["link"] if "link" in (table.dtype.names or ()) else None
+    own = [link.name for link in links] if named is not None else [link.body for link in links]
+    link_id = np.array([own.index(name) for name in (table["body"] if named is None else named)], dtype=np.int64)
+    pos, size = table["pos"], table["size"]
+    exposed = _exposed(link_id, pos, size)
+    chosen = np.flatnonzero((exposed > 0).any(axis=(1, 2)))
+    exposed, link_id, pos = exposed[chosen], link_id[chosen], pos[chosen]
+    area = exposed.sum(axis=(1, 2))
+    normal = (exposed[:, 1] - exposed[:, 0]) / area[:, None]  # shorter than 1 at edges, so that those of a whole box cancel
+    unit = "°C" if output.units[0] == "degC" else output.units[0]
+    tangent = np.roll(normal, 1, axis=1)
+    layout = Layout(links, {}, link_id, pos, normal, tangent, np.sqrt(area), area, np.full((len(area), 2), -1))
+    read = last_step(values)[env].detach().cpu().double().numpy()[:, 0]
+    ends = temperatures if unit == "°C" else None
+    return Boxes(layout, chosen, size[chosen], read, f"{output.channels[0]} [{unit}]", unit, ends)
+
+
+def _exposed(link_id: Int[Array, " box"], pos: Float[Array, "box 3"], size: Float[Array, "box 3"]) -> Float[Array, "box 2 3"]:
+    """Return the area of each box's faces, lower and upper across x, y and z, that is on the box of its link [m²]."""
+    found = np.zeros((len(pos), 2, 3))
+    area = size.prod(axis=1, keepdims=True) / size
+    for link in np.unique(link_id):
+        own = link_id == link
+        low, high = pos[own] - 0.5 * size[own], pos[own] + 0.5 * size[own]
+        slack = 0.1 * size[own]
+        found[own, 0] = area[own] * (low < low.min(axis=0) + slack)
+        found[own, 1] = area[own] * (high > high.max(axis=0) - slack)
+    return found
+
+
+def draw_boxes(axes: Axes, sim: Simulator, seen: Seen, boxes: Boxes, env: int) -> None:
+    """Draw the robot in the colours of the boxes of its links, with a bar that says them; objects are faint."""
+    norm = boxes.norm
+    scene = rendered(seen, boxes.painter(sim.model, Pose(*sim.body_poses(env))))
+    draw_image(axes, scene.image, scene.viewport)
+    draw_scale_bar(axes, scene.viewport.scale, scene.viewport.width, -44.0)
+    bar = axes.inset_axes((0.46, -0.06, 0.5, 0.022))
+    colours = axes.figure.colorbar(ScalarMappable(norm, WARMTH), cax=bar, orientation="horizontal")
+    colours.outline.set_visible(False)
+    bar.set_title(boxes.label, fontsize=8.5, color=INK, pad=3)
+    bar.tick_params(labelsize=8, colors=INK, length=2, pad=1.5)
+    bar.locator_params(nbins=5)
+
+
+def span(values: Array) -> str:
+    """Return the lowest and the highest of some values: `22.00 … 24.13`, or one where they are the same."""
+    ends = dict.fromkeys(f"{end:.2f}" for end in (values.min(), values.max()))
+    return " … ".join(ends)
