@@ -24,6 +24,9 @@ Level = Literal["fault", "slower", "missing", "note"]
 """`fault`: what is installed computes wrongly, or refuses to work; `slower`: the same readings, later; `missing`: tgdsl can do
 something that is not to be had; `note`: nothing is to be done."""
 
+DEVELOPMENT = ("dev", "docs")
+"""The extras that only tgdsl's own development needs."""
+
 WITHOUT: Mapping[str, tuple[Level, str]] = {
     "gymnasium": ("missing", "no vector environments of gymnasium: TouchEnv and rsl_rl's adapter remain"),
     "imageio-ffmpeg": ("missing", "`tgdsl play --video` is refused"),
@@ -146,9 +149,9 @@ def packages(requirements: Sequence[str] | None = None) -> tuple[Package, ...]:
         if own.marker is not None and not own.marker.evaluate({"extra": extra}):
             continue
         name = own.name.lower().replace("_", "-").replace(".", "-")
-        if extra == "dev" and name not in WITHOUT:
+        if extra in DEVELOPMENT and name not in WITHOUT:
             continue
-        if name not in found or found[name].extra == "dev":
+        if name not in found or found[name].extra in DEVELOPMENT:
             found[name] = Package(name, installed_version(name), str(own.specifier), extra)
     return tuple(sorted(found.values(), key=lambda package: (package.extra != "", package.name)))
 
@@ -255,6 +258,6 @@ def _not_there(known: Sequence[Package], has_gpu: bool) -> list[Finding]:
     for package in known:
         if package.installed is None and package.name in WITHOUT and (has_gpu or package.name != "triton"):
             level, then = WITHOUT[package.name]
-            extra = f'pip install "tgdsl[{package.extra}]"' if package.extra != "dev" else f"pip install {package.name}"
-            found.append(Finding(level, f"{package.name} is not installed", f"{then} ({extra})"))
+            wanted = package.name if package.extra in DEVELOPMENT else f'"tgdsl[{package.extra}]"'
+            found.append(Finding(level, f"{package.name} is not installed", f"{then} (pip install {wanted})"))
     return found

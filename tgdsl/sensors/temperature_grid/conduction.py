@@ -36,16 +36,6 @@ class Sides(NamedTuple):
     tables: Mapping[str, Tensor]
     is_plain: bool
 
-    def at_nodes(self, values: Float[Tensor, "env row side"]) -> Float[Tensor, "env node"]:
-        """Return the sums over the sides at each node."""
-        if self.is_plain:
-            return values.sum(dim=1)
-        return torch.nn.functional.pad(values.flatten(1), (0, 1))[:, self.tables["at_node"]].sum(dim=-1)
-
-    def of_nodes(self, values: Float[Tensor, "env node"]) -> Float[Tensor, "env row side"]:
-        """Return what the node of each side has."""
-        return values[:, None] if self.is_plain else values[:, self.tables["node"]]
-
 
 class Flows(NamedTuple):
     """What a step changes: cells (env, row, x, y, z) and nodes (env, node), in kelvins."""
@@ -70,18 +60,30 @@ def step(cells: Tensor, nodes: Tensor, capacity: Tensor, inverse: Tensor, flow: 
     total = heat + flow.sum(dim=2)
     weight = flow * (heat / total)[:, :, None]
     flat = cells[:, :, None]
-    held = sides.at_nodes(weight.sum(dim=(-3, -2, -1)))
-    pulled = held, sides.at_nodes((weight * flat).sum(dim=(-3, -2, -1)))
+    held = _at_nodes(sides, weight.sum(dim=(-3, -2, -1)))
+    pulled = held, _at_nodes(sides, (weight * flat).sum(dim=(-3, -2, -1)))
     coupled = _coupled(flow, total, sides)
     stores, gain = _rows(nodes, inverse, held, num_bodies, num_nodes)
     before = torch.nn.functional.pad(nodes, (0, num_nodes - num_bodies)) if num_nodes > num_bodies else nodes
     after = _solved(stores, gain, pulled, coupled, before)
-    across = sides.of_nodes(after)[..., None, None, None] - flat
-    left = sides.at_nodes((weight * across).sum(dim=(-3, -2, -1))) + _between(coupled, after)
+    across = _of_nodes(sides, after)[..., None, None, None] - flat
+    left = _at_nodes(sides, (weight * across).sum(dim=(-3, -2, -1))) + _between(coupled, after)
     if num_nodes > num_bodies:  # an interface stores nothing: what rounding leaves over is taken back
         slack = torch.where(stores > 0, 0.0, -left / torch.where(held > 0, held, 1.0))
-        across = across + sides.of_nodes(slack)[..., None, None, None]
+        across = across + _of_nodes(sides, slack)[..., None, None, None]
     return Flows((flow * across).sum(dim=2) / total, -inverse * left[:, :num_bodies])
+
+
+def _at_nodes(sides: Sides, values: Float[Tensor, "env row side"]) -> Float[Tensor, "env node"]:
+    """Return the sums over the sides at each node."""
+    if sides.is_plain:
+        return values.sum(dim=1)
+    return torch.nn.functional.pad(values.flatten(1), (0, 1))[:, sides.tables["at_node"]].sum(dim=-1)
+
+
+def _of_nodes(sides: Sides, values: Float[Tensor, "env node"]) -> Float[Tensor, "env row side"]:
+    """Return what the node of each side has."""
+    return values[:, None] if sides.is_plain else values[:, sides.tables["node"]]
 
 
 def _coupled(flow: Tensor, total: Tensor, sides: Sides) -> Tensor | None:
