@@ -3,7 +3,10 @@
 import pytest
 from tiny_tasks import write_task
 
+from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.sensed import num_variants
 
 VARIANTS = """objects:
   ball:
@@ -17,9 +20,44 @@ VARIANTS = """objects:
 
 def test_half_heights_are_those_of_each_environments_own_variant(tmp_path):
     """Geoms of the other variants are in each model too, and do not count."""
-    task = write_task(tmp_path)
-    sensors = tmp_path / "sensors.yaml"
-    sensors.write_text(sensors.read_text().replace("objects: {ball: {body: ball}}\n", VARIANTS))
-    env = TouchEnv(task, 4, threads=1, overrides={"touch": "none"})
+    env = TouchEnv(varied_task(tmp_path), 4, threads=1, overrides={"touch": "none"})
     assert env.task.setup.half_height.tolist() == pytest.approx([0.03, 0.05, 0.015, 0.03])
     env.close()
+
+
+@pytest.mark.parametrize(("chosen", "heights"), [([2, 0], [0.015, 0.03, 0.015]), ([1], [0.05] * 3)])
+def test_a_task_takes_some_variants_in_its_own_order(tmp_path, chosen, heights):
+    """Of one alone nothing is varied: it is the body's own geom."""
+    task, overrides = varied_task(tmp_path), {"touch": "none", "variants": chosen}
+    env = TouchEnv(task, 3, threads=1, overrides=overrides)
+    setup = env.task.setup
+    assert setup.half_height.tolist() == pytest.approx(heights)
+    assert num_variants(load_task(task, overrides)) == setup.num_variants == len(chosen)
+    assert setup.variant.tolist() == [env % len(chosen) for env in range(3)]
+    env.close()
+
+
+def test_variants_that_are_not_there_are_refused_at_their_place(tmp_path):
+    plain = write_task(tmp_path)
+    plain.write_text(plain.read_text() + "variants: [0]\n")
+    assert refused(plain).endswith('variants: the object "ball" of "sensors.yaml" has no variants; leave it out')
+    for found in ("[1, 3]", "[1, 1]"):
+        task = varied_task(tmp_path)
+        task.write_text(task.read_text() + f"variants: {found}\n")
+        assert refused(task).endswith(f"variants[1]: variant {found[4]}, expected each once, from 0 to 2")
+
+
+def refused(task):
+    """Return what a document is refused with, which names its file and line."""
+    with pytest.raises(SpecError) as caught:
+        TouchEnv(task, 1, threads=1)
+    (line,) = str(caught.value).splitlines()
+    assert f"{task.name}:{task.read_text().count(chr(10))}:" in line
+    return line
+
+
+def varied_task(folder):
+    """Write a task whose object has three variants; return its document."""
+    task, sensors = write_task(folder), folder / "sensors.yaml"
+    sensors.write_text(sensors.read_text().replace("objects: {ball: {body: ball}}\n", VARIANTS))
+    return task

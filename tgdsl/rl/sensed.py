@@ -124,6 +124,8 @@ def compile_sensed(
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
+    if spec.variants is not None:
+        overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
     felt, felts = None, {}
     if feels is not None:
         felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}
@@ -229,9 +231,32 @@ def num_variants(loaded: LoadedTask) -> int:
     """Return how many variants the task's object has; 1 if it has none.
 
     Raises:
-        SpecError: All mistakes of the sensors' document.
+        SpecError: All mistakes of the sensors' document, or if a variant that the task names is not there.
     """
-    return len(_document(loaded).spec.objects[loaded.spec.object].variants or ()) or 1
+    document, spec = _document(loaded), loaded.spec
+    return (
+        len(document.spec.objects[spec.object].variants or ()) or 1
+        if spec.variants is None
+        else len(_variants(loaded, document))
+    )
+
+
+def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
+    """Return the variants of its object that a task takes, as the sensors' document has them.
+
+    Raises:
+        SpecError: If one is not there, or is named twice.
+    """
+    spec = loaded.spec
+    assert spec.variants is not None
+    known = document.raw(("objects", spec.object, "variants")) or []
+    if not known:
+        raise loaded.error(("variants",), f'the object "{spec.object}" of "{spec.document}" has no variants', "leave it out")
+    for place, variant in enumerate(spec.variants):
+        if variant >= len(known) or variant in spec.variants[:place]:
+            what = f"variant {variant}, expected each once, from 0 to {len(known) - 1}"
+            raise loaded.error(("variants", place), what)
+    return [known[variant] for variant in spec.variants]
 
 
 def _document(loaded: LoadedTask) -> Loaded:

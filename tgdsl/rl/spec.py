@@ -108,6 +108,8 @@ class TaskSpec(SpecModel):
     """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those needed are taken."""
     object: str
     """The document's object that the task is about."""
+    variants: Annotated[tuple[Annotated[StrictInt, Field(ge=0)], ...], Field(min_length=1)] | None = None
+    """Which of the object's variants there are, by their places in the sensors' document, from 0; default: all."""
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     """Joints that the policy moves: names or shell wildcards, in the order of the actuators; the others are held."""
     keyframe: str | None = None

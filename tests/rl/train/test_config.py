@@ -56,6 +56,7 @@ def test_who_sees_what(tmp_path):
         ("{learning_rat: 1}", 'unknown key "learning_rat"'),
         ("{learning_rate: 0}", "train.learning_rate: 0 is out of range, expected more than 0"),
         ("{discount: 1.5}", "train.discount"),
+        ("{networks: {initial_std: 0.5, min_std: 0.6}}", "train.networks: min_std 0.6 is more than initial_std 0.5"),
         ("{rnd: of}", "train.rnd"),
         ("{rnd: {outputs: 0}}", "train.rnd.outputs"),
         ("{actor: [goal, goal]}", "actor names a group twice"),

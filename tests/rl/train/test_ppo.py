@@ -30,11 +30,12 @@ def _float64():
     torch.set_default_dtype(torch.float32)
 
 
-def settings(is_ours, rnd=None, **algorithm):
+def settings(is_ours, rnd=None, std_range=None, **algorithm):
     network = {"hidden_dims": [16, 8], "activation": "elu", "obs_normalization": True}
     ours = {"class_name": "tgdsl.rl.train.model:EncodedModel", "eps": 1e-2}
     theirs = {"class_name": "MLPModel"}
     gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian" if is_ours else "GaussianDistribution", "init_std": 0.8}
+    gaussian |= {"std_range": std_range} if std_range else {}
     return {
         "num_steps_per_env": STEPS,
         "multi_gpu": None,
@@ -111,6 +112,21 @@ def test_it_equals_rsl_rl_s_own(options, rates):
         torch.testing.assert_close(own[name], value, rtol=1e-8, atol=1e-11, msg=lambda text, name=name: f"{name}: {text}")
     rises = {"rises": max(seen) == 1e-2, "falls": min(seen) < begun / 2, "stays": set(seen) == {begun}, None: True}
     assert rises[rates], seen
+
+
+def test_exploration_stays_within_its_bounds_and_leaves_them_again():
+    """Of a policy that would rather not explore; at the bound, actions far from the mean still ask for more of it."""
+    env = Drifting(NUM_ENVS)
+    free, bound = (algorithm_of(True, env, std_range=r, entropy_coef=-0.1) for r in ((1e-6, 1e6), (0.75, 1e6)))
+    for algorithm in (free, bound):
+        for seed in range(6):
+            iterate(algorithm, env, seed)
+    assert free.actor.distribution.std_param.max() < 0.75
+    distribution = bound.actor.distribution
+    assert (distribution.std_param == 0.75).all() and (bound.actor.output_std == 0.75).all()
+    distribution.update(torch.zeros(1, env.num_actions))
+    distribution.log_prob(torch.full((1, env.num_actions), 3.0)).sum().backward()
+    assert (distribution.std_param.grad > 0).all()
 
 
 def test_what_cannot_be_captured_is_refused_by_name():

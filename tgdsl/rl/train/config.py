@@ -12,6 +12,8 @@ from tgdsl.rl.train.spec import EncoderSpec, RndSpec, TrainSpec
 
 PROPRIO, PRIVILEGED, STATE, PROPS = "proprio", "priv_proprio", "priv_obj_state", "priv_obj_props"
 """What is known of the hand; that and its forces; the object's motion; what it is like."""
+MOST_STD = 1e6
+"""Bound above of the actions' standard deviation: rsl_rl's."""
 
 
 def observed(loaded: LoadedTask, groups: Mapping[str, int]) -> dict[str, list[str]]:
@@ -46,7 +48,12 @@ def config(loaded: LoadedTask, groups: Mapping[str, int], multi_gpu: Mapping[str
     """
     train = loaded.spec.train
     model = _model(train)
-    gaussian = {"class_name": "tgdsl.rl.train.model:Gaussian", "init_std": train.networks.initial_std}
+    own = train.networks
+    gaussian = {
+        "class_name": "tgdsl.rl.train.model:Gaussian",
+        "init_std": own.initial_std,
+        "std_range": (own.min_std, MOST_STD),
+    }
     return {
         "num_steps_per_env": train.steps,
         "save_interval": 1000,
@@ -87,7 +94,7 @@ def _algorithm(train: TrainSpec) -> dict[str, Any]:
         "entropy_coef": train.entropy,
         "learning_rate": train.learning_rate,
         "max_grad_norm": train.max_grad_norm,
-        "use_clipped_value_loss": True,
+        "use_clipped_value_loss": train.clip_values,
         "schedule": "adaptive" if train.adaptive else "fixed",
         "desired_kl": train.desired_kl,
         "precision": train.precision,

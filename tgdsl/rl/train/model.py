@@ -27,6 +27,13 @@ class Gaussian(GaussianDistribution):
         """Draw: the numbers that torch's own would give."""
         return torch.randn_like(self.mean) * self.std + self.mean
 
+    def bound(self) -> None:
+        """Put deviations back within their range: beyond it rsl_rl's clamp has no gradient, and they could not return."""
+        if self.std_type == "scalar":
+            self.std_param.clamp_(*self.std_range)
+        else:
+            self.log_std_param.clamp_(*self.log_std_range)
+
 
 class EncodedModel(MLPModel):
     """An `MLPModel` of rsl_rl with a network per group of observations before it."""

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from tgdsl.errors import TgdslError
 from tgdsl.rl.train.graphs import Captured
+from tgdsl.rl.train.model import Gaussian
 from tgdsl.rl.train.ranks import num_processes, summed
 from tgdsl.rl.train.rnd import Distillation
 from tgdsl.tensors.torch_internals import copy_each
@@ -288,6 +289,8 @@ class CapturedPPO(PPO):
             nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
             nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
             self.optimizer.step()
+            if isinstance(self.actor.distribution, Gaussian):
+                self.actor.distribution.bound()
             if self.rnd is not None:
                 self.rnd.optimizer.step()
 

@@ -42,10 +42,18 @@ class NetworksSpec(SpecModel):
     """Widths of the hidden layers that follow the embeddings."""
     initial_std: Positive = 1.0
     """Standard deviation of the actions at the start."""
+    min_std: NonNegative = 0.0
+    """Standard deviation below which exploration does not fall; at most `initial_std`."""
     eps: Positive = 1e-5
     """What is added to the standard deviation by which an observation is divided, in the observation's unit."""
     clip: Positive = 10.0
     """Bound of normalised observations."""
+
+    @model_validator(mode="after")
+    def _check(self) -> NetworksSpec:
+        if self.min_std > self.initial_std:
+            raise ValueError(f"min_std {self.min_std:g} is more than initial_std {self.initial_std:g}, expected at most that")
+        return self
 
 
 class RndSpec(SpecModel):
@@ -99,7 +107,9 @@ class TrainSpec(SpecModel):
     gae: Share = 0.95
     """λ of the generalised advantage estimate."""
     clip: Positive = 0.2
-    """Bound of the change of a probability ratio, and of a value."""
+    """Bound of the change of a probability ratio, and of a value where these are clipped."""
+    clip_values: StrictBool = True
+    """Whether a value may change by no more than `clip` in an update, as the paper and rsl_rl have it."""
     entropy: NonNegative = 2e-3
     """Weight of the entropy."""
     value: NonNegative = 1.0
