@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch):
     for source in (REPOSITORY, REPOSITORY / "examples", REPOSITORY / "examples" / "tasks"):
         for path in source.iterdir():
             target = tmp_path / path.relative_to(REPOSITORY)
-            if path.name == "robots" or (source != REPOSITORY and not target.exists()):
+            if path.name in ("robots", "policies") or (source != REPOSITORY and not target.exists()):
                 target.symlink_to(path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
