@@ -117,7 +117,7 @@ def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) 
     put(target, broadcast_over(chosen, target), new)
 
 
-def put(target: Tensor, where: Bool[Tensor, ...], new: Tensor | float) -> None:
+def put(target: Tensor, where: Bool[Tensor, "*mask"], new: Tensor | float) -> None:
     """Write new values where a mask holds that broadcasts to the target: see `put_rows`."""
     if not isinstance(new, Tensor):
         target.masked_fill_(where, new)
