@@ -26,6 +26,8 @@ from tgdsl.tensors.env_ids import may_hold, put_rows
 
 ZERO: Range = (0.0, 0.0)
 Force = Annotated[Range, RangeOf("force")]
+_DRAWN = {"push": 3, "push interval": 1}
+"""Numbers of each push by what they are for; drawn together by all, so that they are known before anything is compiled."""
 
 
 class PushSpec(SpecModel):
@@ -90,7 +92,7 @@ class Pushes:
             episode: How often each was reset.
         """
         put_rows(self._count, chosen, episode << 32)
-        put_rows(self._left, chosen, self._interval(self._draws.side_by_side({"push interval": 1}, self._count, chosen)))
+        put_rows(self._left, chosen, self._interval(self._draws.shares(_DRAWN, self._count, chosen)["push interval"]))
         for exerted in (self.force, self._applied[:, self._body, :3]):
             put_rows(exerted, chosen, 0.0)
 
@@ -101,7 +103,7 @@ class Pushes:
         if not may_hold(changes := begins | ends):
             return
         self._count += ends
-        found = self._draws.shares({"push": 3, "push interval": 1}, self._count, changes)
+        found = self._draws.shares(_DRAWN, self._count, changes)
         put_rows(self._left, ends, self._interval(found["push interval"]))
         put_rows(self.force, begins, self._low + found["push"].to(self.force.dtype) * (self._high - self._low))
         put_rows(self.force, ends, 0.0)

@@ -64,8 +64,10 @@ def test_some_environments_are_read_as_the_module_reads_them_of_the_whole_state(
     """After a reset, with and without stored contacts: `sim.read(mask)` is `touch(sim.state(), mask)` to the last bit."""
     touch, sim = started(simulator, tmp_path)
     force = torch.arange(12.0, dtype=torch.float64).view(4, 1, 3).expand(-1, len(touch.inputs.pairs), -1)
-    found = torch.ones((4, len(touch.inputs.pairs)))
-    contacts = {"contact_found": found, "contact_netforce": force} if stored == "stored" else stored
+    values = {"contact_found": torch.ones((4, len(touch.inputs.pairs))), "contact_netforce": force}
+    slots = torch.zeros((4, len(touch.inputs.pairs), touch.inputs.slots, 3), dtype=torch.float64)
+    slots[:, :, 0] = force  # all that acts is shown
+    contacts = values | {"contact_force": slots} if stored == "stored" else stored
     touch.memory.keeps_last = True
     with torch.no_grad():
         sim.read()
@@ -78,7 +80,7 @@ def test_some_environments_are_read_as_the_module_reads_them_of_the_whole_state(
         again = sim.read(which)  # by indices, and a second time
     for name, reading in expected.items():
         assert torch.equal(read[name], reading) and torch.equal(again[name], reading), name
-    assert any(reading[mask].any() for reading in read.values())
+    assert any(reading[mask].any() for reading in read.values()) == (stored != "none")
 
 
 @BOTH
