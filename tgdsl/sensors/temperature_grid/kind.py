@@ -84,6 +84,8 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         constants["convection"] = scalar(spec.convection)
     if spec.source is not None:
         constants |= _source(spec, count, size)
+    if "source" in constants:
+        constants["power"] = constants["source"].sum(axis=(1, 2, 3))
     shape = there.shape
     state = {"cells": Memory(shape=shape), "cells_low": Memory(shape=shape)}
     if spec.feels:

@@ -147,7 +147,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     )
     made = torch.zeros_like(got[:, 0])
     if source is not None:
-        made = made + dt * source.sum(dim=(-3, -2, -1))
+        made = made + dt * constants["power"]
     return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
 
 
