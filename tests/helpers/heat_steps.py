@@ -48,6 +48,7 @@ def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
     found = tables(count, size)
     there = found["outer"] > 0
     constants = {key: tensor(value) for key, value in found.items()} | {
+        "box": tensor(np.concatenate([low, size / count, count], axis=1)),
         "conductivity": tensor(rng.uniform(0.2, 50.0, num)),
         "volumetric_heat": tensor(rng.uniform(1e6, 3e6, num)),
         "ambient": tensor(22.0),

@@ -137,7 +137,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
         [part.expand(len(cells), -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
-        [constants["conductivity"], constants["volumetric_heat"], patches.boxes, constants["count"], rows.outer],
+        [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), rows.outer],
         constants.get("emissivity"),
         source,
         [*rows.cosines, *rows.exponent],
