@@ -42,6 +42,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.errors import LowerError
+from tgdsl.fields.materials import Material
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.patches import ContactPatches
@@ -111,14 +112,19 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         channels=(Channel("temperature", "degC"),),
         constants=constants,
         state=state,
-        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes),),
+        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes, needs_stiffness=_needs_stiffness(spec, made_of)),),
         rows=rows,
         reports=reports,
         report_rows=report_rows,
     )
 
 
-def _contact(spec: TemperatureGridSpec, made_of: list, size: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:
+    """Return whether the area of a contact follows from the object's stiffness alone, as some link has none."""
+    return spec.contact_area == "manifold" and any(own.youngs_modulus is None for own in made_of)
+
+
+def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarray) -> dict[str, np.ndarray]:
     """Return what areas and conductances of patches follow from."""
     if not spec.feels:
         return {}
