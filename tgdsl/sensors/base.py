@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -179,6 +179,8 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
+            between calls is another one, a warning says so.
     """
 
     channels: tuple[Channel, ...]
@@ -192,6 +194,7 @@ class Lowered:
     signal: tuple[Channel, ...] | None = None
     substeps: int = 0
     samples: int = 0
+    timestep: float = 0.0
 
 
 class Context(NamedTuple):
@@ -226,8 +229,19 @@ class ReferenceContext(NamedTuple):
     is_first: bool
 
 
-SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
-"""Returns the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+@runtime_checkable
+class SurfaceOf(Protocol):
+    """Triangles of links and objects."""
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+        ...
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
+        ...
+
+
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
