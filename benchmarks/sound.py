@@ -128,7 +128,7 @@ def run_cpu(options: argparse.Namespace) -> None:
     force, loop = torch.rand(n, LINKS, 1), Loop(constants, n)
     state = {name: torch.zeros(n, *part.shape) for name, part in silent.plan.sensors[0].state.items()}
     states = [whole.example_state(n, seed=seed, dtype=torch.float32) for seed in range(3)]
-    compiled = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
+    compiled: list[Any] = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
 
     def advance(step: Callable[..., Any]) -> None:
         for name, value in step(force, context, constants, state)[1].items():

@@ -92,8 +92,8 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         "kept": np.asarray(kept),
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
-        "struck": np.concatenate([added.real, added.imag], axis=2),
-        **_rounded("turn", np.stack([turn.real, turn.imag])),
+        "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
+        **_rounded("turn", np.stack([np.real(turn), np.imag(turn)])),
     }
     if scrape > 0:
         found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
@@ -101,7 +101,11 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return found | {"energy": np.concatenate([energy, energy], axis=1)}
     free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
-    parts = [gain[..., None] * free.imag, gain[..., None] * free.real, (gain[..., None, None] * of_impulses.imag).sum(axis=1)]
+    parts = [
+        gain[..., None] * np.imag(free),
+        gain[..., None] * np.real(free),
+        (gain[..., None, None] * np.imag(of_impulses)).sum(axis=1),
+    ]
     return found | {"heard": np.concatenate(parts, axis=1)}
 
 
