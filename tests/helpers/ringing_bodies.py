@@ -65,13 +65,13 @@ def lamb(degree: int, poissons_ratio: float, below: float) -> list[float]:
     ratio = np.sqrt((1 - 2 * poissons_ratio) / (2 - 2 * poissons_ratio))
     n = degree
 
-    def traction(y: float) -> float:
+    def traction(y):
         x = ratio * y
         p, p_next = spherical_jn(n, x), spherical_jn(n + 1, x)
         s, s_next = spherical_jn(n, y), spherical_jn(n + 1, y)
         radial = (n * n - n - y * y / 2) * p + 2 * x * p_next, n * (n + 1) * ((n - 1) * s - y * s_next)
         shear = (n - 1) * p - x * p_next, (n * n - 1 - y * y / 2) * s + y * s_next
-        return float(radial[0] * shear[1] - radial[1] * shear[0])
+        return radial[0] * shear[1] - radial[1] * shear[0]
 
     return roots(traction, 0.5, below)
 
@@ -79,19 +79,19 @@ def lamb(degree: int, poissons_ratio: float, below: float) -> list[float]:
 def breathing(poissons_ratio: float, below: float) -> list[float]:
     """Return ω a/c_p of a ball's radial modes: roots of x cot x = 1 − x²/4 κ², κ = c_s/c_p."""
     ratio = (1 - 2 * poissons_ratio) / (2 - 2 * poissons_ratio)
-    return roots(lambda x: float(np.sin(x) * (1 - x * x / (4 * ratio)) - x * np.cos(x)), 0.5, below)
+    return roots(lambda x: np.sin(x) * (1 - x * x / (4 * ratio)) - x * np.cos(x), 0.5, below)
 
 
 def torsion(degree: int, below: float) -> list[float]:
     """Return ω a/c_s of a ball's torsional modes of a degree: roots of (n − 1) j_n(y) = y j_{n+1}(y)."""
-    return roots(lambda y: float((degree - 1) * spherical_jn(degree, y) - y * spherical_jn(degree + 1, y)), 0.5, below)
+    return roots(lambda y: (degree - 1) * spherical_jn(degree, y) - y * spherical_jn(degree + 1, y), 0.5, below)
 
 
 def roots(function, low: float, high: float) -> list[float]:
-    """Return the zeros of a smooth function."""
-    at = np.linspace(low, high, 2000)
-    value = [function(x) for x in at]
-    return [brentq(function, at[i], at[i + 1]) for i in range(len(at) - 1) if value[i] * value[i + 1] < 0]
+    """Return the zeros of a smooth function of arrays."""
+    at = np.linspace(low, high, 500)
+    value = function(at)
+    return [brentq(function, at[i], at[i + 1]) for i in range(499) if value[i] * value[i + 1] < 0]
 
 
 def timoshenko(length: float, height: float, width: float, poissons_ratio: float, below: float) -> list[float]:
@@ -115,4 +115,5 @@ def timoshenko(length: float, height: float, width: float, poissons_ratio: float
         found = moment[0] * force[1] - moment[1] * force[0]
         return float(found.real if is_even else found.imag)
 
-    return sorted(roots(lambda o: ends(o, True), 1e-4, below) + roots(lambda o: ends(o, False), 1e-4, below))
+    even, odd = (np.vectorize(lambda omega, is_even=is_even: ends(omega, is_even)) for is_even in (True, False))
+    return sorted(roots(even, 1e-4, below) + roots(odd, 1e-4, below))

@@ -122,6 +122,6 @@ def _coherent(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     pairs = np.bincount(which, minlength=len(edges)) == 2
     if not (pairs & (np.bincount(which, sense, len(edges)) != 0)).any():
         return faces
-    turned, part = (np.asarray(found) for found in igl.bfs_orient(faces))
+    turned, part = (np.asarray(found).astype(np.int64) for found in igl.bfs_orient(faces))
     kept = np.where((turned == faces).all(axis=1), 1.0, -1.0) * np.asarray(igl.doublearea(vertices, faces))
     return np.where((np.bincount(part, kept) < 0)[part][:, None], turned[:, ::-1], turned)

@@ -71,7 +71,7 @@ class Spectrum:
 
 
 def spectrum(
-    surface: Surface, poissons_ratio: float, count: int, unknowns: int = UNKNOWNS
+    surface: Surface, poissons_ratio: float, count: int, unknowns: int | None = None
 ) -> tuple[Spectrum, float, Float[np.ndarray, " 3"]]:
     """Return the lowest modes of a shape, from the cache if they are there; its size L [m]; and the middle of its box [m].
 
@@ -79,11 +79,12 @@ def spectrum(
         surface: Triangles around the body [m].
         poissons_ratio: Less than 1/2.
         count: Most modes of distinct frequency.
-        unknowns: Number of unknowns that the cells are made small for.
+        unknowns: Number of unknowns that the cells are made small for; default: `UNKNOWNS`.
 
     Raises:
         LowerError: If the surface has no inside, the body falls into parts, or needs more cells than are allowed.
     """
+    unknowns = UNKNOWNS if unknowns is None else unknowns
     vertices, faces = closed(surface)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size, middle = float((high - low).max()), (low + high) / 2
