@@ -16,14 +16,12 @@ from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import band_numbers, middle
 from tgdsl.sensors.contact_audio.impulses import reference_impulses
-from tgdsl.sensors.contact_audio.operators import GRAINS, highest
+from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet
 from tgdsl.sensors.contact_audio.rows import ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise.reference import normal_pair
 from tgdsl.surfaces.surface import Surface
 
-LEAST, QUIET = 1e-12, 1e-12
-"""Amplitude that is flushed to zero [N·s]; energy that is 3 dB (E₀) [m²/s²]."""
 Strikes = list[tuple[float, float]]
 """When each impulse acts after the start of the step [s], and how large it is [N·s]."""
 
@@ -35,9 +33,9 @@ def reference(
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
     is_paper, below = spec.model == "paper", highest(spec.samples, step)
-    steady = loads.force if context.is_first else state["steady"]
-    pending = state.get("pending", np.zeros_like(steady))
-    impulse, steady, pending = reference_impulses(loads.force, (steady, pending), step, spec.settling, is_paper)
+    before = loads.force if context.is_first else state["steady"]
+    pending = state.get("pending", np.zeros_like(before))
+    impulse, steady, pending = reference_impulses(loads.force, (before, pending), step, spec.settling, is_paper)
     axis = 1 if spec.of == "link" else 0
     struck, rubbed = impulse.sum(axis=axis), loads.sliding.sum(axis=axis)
     num = len(struck)
@@ -54,7 +52,7 @@ def reference(
             rate, before = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
             samples, after = _ring(rate, before, strikes, spec.samples, step, is_paper)
             heard[:, row] += gain * samples
-            phasors[row, [m, half + m]] = [part if abs(part) > LEAST else 0.0 for part in (after.real, after.imag)]
+            phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
     after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
     return (heard[..., None] if spec.outputs == "samples" else _bands(spec, modes.frequency, amplitude)), after
@@ -118,4 +116,4 @@ def _bands(spec: ContactAudioSpec, frequency: np.ndarray, amplitude: np.ndarray)
         for b, number in enumerate(band_numbers(frequency)):
             if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
                 found[place[0], b] += 0.5 * amplitude[place] ** 2
-    return 10 * np.log10(1 + found / QUIET) if spec.scale == "decibel" else found
+    return 10 * np.log10(1 + found / quiet()) if spec.scale == "decibel" else found
