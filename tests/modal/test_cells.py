@@ -88,6 +88,18 @@ def test_a_screw_in_its_hole_is_part_of_the_body():
     assert found.volume.sum() == pytest.approx(1e-3 - 0.05**3, rel=1e-9)
 
 
+@pytest.mark.parametrize("sections", [8, 32, 96])
+@pytest.mark.parametrize("cell", [0.1, 0.037])
+def test_edges_where_lines_of_sight_are(sections, cell):
+    """A cylinder's edges and those of its caps run through its axis, along diagonals too, as lines of sight lie."""
+    mesh = trimesh.creation.cylinder(0.3, 0.5, sections=sections)
+    for sight in (3, 12):
+        found, _ = cut(surface_of(mesh), cell, sight)
+        assert found.volume.sum() == pytest.approx(mesh.volume, rel=0.02)
+    tube = trimesh.creation.annulus(0.28, 0.3, 0.5, sections=sections)
+    assert cut(surface_of(tube), cell)[0].volume.sum() == pytest.approx(tube.volume, rel=0.03)
+
+
 def test_axes_follow_the_flat_faces():
     """Of a box that is turned, its own; of a rod with round ends its length; of a ball the frame's."""
     vector = (0.3, 0.8, -0.4)

@@ -6,8 +6,8 @@ degree four along each axis are integrated over the body in a cell as these line
 counts as the square of the surface that it sees in the cell. A full cell has Gauss' own weights. The crossings themselves, each
 standing for cos²θ of the surface around it, are the points to integrate over the surface.
 
-A line crosses each closed surface as often inwards as outwards, whatever the rounding: on which side of an edge a line passes
-is one number for both triangles of the edge.
+A line crosses each closed surface as often inwards as outwards: on which side of an edge a line passes is one number for both
+triangles of the edge, and lines are moved aside a little, so that they pass no edge within rounding.
 
 Everything is in the grid's frame. Shapes: `v` vertices, `f` faces, `cell` cells, `point` points of a cell, `x` crossings.
 """
@@ -27,6 +27,8 @@ CHUNK = 1 << 21
 """Pairs of line and triangle that are looked at at once."""
 NUDGE = 1e-9
 """How far into the body a point of the surface is moved to tell which cell it belongs to, over the size of the grid."""
+ASIDE = 1e-10
+"""How far lines of sight are moved, over the size of the grid: far more than rounding, and too little to matter."""
 TOUCHING = 1e-6
 """Distance between two surfaces up to which they touch, over the size of the body."""
 
@@ -136,7 +138,7 @@ class _View:
         self._shape = tuple(len(line) - 1 for line in (u_lines, v_lines, w_lines))
         points, weights = gauss(sight)
         u, v = ((line[:-1, None] + np.diff(line)[:, None] * points).ravel() for line in (u_lines, v_lines))
-        ray, w, face, turn = _crossings(vertices[:, order], faces, u, v)
+        ray, w, face, turn = _crossings(vertices[:, order], faces, _aside(u, 0.6180339887498949), _aside(v, 0.7548776662466927))
         i, j = ray // len(v), ray % len(v)
         step = NUDGE * (w_lines[-1] - w_lines[0]) * turn
         k = np.clip(np.searchsorted(w_lines, w + step) - 1, 0, self._shape[2] - 1)
@@ -175,6 +177,11 @@ class _View:
         along += is_full[..., None] * gauss(POINTS)[1]
         along = along.reshape(num_u, sight, num_v, sight, num_w, POINTS)
         return np.einsum("asbtcw,su,tv->abcuvw", along, across, across, optimize=True)
+
+
+def _aside(at: np.ndarray, ratio: float) -> np.ndarray:
+    """Return places of lines, each moved a little: symmetric bodies have edges exactly at symmetric places."""
+    return at + ASIDE * (at[-1] - at[0]) * (np.arange(1, len(at) + 1) * ratio % 1.0)
 
 
 def _crossings(
