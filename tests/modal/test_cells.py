@@ -119,3 +119,14 @@ def test_lines_keep_thin_walls_and_leave_out_small_steps():
     step = grid.Planes(np.array([0.0, 0.001, 1.0]), np.array([1.0, 0.05, 1.0]))
     assert grid.lines(step, 0.0, 1.0, 0.5) == pytest.approx([0.0, 0.5, 1.0])
     assert grid.lines(grid.Planes(np.zeros(0), np.zeros(0)), -1.0, 1.0, 1.0) == pytest.approx([-1.0, 0.0, 1.0])
+
+
+def test_faces_that_rounding_puts_a_little_apart_are_one_plane():
+    """As coordinates of a mesh in float32 are: no cell is thinner than that."""
+    noisy = grid.Planes(np.array([2e-8, 0.5, 1 - 3e-8]), np.array([1.0, 1.0, 1.0]))
+    assert grid.lines(noisy, 0.0, 1.0, 0.5).tolist() == [0.0, 0.5, 1.0]
+    mesh = turned(thin_box(0.1, 0.002), (0.3, 0.5, 0.2), (0.01, 0.02, 0.03))
+    mesh.vertices = mesh.vertices.astype(np.float32)
+    found, _ = cut(surface_of(mesh), 0.02)
+    assert found.size.min() == pytest.approx(0.002, rel=1e-3)
+    assert found.weight.sum(axis=1) == pytest.approx(np.ones(len(found.index)), abs=1e-3)

@@ -24,8 +24,8 @@ LEAST_LAYER = 0.1
 """Of planes nearer than this to each other, in cell sizes, those with less than a third of another one's area are left out."""
 ALIKE = 1e-2
 """Relative difference below which two principal moments are equal, and their axes those of the body's frame."""
-ROUNDING = 1e-7
-"""Lengths that are equal, over the size of the body."""
+ROUNDING = 1e-5
+"""Difference of places along an axis up to which they are one, over the size of the body: meshes are float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +110,10 @@ def planes(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], ax
 
 def lines(found: Planes, low: float, high: float, cell: float) -> Float[np.ndarray, " line"]:
     """Return the planes of the grid across an axis, from one end of the body to the other, about a cell apart or nearer."""
-    ends = np.array([end for end in (low, high) if not (np.abs(found.at - end) < ROUNDING * cell).any()])
-    at, area = np.concatenate([found.at, ends]), np.concatenate([found.area, np.zeros(len(ends))])
+    near = ROUNDING * (high - low)
+    at = np.where(found.at < low + near, low, np.where(found.at > high - near, high, found.at))
+    ends = np.array([end for end in (low, high) if end not in at])
+    at, area = np.concatenate([at, ends]), np.concatenate([found.area, np.zeros(len(ends))])
     area, at = area[np.argsort(at)], np.sort(at)
     kept = np.ones(len(at), bool)
     for plane in np.argsort(area[1:-1], kind="stable") + 1:

@@ -23,7 +23,7 @@ from tgdsl.modal.loudness import loudness, picked
 from tgdsl.modal.vibration import vibration
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl modes 1"
+FORMAT = b"tgdsl modes 2"
 """To be changed with anything that changes what is computed."""
 UNKNOWNS = 25_000
 """Number of unknowns that the cells are made small for."""

@@ -59,8 +59,8 @@ def vibration(stiffness: csc_array, mass: csc_array, count: int) -> Vibration:
     """
     diagonal = mass.diagonal()
     held = diagonal > FAINT * diagonal.max()
-    scale = diags_array(1 / np.sqrt(diagonal[held]))
-    # Unit diagonal of the mass: unknowns of cells that are hardly filled then do not spoil the condition.
+    # Unit diagonal of what is factorised: unknowns of cells that are hardly filled then do not spoil the condition.
+    scale = diags_array(1 / np.sqrt((stiffness.diagonal() - SHIFT * diagonal)[held]))
     inner_stiffness, inner_mass = (csc_array(scale @ matrix[held][:, held] @ scale) for matrix in (stiffness, mass))
     factor = splu(
         csc_array(inner_stiffness - SHIFT * inner_mass),
