@@ -114,6 +114,7 @@ class PlannedSensor(Generic[Array]):
         notes: What an account of it says of its parameters, line by line.
         is_timed: Whether its kind wants to know when it is called: see `sensors.base.Context`.
         substeps: Physics steps of a call that it is advanced at; 0: once per call.
+        upstream: Sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it.
     """
 
     name: str
@@ -135,6 +136,7 @@ class PlannedSensor(Generic[Array]):
     notes: tuple[str, ...] = ()
     is_timed: bool = False
     substeps: int = 0
+    upstream: tuple[str, ...] = ()
 
     @property
     def wants_clock(self) -> bool:

@@ -19,7 +19,7 @@ from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
-from tgdsl.sensors.base import Axis, Kind, Lowered, Memory, SensorSpec
+from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
 
 GROUP = "tgdsl.kinds"
 """Group of the entry points by which packages bring kinds."""
@@ -76,7 +76,7 @@ def quantities_of(kinds: Sequence[Kind]) -> tuple[Quantity, ...]:
     return known_quantities(tuple(own.values()))
 
 
-def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
+def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
     """Refuse what a kind may not say of a sensor: names that readings need for something else, requests that contradict.
 
     Raises:

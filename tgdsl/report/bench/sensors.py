@@ -32,7 +32,7 @@ from tgdsl.report.bench.results import Cost, Measured, Subject
 from tgdsl.report.bench.timing import times_of
 from tgdsl.schema.load import load
 from tgdsl.schema.objects import query_alternatives
-from tgdsl.sensors.base import Kind, SensorSpec
+from tgdsl.sensors.base import AnySensorSpec, Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.lower import quantity
 
@@ -80,7 +80,7 @@ class Sensor:
     overrides: Mapping[str, Any]
     name: str
     kind: Kind
-    spec: SensorSpec
+    spec: AnySensorSpec
     own: Plan
     variants: Variants
 
