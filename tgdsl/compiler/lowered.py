@@ -12,14 +12,16 @@ from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, did_you_mean
+from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, body_axis, taxel_axis
+from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
 from tgdsl.sensors.noise.lower import LoweredNoise
+from tgdsl.surfaces.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,22 @@ class LoweredSensor:
         return rows_of(self.lowered, self.layout, self.spec)
 
 
+class Surfaces:
+    """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
+
+    def __init__(self, resolved: Resolved):
+        """Be those of a document."""
+        self._resolved = resolved
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
+        return self._resolved.surface_of(link, region)
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m]."""
+        return self._resolved.surface_of_object(name)
+
+
 def rows_of(lowered: Lowered, layout: Layout, spec: AnySensorSpec) -> Axis:
     """Return what a sensor's own reading has rows of: what its kind says, else its taxels, or its bodies if it has none."""
     if lowered.rows is not None:
@@ -112,7 +130,7 @@ def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) ->
     while ready := [s for s in sensors if s.name not in done and all(name in done for name in reading[s.name])]:
         for sensor in ready:
             names = reading[sensor.name]
-            fitting = Fitting(timestep, {name: done[name].lowered for name in names})
+            fitting = Fitting(timestep, {name: ReadSensor(done[name].lowered, done[name].rows) for name in names})
             try:
                 done[sensor.name] = _fitted(sensor, fitting)
             except LowerError as error:
@@ -137,7 +155,7 @@ def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
         lowered = sensor.kind.fit(sensor.spec, lowered, fitting)
         check_lowered(sensor.kind, lowered, sensor.spec)
     for name, other in fitting.upstream.items():
-        if other.substeps != lowered.substeps:
+        if other.lowered.substeps != lowered.substeps:
             what = (
                 f'it is advanced at {lowered.substeps} physics steps of a call, "{name}", which it reads, at {other.substeps}'
             )
@@ -206,7 +224,8 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
     spec = loaded.spec.sensors[name]
     taxels, layout = resolved.layout_on(name)
-    clean = kind.lower(spec, layout, resolved.surface_of)
+    surfaces = Surfaces(resolved)
+    clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
     _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
@@ -214,7 +233,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     knobs = knobs_of(loaded, resolved, name, layout, kind)
     loaded.raise_problems()
     noisy = measured_spec(spec, knobs)
-    lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, surfaces)
     rows = rows_of(lowered, layout, spec)
     noise = imperfections(name, spec, kind, knobs, lowered, rows, layout, loaded.spec.noise)
     both = spec.readout == "both"

@@ -97,6 +97,22 @@ class Resolved:
         """Return where a joint's anchor is in the frame of the body that it moves [m]."""
         return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
 
+    def surface_of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m], meshes as they are, not their hulls.
+
+        Raises:
+            LowerError: If one of its geoms has no bounded surface.
+        """
+        parts = []
+        for own in self.objects[name].variants[0]:
+            mesh = own.surface if own.mesh is None else own.mesh
+            try:
+                placed = self.scene.surface((own.geom,)) if mesh is None else mesh.placed(own.geom.pos, own.geom.rotation)
+            except RobotError as error:
+                raise LowerError(str(error), field="feels") from error
+            parts.append(placed)
+        return Surface.joined(parts)
+
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
         """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
         triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh
@@ -108,7 +124,7 @@ class Resolved:
         names = self.links[sensor]
         if sensor in self.on_links:
             joints = self.on_joints.get(sensor, ())
-            links = tuple([*(Link(name, name) for name in names), *(Link(name, self.moved_by(name)) for name in joints)])
+            links = (*(Link(name, name) for name in names), *(Link(name, self.moved_by(name)) for name in joints))
             return np.zeros(0, dtype=np.int64), Layout.of_links(links, self.layout.groups)
         taxels = self.layout.taxels_of(names)
         return taxels, self.layout.take(taxels)
@@ -147,7 +163,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
         objects = sensed_objects(loaded, scene, own)
         check_named_bodies(loaded, scene)
         joints = robot_joints(robot, scene)
-        on_joints = {name: found for name, found in sensor_joints(loaded, joints)}
+        on_joints = dict(sensor_joints(loaded, joints))
     loaded.raise_problems()
     assert robot is not None and scene is not None
     needed = {link for name, own in links.items() for link in own if name not in on_links}

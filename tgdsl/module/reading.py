@@ -113,8 +113,9 @@ def block(
     constants: Constants,
     memory: Tensors,
 ) -> tuple[Tensors, Tensors, list[Tensors]]:
-    """Return the reading of a sensor that is advanced at each substep, (env, sample, row, channel), its new memory, and what
-    its kind's `forward` returned at each substep.
+    """Return the reading of a sensor that is advanced at each substep, its new memory, and what its kind returned at each.
+
+    The reading is (env, sample, row, channel).
 
     Args:
         sensor: The sensor.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -200,6 +200,8 @@ class Lowered:
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
         upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
+        timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
+            between calls is another one, a warning says so.
     """
 
     channels: tuple[Channel, ...]
@@ -213,7 +215,15 @@ class Lowered:
     signal: tuple[Channel, ...] | None = None
     substeps: int = 0
     samples: int = 0
+    timestep: float = 0.0
     upstream: Upstream | None = None
+
+
+class ReadSensor(NamedTuple):
+    """A sensor that another one reads: what its kind made of it, and what it has rows of."""
+
+    lowered: Lowered
+    rows: Axis
 
 
 class Fitting(NamedTuple):
@@ -225,7 +235,7 @@ class Fitting(NamedTuple):
     """
 
     timestep: float
-    upstream: Mapping[str, Lowered]
+    upstream: Mapping[str, ReadSensor]
 
 
 class Context(NamedTuple):
@@ -260,8 +270,19 @@ class ReferenceContext(NamedTuple):
     is_first: bool
 
 
-SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
-"""Returns the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+@runtime_checkable
+class SurfaceOf(Protocol):
+    """Triangles of links and objects."""
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+        ...
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
+        ...
+
+
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
@@ -317,10 +338,10 @@ class Kind:
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
             measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
-        provides: Planes that `forward` returns beside its channels for other sensors to read, see `sensors.upstream`; `reference`
-            then returns them too, by name, as a third value.
+        provides: Planes that `forward` returns beside its channels for other sensors to read, see `sensors.upstream`;
+            `reference` then returns them too, by name, as a third value.
         reads: The field of its spec that names sensors that it reads, if it does so.
-        fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from the sensors that it reads.
+        fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
     """
 
     spec: type[AnySensorSpec]

@@ -1,15 +1,15 @@
 """What a kind asks of other sensors of its document: a typed request that names them, answered once they are evaluated.
 
 A kind that makes something for others says by `Kind.provides` which planes its `forward` returns beside its channels. A kind
-that reads others puts an `Upstream` into `Lowered.upstream`, and by `Kind.reads` says which field of its spec names them. At each
-call, or substep of a block, the sensors named are evaluated first and once, whoever else reads them; the kind then gets as
+that reads others puts an `Upstream` into `Lowered.upstream`, and says by `Kind.reads` which field of its spec names them. At
+each call, or substep of a block, the sensors named are evaluated first and once, whoever else reads them; the kind then gets as
 `gathered[Upstream]` all that their `forward` returned at this very call or substep, before noise, rates and history, by the
 sensors' names. Nothing of it is handed out to users: their readings are what they were.
 
 A sensor that is read is advanced at as many substeps as the one that reads it. Sensors that read one another in a circle, that
-are not there, or whose kind does not provide what is wanted are mistakes of the document, each at its place. As sizes may follow
-from what is read, and from the scene's time step, a kind may have `Kind.fit`: `(spec, lowered, fitting) → Lowered`, which is
-called once all that it reads is lowered and fitted.
+are not there, or whose kind does not provide what is wanted are mistakes of the document, each at its place. As sizes may
+follow from what is read, and from the scene's time step, a kind may have `Kind.fit`, `(spec, lowered, fitting) → Lowered`,
+which is called once all that it reads is lowered and fitted.
 
 Shapes: `env` environments, `row` rows of the sensor that is read, `sample` samples of a block.
 """
@@ -26,10 +26,10 @@ from tgdsl.quantities.base import Request
 SAMPLES, PLACE = "sound/samples", "sound/place"
 """Planes of a sensor that makes sound.
 
-`sound/samples` (env, sample, row): sound pressure at 1 m from each row [Pa], the last sample at the instant of the state, earlier
-ones evenly since the (sub)step before; `sound/place` (env, 3, row): where each row's sound comes from, in the world, at the instant
-of the state [m], in the dtype of the state: `quantities.places` has points of bodies so. Float64 references return
-(sample, row) and (3, row).
+`sound/samples` (env, sample, row): the sound of each row in the unit of the sensor's first channel, the last sample at the
+instant of the state, earlier ones evenly since the (sub)step before. `sound/place` (env, 3, row): where it comes from, in the
+world, at the instant of the state [m], in the dtype of the state, as `quantities.places` has points of bodies. Float64
+references return (sample, row) and (3, row).
 """
 SOUND = frozenset({SAMPLES, PLACE})
 
