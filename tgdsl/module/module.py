@@ -69,7 +69,7 @@ class TactileModule(HookedModule):
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
-        self.memory = Memory(plan.sensors, plan.readings())
+        self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
         self.calls, self._order = Calls(), in_order(plan.sensors)

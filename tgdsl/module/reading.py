@@ -173,7 +173,7 @@ def _check_answer(sensor: PlannedSensor, kind: Kind, answer: object, state: Tens
             raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
-def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:
+def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
     """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 

@@ -9,6 +9,7 @@ from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL
 from tgdsl.sensors.kinematic_taxel import KINEMATIC_TAXEL
 from tgdsl.sensors.link_contact import LINK_CONTACT
+from tgdsl.sensors.microphone.kind import MICROPHONE
 from tgdsl.sensors.proximity import PROXIMITY
 from tgdsl.sensors.surface_distance import SURFACE_DISTANCE
 from tgdsl.sensors.temperature_grid.kind import TEMPERATURE_GRID
@@ -23,6 +24,7 @@ KINDS: tuple[Kind, ...] = (
     FORCE_TAXEL,
     LINK_CONTACT,
     TEMPERATURE_GRID,
+    MICROPHONE,
 )
 """The kinds that come with tgdsl."""
 
@@ -35,6 +37,7 @@ __all__ = [
     "KINDS",
     "KINEMATIC_TAXEL",
     "LINK_CONTACT",
+    "MICROPHONE",
     "PROXIMITY",
     "SURFACE_DISTANCE",
     "TEMPERATURE_GRID",

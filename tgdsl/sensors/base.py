@@ -199,6 +199,7 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        sound: Samples of sound that it provides at each call of `forward`; 0: none, see `sensors.upstream`.
         upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
         timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
             between calls is another one, a warning says so.
@@ -216,6 +217,7 @@ class Lowered:
     substeps: int = 0
     samples: int = 0
     timestep: float = 0.0
+    sound: int = 0
     upstream: Upstream | None = None
 
 
@@ -303,6 +305,9 @@ class Alternative(NamedTuple):
     changes: Mapping[str, Any]
 
 
+Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]
+
+
 def no_alternatives(spec: Any) -> Sequence[Alternative]:
     """Return no alternatives: nothing in a spec trades speed for error."""
     return ()
@@ -341,6 +346,8 @@ class Kind:
         provides: Planes that `forward` returns beside its channels for other sensors to read, see `sensors.upstream`;
             `reference` then returns them too, by name, as a third value.
         reads: The field of its spec that names sensors that it reads, if it does so.
+        warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
+            environments) → messages`: what users are to be warned of, each once.
         fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
     """
 
@@ -359,6 +366,7 @@ class Kind:
     alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives
     provides: frozenset[str] = frozenset()
     reads: str = ""
+    warns: tuple[tuple[str, Warn], ...] = ()
     fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
 
     @property

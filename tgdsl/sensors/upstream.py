@@ -26,8 +26,8 @@ from tgdsl.quantities.base import Request
 SAMPLES, PLACE = "sound/samples", "sound/place"
 """Planes of a sensor that makes sound.
 
-`sound/samples` (env, sample, row): the sound of each row in the unit of the sensor's first channel, the last sample at the
-instant of the state, earlier ones evenly since the (sub)step before. `sound/place` (env, 3, row): where it comes from, in the
+`sound/samples` (env, sample, row): sound pressure at 1 m from each row [Pa], the last sample at the instant of the state,
+earlier ones evenly since the (sub)step before, `Lowered.sound` of them. `sound/place` (env, 3, row): where it comes from, in the
 world, at the instant of the state [m], in the dtype of the state, as `quantities.places` has points of bodies. Float64
 references return (sample, row) and (3, row).
 """
