@@ -48,7 +48,7 @@ def lower(spec, layout, surface_of):
         "pulse": scalar(float(spec.pulse)),
     }
     places = Places(bodies=layout.bodies, offset=np.zeros((rows, 3)))
-    blocks = {"substeps": spec.substeps, "samples": spec.samples, "sound": spec.samples}
+    blocks = {"substeps": spec.substeps, "samples": spec.samples, "sound": spec.samples, "provides": SOUND}
     return Lowered((Channel("tone", "Pa"),), constants, requests=(places,), rows=body_axis(layout), **blocks)
 
 

@@ -294,6 +294,7 @@ def _sensor(
         is_timed=sensor.kind.is_timed,
         substeps=lowered.substeps,
         upstream=sensor.upstream,
+        provides=tuple(sorted(lowered.provides)),
     )
 
 

@@ -168,7 +168,7 @@ def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[Lowere
     asked = sensor.lowered.upstream
     if asked is None:
         return ()
-    able = {own.sensor: own for own in sensors if asked.planes <= own.kind.provides}  # of two ways the second is clean
+    able = {own.sensor: own for own in sensors if asked.planes <= own.lowered.provides}  # of two ways the second is clean
     if not asked.sensors:
         if not able:
             what = f"no sensor of the document makes {asked.what}, so there is none to read"
@@ -180,7 +180,7 @@ def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[Lowere
         if name not in kinds:
             loaded.problems.append(loaded.problem(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors")))
         elif name not in able:
-            what = f'"{name}" is a {kinds[name]}, which makes no {asked.what}'
+            what = f'"{name}" ({kinds[name]}) makes no {asked.what}, as it is written'
             loaded.problems.append(loaded.problem(path, what, f"those that do: {', '.join(able) or 'none'}"))
         elif name in asked.sensors[:i]:
             loaded.problems.append(loaded.problem(path, f'sensor "{name}" is listed twice', "name it once"))

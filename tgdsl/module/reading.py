@@ -145,17 +145,17 @@ def _answer(
     """
     answer = kind.forward(gathered, context, constants, state)
     if not torch.compiler.is_compiling():
-        _check_answer(sensor, kind, answer, state)
+        _check_answer(sensor, answer, state)
     found, new = answer
     return dict(found), dict(new)
 
 
-def _check_answer(sensor: PlannedSensor, kind: Kind, answer: object, state: Tensors) -> None:
+def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None:
     where = f'sensor "{sensor.name}": `forward` of the kind "{sensor.kind}" returns'
     if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
         raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
     found, new = answer
-    if missing := [name for name in kind.provides if name not in found]:
+    if missing := [name for name in sensor.provides if name not in found]:
         raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without {missing[0]}, which the kind provides")
     if missing := [name for name in sensor.signal if name not in found and "signal" not in found]:
         raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without the channel {missing[0]}")

@@ -100,7 +100,7 @@ def sense(
             values = constants, knobs[sensor.name], state, nows.get(sensor.name)
             found, new, answer = read(sensor, kind, asked, context, *values, signal)
             answered = [answer]
-        if kind.provides:
+        if sensor.provides:
             answers[sensor.name] = answered
         updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         readings |= _with_history(sensor, found, memory, updated)

@@ -115,6 +115,7 @@ class PlannedSensor(Generic[Array]):
         is_timed: Whether its kind wants to know when it is called: see `sensors.base.Context`.
         substeps: Physics steps of a call that it is advanced at; 0: once per call.
         upstream: Sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it.
+        provides: Planes that it has for others.
     """
 
     name: str
@@ -137,6 +138,7 @@ class PlannedSensor(Generic[Array]):
     is_timed: bool = False
     substeps: int = 0
     upstream: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
 
     @property
     def wants_clock(self) -> bool:

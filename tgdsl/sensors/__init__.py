@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tgdsl.sensors.actuation_audio import ACTUATION_AUDIO
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
@@ -24,12 +25,14 @@ KINDS: tuple[Kind, ...] = (
     FORCE_TAXEL,
     LINK_CONTACT,
     TEMPERATURE_GRID,
+    ACTUATION_AUDIO,
     MICROPHONE,
 )
 """The kinds that come with tgdsl."""
 
 
 __all__ = [
+    "ACTUATION_AUDIO",
     "CONTACT",
     "CONTACT_DEPTH",
     "ELASTOMER",

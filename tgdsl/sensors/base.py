@@ -199,6 +199,7 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        provides: Planes that `forward` returns for other sensors to read, of those of `Kind.provides`.
         sound: Samples of sound that it provides at each call of `forward`; 0: none, see `sensors.upstream`.
         upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
         timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
@@ -217,6 +218,7 @@ class Lowered:
     substeps: int = 0
     samples: int = 0
     timestep: float = 0.0
+    provides: frozenset[str] = frozenset()
     sound: int = 0
     upstream: Upstream | None = None
 
@@ -343,8 +345,8 @@ class Kind:
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
             measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
-        provides: Planes that `forward` returns beside its channels for other sensors to read, see `sensors.upstream`;
-            `reference` then returns them too, by name, as a third value.
+        provides: Planes that `forward` can return beside its channels for other sensors to read, see `sensors.upstream`:
+            it does so for those of `Lowered.provides`, and `reference` returns them too, by name, as a third value.
         reads: The field of its spec that names sensors that it reads, if it does so.
         warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
             environments) → messages`: what users are to be warned of, each once.

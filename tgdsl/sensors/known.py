@@ -20,6 +20,7 @@ from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
+from tgdsl.sensors.upstream import SOUND
 
 GROUP = "tgdsl.kinds"
 """Group of the entry points by which packages bring kinds."""
@@ -102,6 +103,9 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
         raise LowerError("this sensor reads a block of samples at each call", field, f"leave `{field}` out")
     if lowered.substeps and spec.readout == "both":
         raise LowerError("this sensor reads a block of samples, which has no noise", "readout", "leave `readout` out")
+    if lowered.provides - kind.provides or bool(lowered.sound) != (lowered.provides >= SOUND):
+        what = f"it provides {', '.join(sorted(lowered.provides)) or 'nothing'}, {lowered.sound} samples of sound"
+        raise TgdslError(f'kind "{kind.name}": {what}; expected planes of `Kind.provides`, and samples if these are of sound')
     if lowered.substeps and lowered.reports:
         raise TgdslError(f'kind "{kind.name}" has reports and reads blocks; a block has none')
 

@@ -1,7 +1,7 @@
 """What a kind asks of other sensors of its document: a typed request that names them, answered once they are evaluated.
 
-A kind that makes something for others says by `Kind.provides` which planes its `forward` returns beside its channels. A kind
-that reads others puts an `Upstream` into `Lowered.upstream`, and says by `Kind.reads` which field of its spec names them. At
+A kind that makes something for others says by `Kind.provides` which planes its `forward` can return beside its channels, and by
+`Lowered.provides` which it does return. A kind that reads others puts an `Upstream` into `Lowered.upstream`, and says by `Kind.reads` which field of its spec names them. At
 each call, or substep of a block, the sensors named are evaluated first and once, whoever else reads them; the kind then gets as
 `gathered[Upstream]` all that their `forward` returned at this very call or substep, before noise, rates and history, by the
 sensors' names. Nothing of it is handed out to users: their readings are what they were.
@@ -27,8 +27,8 @@ SAMPLES, PLACE = "sound/samples", "sound/place"
 """Planes of a sensor that makes sound.
 
 `sound/samples` (env, sample, row): sound pressure at 1 m from each row [Pa], the last sample at the instant of the state,
-earlier ones evenly since the (sub)step before, `Lowered.sound` of them. `sound/place` (env, 3, row): where it comes from, in the
-world, at the instant of the state [m], in the dtype of the state, as `quantities.places` has points of bodies. Float64
+earlier ones evenly since the (sub)step before, `Lowered.sound` of them. `sound/place` (env, 3, row): where it comes from, in
+the world, at the instant of the state [m], in the dtype of the state, as `quantities.places` has points of bodies. Float64
 references return (sample, row) and (3, row).
 """
 SOUND = frozenset({SAMPLES, PLACE})

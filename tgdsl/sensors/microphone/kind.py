@@ -2,7 +2,8 @@
 
     p(t) = Σ_i l_i s_i(t − a_i(t)) / max(r_i, r_min)^p,   r_i = c a_i,   a_i = |m(t) − x_i(t − a_i)|/c          [Pa]
 
-with s_i the sound pressure at 1 m from row i of a sensor that makes sound [Pa], l_i a factor for that sensor; r_i the distance in metres from where the source was when it emitted what is heard to where the microphone is, and c the speed of sound
+with s_i the sound pressure at 1 m from row i of a sensor that makes sound [Pa], l_i a factor for that sensor; r_i the distance
+in metres from where the source was when it emitted what is heard to where the microphone is, and c the speed of sound
 [m/s]. The sources that it hears are sensors of the document; it reads what they find at the same physics step, see
 `sensors.upstream`: K samples, the last one at the step's end. So it reads a block of K samples, of each step of a call.
 
