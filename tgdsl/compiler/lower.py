@@ -254,6 +254,7 @@ def _inputs(
         contacts_of=touched.objects,
         link_parts=touched.links,
         substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
+        dt=max((sensor.lowered.timestep * max(sensor.lowered.substeps, 1) for sensor in sensors), default=0.0),
     )
 
 
@@ -295,6 +296,8 @@ def _sensor(
         substeps=lowered.substeps,
         upstream=sensor.upstream,
         provides=tuple(sorted(lowered.provides)),
+        is_random=sensor.kind.is_random,
+        timestep=lowered.timestep,
     )
 
 

@@ -220,9 +220,16 @@ def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
             loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what, "expected as many of all"))
 
 
+def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
+    """Return a spec with the scene's time step, if it has a field `timestep` that is left out."""
+    if "timestep" not in type(spec).model_fields or spec.timestep is not None:
+        return spec
+    return spec.model_copy(update={"timestep": float(resolved.scene.compiled.opt.timestep)})
+
+
 def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
-    spec = loaded.spec.sensors[name]
+    spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)
     surfaces = Surfaces(resolved)
     clean = kind.lower(spec, layout, surfaces)

@@ -132,7 +132,8 @@ def block(
         made = _stacked(found, "signal", sensor.signal)
         samples.append(made if made.ndim == 4 else made[:, None])
         answers.append(found)
-    return {sensor.name: torch.cat(samples, dim=1).transpose(2, 3)}, dict(state), answers
+    made = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
+    return {sensor.name: made.transpose(2, 3)}, dict(state), answers
 
 
 def _answer(

@@ -5,6 +5,7 @@ from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.quantities.joints import Joints
 from tgdsl.quantities.known import QUANTITIES, known_quantities
+from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.moments import MomentsRequest
 from tgdsl.quantities.motion import LinkMotion
 from tgdsl.quantities.places import Places
@@ -18,6 +19,7 @@ __all__ = [
     "Gathered",
     "Joints",
     "LinkMotion",
+    "Loads",
     "MomentsRequest",
     "Places",
     "Planning",

@@ -16,6 +16,7 @@ from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.contact_depth import CONTACT_DEPTH
 from tgdsl.quantities.contacts import CONTACTS
 from tgdsl.quantities.joints import JOINTS
+from tgdsl.quantities.loads import LOADS
 from tgdsl.quantities.moments import MOMENTS
 from tgdsl.quantities.motion import MOTION
 from tgdsl.quantities.patches import PATCHES
@@ -24,7 +25,7 @@ from tgdsl.quantities.points import POINTS
 
 QUANTITIES: tuple[Quantity, ...] = (
     *(CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION, PATCHES),
-    *(JOINTS, PLACES),
+    *(LOADS, JOINTS, PLACES),
 )
 """The quantities that come with tgdsl, in the order in which they are planned and gathered."""
 GROUP = "tgdsl.quantities"

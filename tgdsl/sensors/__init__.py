@@ -5,6 +5,7 @@ from __future__ import annotations
 from tgdsl.sensors.actuation_audio import ACTUATION_AUDIO
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL
@@ -25,6 +26,7 @@ KINDS: tuple[Kind, ...] = (
     FORCE_TAXEL,
     LINK_CONTACT,
     TEMPERATURE_GRID,
+    CONTACT_AUDIO,
     ACTUATION_AUDIO,
     MICROPHONE,
 )
@@ -34,6 +36,7 @@ KINDS: tuple[Kind, ...] = (
 __all__ = [
     "ACTUATION_AUDIO",
     "CONTACT",
+    "CONTACT_AUDIO",
     "CONTACT_DEPTH",
     "ELASTOMER",
     "FORCE_TAXEL",

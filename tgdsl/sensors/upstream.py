@@ -1,10 +1,11 @@
 """What a kind asks of other sensors of its document: a typed request that names them, answered once they are evaluated.
 
 A kind that makes something for others says by `Kind.provides` which planes its `forward` can return beside its channels, and by
-`Lowered.provides` which it does return. A kind that reads others puts an `Upstream` into `Lowered.upstream`, and says by `Kind.reads` which field of its spec names them. At
-each call, or substep of a block, the sensors named are evaluated first and once, whoever else reads them; the kind then gets as
-`gathered[Upstream]` all that their `forward` returned at this very call or substep, before noise, rates and history, by the
-sensors' names. Nothing of it is handed out to users: their readings are what they were.
+`Lowered.provides` which it does return. A kind that reads others puts an `Upstream` into `Lowered.upstream`, and says by
+`Kind.reads` which field of its spec names them. At each call, or substep of a block, the sensors named are evaluated first and
+once, whoever else reads them; the kind then gets as `gathered[Upstream]` all that their `forward` returned at this very call or
+substep, before noise, rates and history, by the sensors' names. Nothing of it is handed out to users: their readings are what
+they were.
 
 A sensor that is read is advanced at as many substeps as the one that reads it. Sensors that read one another in a circle, that
 are not there, or whose kind does not provide what is wanted are mistakes of the document, each at its place. As sizes may

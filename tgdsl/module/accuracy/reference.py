@@ -5,6 +5,7 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,6 +16,8 @@ from tgdsl.plan.plan import Plan
 from tgdsl.quantities.reference import References, ReferenceScene
 from tgdsl.sensors.base import AnySensorSpec, Kind, ReferenceContext
 from tgdsl.sensors.known import quantities_of
+from tgdsl.sensors.noise.random import KIND, sensor_key
+from tgdsl.sensors.noise.reference import words
 from tgdsl.sensors.upstream import Upstream
 
 Planes = Mapping[str, np.ndarray]
@@ -69,7 +72,7 @@ class ReferenceModule:
             memory, samples, provided = self.memory.get(env, rest), [], []
             for i, part in enumerate([*state.substeps, state] if self.sensor.substeps else [state]):
                 read = {name: found[env][i] for name, found in others.items()}
-                gathered, context = self.gathered(part, env, shift, read), self.context(state, i)
+                gathered, context = self.gathered(part, env, shift, read), self.context(state, i, env)
                 reading, memory, *rest_of_it = self.kind.reference(self.spec, self.layout, gathered, context, memory)
                 samples.append(reading)
                 provided.append(rest_of_it[0] if rest_of_it else {})
@@ -87,11 +90,13 @@ class ReferenceModule:
         for other in self.upstream.values():
             other.remember(other._after)
 
-    def context(self, state: SceneState, substep: int) -> ReferenceContext:
-        """Return when the kind is called, all calls having been as long as this one."""
+    def context(self, state: SceneState, substep: int, env: int) -> ReferenceContext:
+        """Return when the kind is called, all calls having been as long as this one, with the random numbers of seed 0."""
         dt, count = state.dt or 0.0, max(self.sensor.substeps, 1)
         time = 0.0 if self.num_calls == 0 else (self.num_calls - 1) * dt + (substep + 1) * dt / count
-        return ReferenceContext(dt / count, self.num_calls, substep, time, self.num_calls == 0 and substep == 0)
+        call = sensor_key(0, self.sensor.sensor), env, self.num_calls * count + substep, KIND
+        is_first = self.num_calls == 0 and substep == 0
+        return ReferenceContext(dt / count, self.num_calls, substep, time, is_first, functools.partial(words, *call))
 
     def gathered(
         self, state: SceneState, env: int, shift: np.ndarray, upstream: Mapping[str, Planes] | None = None

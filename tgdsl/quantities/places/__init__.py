@@ -54,8 +54,11 @@ def plan(planning: Planning, uses: Sequence[Use]) -> PlacesPart[np.ndarray]:
     found = []
     for use in uses:
         assert isinstance(use.request, Places)
-        bodies = np.array([planning.bodies.index(body) for body in use.request.bodies], dtype=np.int64)
-        found.append(PlacesUse(bodies, np.asarray(use.request.offset, dtype=np.float64).reshape(-1, 3)))
+        body_of = {target.name: target.body for target in planning.objects}
+        names = use.request.bodies or tuple(body_of[name] for name in use.request.objects if name in body_of)
+        bodies = np.array([planning.bodies.index(body) for body in names], dtype=np.int64)
+        offset = use.request.offset if use.request.bodies else np.zeros((len(names), 3))
+        found.append(PlacesUse(bodies, np.asarray(offset, dtype=np.float64).reshape(-1, 3)))
     return PlacesPart(tuple(found))
 
 

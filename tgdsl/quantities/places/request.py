@@ -15,6 +15,8 @@ from tgdsl.quantities.base import Request
 class Places(Request[Vec]):
     """Asks where points on bodies are: planes (env, point) in the world [m], in the dtype of the state.
 
+    With `objects` it asks where the frames of these objects' bodies are, and of no other points.
+
     Attributes:
         bodies: The body of each point.
         offset: Where each is in its body's frame [m].
