@@ -296,8 +296,9 @@ Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
-Reading = Float[np.ndarray, "row channel"]
-ReferenceAnswer = tuple[Reading, dict[str, np.ndarray]] | tuple[Reading, dict[str, np.ndarray], Mapping[str, np.ndarray]]
+Kept = dict[str, np.ndarray]
+ReferenceAnswer = tuple[np.ndarray, Kept] | tuple[np.ndarray, Kept, Mapping[str, np.ndarray]]
+"""A reading (row, channel), or of a block (sample, row, channel), and what is kept; of a kind that provides planes also these."""
 
 
 class Alternative(NamedTuple):
