@@ -65,7 +65,7 @@ class Run:
             if self.compiled:
                 touch.compile()
             progress(f"starting {self.num_envs} environments" if self.num_envs > 1 else "starting the simulation")
-            sim, controls = self._start(touch, progress)
+            sim, controls = self.start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
         if touch.plan.objects and not is_touched(touch, sim):
@@ -74,7 +74,7 @@ class Run:
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 
-    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
+    def start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
         from tgdsl.runtime.rollout import recorded_controls
         from tgdsl.runtime.scripted import script_of
