@@ -298,7 +298,7 @@ ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
 Kept = dict[str, np.ndarray]
 ReferenceAnswer = tuple[np.ndarray, Kept] | tuple[np.ndarray, Kept, Mapping[str, np.ndarray]]
-"""A reading (row, channel), or of a block (sample, row, channel), and what is kept; of a kind that provides planes also these."""
+"""A reading (row, channel), or (sample, row, channel) of a block, and what is kept; and planes, where a kind provides them."""
 
 
 class Alternative(NamedTuple):

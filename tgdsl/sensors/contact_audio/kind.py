@@ -55,8 +55,8 @@ from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.bands import band_numbers, membership, middle
 from tgdsl.sensors.contact_audio.impulses import impulses
-from tgdsl.sensors.contact_audio.operators import operators
-from tgdsl.sensors.contact_audio.reference import LEAST, QUIET, radiated, reference
+from tgdsl.sensors.contact_audio.operators import advance_of, least, operators, quiet, radiated
+from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise import random
@@ -124,8 +124,8 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
         strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
         struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
     parts = torch.cat([state["phasors"], struck], dim=-1).transpose(0, 1)
-    advance = constants["advance"].double() + constants["advance_low"].double()
-    phasors = torch.nn.functional.hardshrink(torch.bmm(parts.double(), advance).to(parts.dtype), LEAST)
+    advance = advance_of(constants, context.step[0] + context.substep)
+    phasors = torch.nn.functional.hardshrink(torch.bmm(parts, advance), least())
     new["phasors"] = phasors.transpose(0, 1)
     if "band" not in constants:
         made = torch.bmm(parts, constants["heard"]).permute(1, 2, 0)
@@ -152,7 +152,7 @@ def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
 
 def _level(energy: Tensor) -> Tensor:
     """Return the level of energies [dB]."""
-    return 10.0 * torch.log10(1.0 + energy / QUIET)
+    return 10.0 * torch.log10(1.0 + energy / quiet())
 
 
 def retimed(constants: Mapping[str, np.ndarray], dt: float) -> Mapping[str, np.ndarray]:

@@ -3,8 +3,10 @@
     heard = Hᵀ x,   z′ = Pᵀ x,   x = (Re z, Im z, u)
 
 with the phasors z of the modes at the start of a step [N·s] and impulses u at `GRAINS` times within it [N·s]; H holds the
-samples' sines, P what is left of each phasor at the end. Both are exact, whatever the step. A phasor turned by a rounded factor
-would drift by 10⁻⁸ a step, so P is kept as a rounded matrix and what rounding left out, which are added up in float64.
+samples' sines, P what is left of each phasor at the end. Both are exact, whatever the step. A phasor that is turned by the same
+rounded factor at every step drifts by 3e-8 a step. So in float32 each number of P is rounded down at some steps and up at
+others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
+last place by which it is above the lower one. What is left are roundings that do not add up.
 
 Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real parts, imaginary parts and impulses, `sample`
 samples of a block, `band` bands, `grain` times of impulses.
@@ -16,13 +18,32 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
 GRAINS = 4
 """Times within a physics step at which noise strikes: the same for any number of samples, so that the noise is."""
 HIGHEST = 0.45
 """Largest frequency that is heard, in sample rates."""
 Arrays = Mapping[str, np.ndarray]
+
+# Functions, not floats of the module: under dynamic shapes torch.compile makes those inputs of the graph.
+
+
+def golden() -> float:
+    """Return the golden ratio's fraction: modulo 1, its multiples fill the unit interval most evenly of all numbers'."""
+    return 0.6180339887498949
+
+
+def least() -> float:
+    """Return up to where a component of a phasor is flushed to zero [N·s]."""
+    return 1e-12
+
+
+def quiet() -> float:
+    """Return the energy E₀ that levels are relative to, of 1 µm/s [m²/s²]."""
+    return 1e-12
 
 
 def highest(samples: int, step: float) -> float:
@@ -44,6 +65,11 @@ def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: b
     angle = 2 * math.pi * frequency * step / samples
     sine = np.where(np.sin(angle) != 0, np.sin(angle), 1.0)
     return np.cos(angle) / sine, np.ones_like(frequency)
+
+
+def radiated() -> float:
+    """Return the sound pressure at 1 m per velocity of a surface of 0.01 m², ρc √(A/4π), of air at 20 °C [Pa·s/m]."""
+    return 1.204 * 343.2 * math.sqrt(0.01 / (4 * math.pi))
 
 
 def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
@@ -85,10 +111,29 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         struck = begun[0][..., None, None] * late_imag + begun[1][..., None, None] * late_real
         of_impulses = (gain[..., None, None] * struck).sum(axis=1)
         found["heard"] = np.concatenate([gain[..., None] * imag, gain[..., None] * real, of_impulses], axis=1)
-    rounded = found.pop("mixed")
-    found["advance"] = rounded.astype(np.float32).astype(np.float64)
-    found["advance_low"] = rounded - found["advance"]
-    return found
+    return found | _rounded(found.pop("mixed"))
+
+
+def _rounded(exact: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the float32 numbers below and above each number, and how far on the way from one to the other it is."""
+    nearest = exact.astype(np.float32)
+    low = np.where(nearest > exact, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+    high = np.nextafter(low, np.float32(np.inf))
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    return {"advance_low": low, "advance_high": high, "advance_share": (exact - low) / (high - low)}
+
+
+def advance_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "row part both"]:
+    """Return P as a step uses it: exact in float64, rounded down or up in float32.
+
+    Args:
+        constants: The module's.
+        count: Number of the step, int64; any steps will do that follow one another.
+    """
+    low, high, share = (constants[f"advance_{name}"] for name in ("low", "high", "share"))
+    if low.dtype == torch.float64:
+        return low + share * (high - low)
+    return torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
 
 
 def _advance(

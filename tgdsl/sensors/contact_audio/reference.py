@@ -17,15 +17,13 @@ from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import band_numbers, middle
 from tgdsl.sensors.contact_audio.impulses import reference_impulses
-from tgdsl.sensors.contact_audio.operators import GRAINS, highest
+from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet, radiated
 from tgdsl.sensors.contact_audio.rows import ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise.reference import normal_pair
 from tgdsl.sensors.upstream import PLACE, SAMPLES
 from tgdsl.surfaces.surface import Surface
 
-LEAST, QUIET = 1e-12, 1e-12
-"""Amplitude that is flushed to zero [N·s]; energy that is 3 dB (E₀) [m²/s²]."""
 Strikes = list[tuple[float, float]]
 """When each impulse acts after the start of the step [s], and how large it is [N·s]."""
 
@@ -59,17 +57,12 @@ def reference(
             rate, before = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
             samples, after = _ring(rate, before, strikes, spec.samples, step, is_paper)
             heard[:, row] += gain * samples
-            phasors[row, [m, half + m]] = [part if abs(part) > LEAST else 0.0 for part in (after.real, after.imag)]
+            phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
     after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
     if spec.outputs == "bands":
         return _bands(spec, modes.frequency, amplitude), after
     return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
-
-
-def radiated() -> float:
-    """Return the sound pressure at 1 m per velocity of a surface of 0.01 m², ρc √(A/4π), of air at 20 °C [Pa·s/m]."""
-    return 1.204 * 343.2 * math.sqrt(0.01 / (4 * math.pi))
 
 
 def _no_surface(name: str) -> Surface:
@@ -130,4 +123,4 @@ def _bands(spec: ContactAudioSpec, frequency: np.ndarray, amplitude: np.ndarray)
         for b, number in enumerate(band_numbers(frequency)):
             if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
                 found[place[0], b] += 0.5 * amplitude[place] ** 2
-    return 10 * np.log10(1 + found / QUIET) if spec.scale == "decibel" else found
+    return 10 * np.log10(1 + found / quiet()) if spec.scale == "decibel" else found
