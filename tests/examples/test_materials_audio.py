@@ -1,0 +1,86 @@
+"""examples/materials_audio.yaml: three boxes that are one to the solver, told apart by ear in drops from anywhere."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.signal import find_peaks
+
+import tgdsl
+from tgdsl.schema.load import load
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "materials_audio.yaml"
+BOXES = ("steel", "wood", "glass")
+NUM_DROPS, NUM_STEPS, RATE = 50, 400, 24000.0
+SPAN = int(0.06 * RATE)
+"""Samples after an impact that are looked at: no ball is back so soon."""
+
+
+@pytest.fixture(scope="module")
+def drops():
+    """What each box sounds like from the first impact on, (drop, sample), and where the balls were at the end."""
+    touch = tgdsl.compile(EXAMPLE, sensors=BOXES, dtype="float64")
+    sim = tgdsl.simulate(touch, NUM_DROPS)
+    rng = np.random.default_rng(5)
+    place, height = rng.uniform(-0.07, 0.07, size=(NUM_DROPS, 2)), rng.uniform(0.05, 0.35, size=NUM_DROPS)
+    for i, centre in enumerate((-0.3, 0.0, 0.3)):
+        ball = sim.joints[f"ball_{i + 1}"].qpos
+        ball = slice(ball.start, ball.start + 3)
+        sim.qpos[:, ball] = torch.from_numpy(np.column_stack([centre + place[:, 0], place[:, 1], 0.11 + height]))
+    sim.forward()
+    blocks = {name: [] for name in BOXES}
+    for _ in range(NUM_STEPS):
+        sim.step()
+        readings = touch(sim.state())
+        for name in BOXES:
+            blocks[name].append(readings[name][:, :, 0, 0])
+    found = {name: torch.cat(blocks[name], dim=1).numpy() for name in BOXES}
+    first = {name: (np.abs(own) > 0).argmax(axis=1) for name, own in found.items()}
+    assert all((np.abs(own).max(axis=1) > 1e-3).all() for own in found.values()) and sim.num_envs == NUM_DROPS
+    cut = {n: np.stack([own[k : k + SPAN] for own, k in zip(found[n], first[n], strict=True)]) for n in BOXES}
+    balls = [sim.qpos[:, sim.joints[f"ball_{i + 1}"].qpos].numpy() for i in range(3)]
+    return cut, balls, first
+
+
+def centroid(sound):
+    """Return the spectral centroid [Hz]."""
+    power = np.abs(np.fft.rfft(sound)) ** 2
+    return power @ np.fft.rfftfreq(sound.shape[-1], 1 / RATE) / power.sum(axis=-1)
+
+
+def decay(sound):
+    """Return the rate at which the energy of what is left falls, halved: of amplitudes [1/s]."""
+    left = np.cumsum(sound[:, ::-1] ** 2, axis=1)[:, ::-1]
+    early = slice(0, SPAN // 2)
+    return np.array([-0.5 * np.polyfit(np.arange(SPAN)[early] / RATE, np.log(own[early]), 1)[0] for own in left])
+
+
+def test_the_solver_cannot_tell_them_apart(drops):
+    _, balls, first = drops
+    for ball, centre in zip(balls, (-0.3, 0.0, 0.3), strict=True):
+        same = ball[:, :3] - [centre, 0, 0]
+        np.testing.assert_allclose(same, balls[1][:, :3], atol=1e-9)
+    assert (first["steel"] // 24 == first["wood"] // 24).all() and (first["steel"] // 24 == first["glass"] // 24).all()
+
+
+@pytest.mark.parametrize("feature", [centroid, decay])
+def test_every_drop_is_told_apart(drops, feature):
+    """50 of 50 of each: the ranges of the three do not meet, neither of the centroid nor of the decay."""
+    values = {name: feature(sound) for name, sound in drops[0].items()}
+    ordered = sorted(values.values(), key=np.median)
+    assert all(below.max() < above.min() for below, above in itertools.pairwise(ordered))
+    assert np.isfinite(np.concatenate(ordered)).all() and len(np.concatenate(ordered)) == 3 * NUM_DROPS
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_the_spectrum_has_a_peak_at_each_mode(drops, name):
+    """Of every drop, within 1 % of the frequency of each of at least four modes."""
+    modes = [mode.frequency for mode in load(EXAMPLE).spec.sensors[name].modes]
+    assert len(modes) >= 4
+    for sound in drops[0][name]:
+        spectrum = np.abs(np.fft.rfft(sound * np.exp(-np.arange(SPAN) / RATE * 20.0), 1 << 15))
+        frequency = np.fft.rfftfreq(1 << 15, 1 / RATE)
+        peaks = frequency[find_peaks(spectrum, prominence=0.02 * spectrum.max())[0]]
+        assert all(np.abs(peaks / mode - 1).min() < 0.01 for mode in modes)
