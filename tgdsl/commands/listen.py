@@ -83,7 +83,7 @@ class Listen:
         from tgdsl.runtime.rollout import rollout
         from tgdsl.view.sound import Sound
 
-        run = Run(self.document, self.keyframes, self.seconds, self.controls, substeps=touch.inputs.substeps)
+        run = Run(self.document, self.keyframes, self.seconds, self.controls)
         with StatusLine() as progress:
             sim, controls = run.start(touch, progress)
         blocks: dict[str, list[np.ndarray]] = {sensor.name: [] for sensor in chosen}

@@ -35,8 +35,8 @@ class Run:
     """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator) or (step, env, actuator)."""
     num_envs: int = 1
     """Environments; the table and the picture show the first."""
-    substeps: int = 5
-    """Physics steps per control step."""
+    substeps: int | None = None
+    """Physics steps per control step; default: as many as sensors that read blocks want, else 5."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
     """Folder for readings.npz, picture.png and, where there are several readings, overview.png."""
     compiled: bool = False
@@ -80,13 +80,15 @@ class Run:
         from tgdsl.runtime.scripted import script_of
         from tgdsl.runtime.simulate import simulate
 
+        blocks = max(sensor.substeps for sensor in touch.plan.sensors)
+        substeps = (blocks or 5) if self.substeps is None else self.substeps
         if self.controls is not None:
-            return simulate(touch, self.num_envs, substeps=self.substeps), recorded_controls(self.controls)
+            return simulate(touch, self.num_envs, substeps=substeps), recorded_controls(self.controls)
         script = script_of(touch, self.keyframes, progress)
         if script.note:
             held = "" if script.closing else f": its initial state is held for {self.seconds:g} s"
             print(f"{script.note}{held}")
-        return script.begin(touch, self.num_envs, self.substeps, self.seconds)
+        return script.begin(touch, self.num_envs, substeps, self.seconds)
 
     def _steps(self, touch: TactileModule, sim: BatchSimulation, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
         """Make all steps, and return the last readings."""
