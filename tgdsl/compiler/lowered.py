@@ -156,9 +156,8 @@ def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
         check_lowered(sensor.kind, lowered, sensor.spec)
     for name, other in fitting.upstream.items():
         if other.lowered.substeps != lowered.substeps:
-            what = (
-                f'it is advanced at {lowered.substeps} physics steps of a call, "{name}", which it reads, at {other.substeps}'
-            )
+            own, read = lowered.substeps, other.lowered.substeps
+            what = f'it is advanced at {own} physics steps of a call, and reads "{name}", which is at {read}'
             raise TgdslError(f'kind "{sensor.kind.name}": {what}; expected as many')
     return dataclasses.replace(sensor, lowered=lowered, upstream=tuple(fitting.upstream))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tgdsl.compiler.joints import joints_matching
+from tgdsl.compiler.links import joints_matching
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.errors import Problem, did_you_mean
 from tgdsl.formats.joints import RobotJoints

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.compiler.joints import check_named_bodies, sensor_joints
-from tgdsl.compiler.links import LinkBodies, link_bodies
+from tgdsl.compiler.links import LinkBodies, check_named_bodies, link_bodies, sensor_joints
 from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.variants import OwnObjects
