@@ -106,7 +106,7 @@ def spectrogram(sound: Sound, window: float = 0.02) -> Spectrogram:
     """
     num = int(np.clip(round(window * sound.rate), 1, max(len(sound.samples), 1)))
     hop = max(num // 4, 1)
-    frequency, time, power = signal.spectrogram(sound.samples, sound.rate, "hann", num, num - hop, detrend=False)
+    frequency, time, power = signal.spectrogram(sound.samples, sound.rate, "hann", num, num - hop, detrend=False)  # type: ignore[arg-type]
     largest = power.max(initial=0.0)
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(power / largest) if largest > 0 else np.full(power.shape, -np.inf)

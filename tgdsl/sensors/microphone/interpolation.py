@@ -34,7 +34,7 @@ def coefficients() -> Float[np.ndarray, "power tap"]:
     powers = (fraction[:, None] - 0.5) ** np.arange(ORDER)
     heard = np.einsum("wk,dm->wdmk", np.exp(1j * np.outer(omega, taps)), powers).reshape(-1, ORDER * TAPS)
     wanted = np.exp(1j * np.outer(omega, fraction)).reshape(-1)
-    rows, right = np.concatenate([heard.real, heard.imag]), np.concatenate([wanted.real, wanted.imag])
+    rows, right = (np.concatenate([np.real(part), np.imag(part)]) for part in (heard, wanted))
     return np.linalg.lstsq(rows, right, rcond=1e-12)[0].reshape(ORDER, TAPS)
 
 

@@ -59,7 +59,8 @@ def age_of_sound(listener: Float[np.ndarray, 3], track: Float[np.ndarray, "node 
     for node in range(1, len(track)):
         if early(node * dt) > 0:
             first, last = (node - 1) * dt, node * dt
-            return first if early(first) == 0 else brentq(early, first, last, xtol=1e-18, rtol=4 * np.finfo(float).eps)
+            tolerance = {"xtol": 1e-18, "rtol": 4 * np.finfo(float).eps}
+            return first if early(first) == 0 else float(brentq(early, first, last, **tolerance))  # type: ignore[arg-type]
     return (len(track) - 1) * dt
 
 
