@@ -8,7 +8,11 @@ import pytest
 import torch
 from struck_plate import MODES, STEP, energy, plate, pressed, ringing, sound
 
-from tgdsl.sensors.contact_audio.operators import advance_of, least, operators
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.loads import Loads, PairLoads
+from tgdsl.sensors.base import Context
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+from tgdsl.sensors.contact_audio.operators import operators
 
 STRIKE = [0.0, 0.0, 3.0, 0.0]
 """A collision of one step, 3 N over 1 ms, whose impulse strikes at the start of the next one."""
@@ -48,13 +52,14 @@ def test_roundings_do_not_add_up():
     table = {"frequency": frequency, "decay": decay, "gain": 1.0}
     constants = {name: np.array([[value]]) for name, value in table.items()}
     constants |= {"samples": np.array(samples), "settling": np.array(0.02), "scrape": np.array(0.0)}
+    load = {name: torch.zeros(1, 1, 1) for name in ("steady", "pending")}
     own = {name: torch.from_numpy(np.asarray(value)).float() for name, value in operators(constants, step).items()}
-    parts, found = torch.tensor([[[0.0, 0.0, 1.0]]]), []
+    state, force, found = {"phasors": torch.tensor([[[1.0, 0.0]]]), **load}, torch.zeros(1, 1, 1), []
     for count in range(20_000):
-        found.append(parts @ own["heard"])
-        phasors = torch.nn.functional.hardshrink(parts @ advance_of(own, torch.tensor([count])), least())
-        parts = torch.cat([phasors, torch.zeros(1, 1, 1)], dim=-1)
-    heard = torch.cat(found, dim=-1).flatten().double().numpy()
+        context = Context(torch.tensor(step), torch.tensor([[count]]), 0, torch.tensor([[1.0]]), torch.tensor([[False]]))
+        read, state = CONTACT_AUDIO.forward(Gathered({Loads: PairLoads(force, force, None)}), context, own, state)
+        found.append(read["signal"].flatten())
+    heard = torch.cat(found).double().numpy()
     time = np.arange(1, len(heard) + 1) * step / samples
     assert abs(heard - np.exp(-decay * time) * np.sin(2 * math.pi * frequency * time)).max() < 3e-5
 

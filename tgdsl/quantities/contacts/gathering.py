@@ -117,4 +117,4 @@ def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object sl
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
     """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
     padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
-    return torch.cat([field, padding], dim=1)[:, index]
+    return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)

@@ -53,7 +53,7 @@ def _velocity(
 ) -> Vec:
     """Return the velocity of the bodies' material at each contact [m/s], (env, body, object, slot)."""
     names = ("body_pos", "body_linvel", "body_angvel")
-    pos, linvel, angvel = (planes.vec(map(spread, planes.split(state[name][:, bodies]))) for name in names)
+    pos, linvel, angvel = (planes.vec(map(spread, planes.split(state[name].index_select(1, bodies)))) for name in names)
     return planes.add(linvel, planes.cross(angvel, _away(found, pos)))
 
 

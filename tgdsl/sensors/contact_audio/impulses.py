@@ -19,23 +19,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.sensors.base import Constants, Context, State
+from tgdsl.sensors.base import Constants, State
 
 Load = Float[Tensor, "env body object"]
+UNKNOWN = 1e30
+"""Steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first."""
 
 
-def impulses(force: Load, context: Context, constants: Constants, state: State) -> tuple[Load, dict[str, Tensor]]:
+def impulses(force: Load, constants: Constants, state: State) -> tuple[Load, dict[str, Tensor]]:
     """Return the impulses that strike at the start of this step [N·s], and what is remembered."""
-    step, kept = constants["step"], constants["kept"]
-    is_first = context.is_first[..., None]
-    steady = torch.where(is_first, force, state["steady"])
+    steady, kept = state["steady"], constants["kept"]
+    grown = (force - steady).clamp(min=0.0) * constants["step"]
     if "is_paper" in constants:
-        return (force - steady).clamp(min=0.0) * step, {"steady": force}
-    pending, grown = torch.where(is_first, 0.0, state["pending"]), (force - steady).clamp(min=0.0) * step
-    is_over = grown <= (1.0 - kept) * pending
+        return grown, {"steady": force}
+    pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
+    is_over = grown <= constants["leaked"] * pending
     impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
-    after = torch.where(is_over, force, force + kept * (steady - force))
-    return impulse, {"pending": torch.where(is_over, 0.0, kept * pending + grown), "steady": after}
+    after = torch.where(is_over, force, torch.lerp(force, steady, kept))
+    return impulse, {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
 
 
 def reference_impulses(

@@ -54,8 +54,8 @@ from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.bands import band_numbers, membership, middle
-from tgdsl.sensors.contact_audio.impulses import impulses
-from tgdsl.sensors.contact_audio.operators import advance_of, least, operators, quiet, radiated
+from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
+from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
@@ -91,7 +91,7 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         unit = "dB" if spec.scale == "decibel" else "m²/s²"
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in band_numbers(modes.frequency))
     pairs = (len(layout.bodies), len(spec.feels))
-    state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(shape=pairs)}
+    state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
     is_heard = spec.outputs == "samples"
     return Lowered(
         channels=channels,
@@ -118,31 +118,41 @@ def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the samples of a step (env, sample, 1, row) [m/s], or the energies of its bands (env, band, row)."""
     loads = gathered[Loads]
-    impulse, new = impulses(loads.force, context, constants, state)
+    impulse, new = impulses(loads.force, constants, state)
     struck = _of_rows(impulse, constants)[..., None]
     if "noise" in constants:
         strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
         struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
-    parts = torch.cat([state["phasors"], struck], dim=-1).transpose(0, 1)
-    advance = advance_of(constants, context.step[0] + context.substep)
-    phasors = torch.nn.functional.hardshrink(torch.bmm(parts, advance), least())
-    new["phasors"] = phasors.transpose(0, 1)
-    if "band" not in constants:
-        made = torch.bmm(parts, constants["heard"]).permute(1, 2, 0)
+    before = state["phasors"]
+    new["phasors"] = after = _turned(before, struck, turn_of(constants, context.step[0] + context.substep), constants)
+    if "heard" in constants:
+        parts = torch.cat([before, struck], dim=-1)
+        made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
-    energy = torch.bmm(phasors * phasors, constants["heard"]).permute(1, 2, 0)
+    energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
+
+
+def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step, (env, row, part · mode) [N·s]."""
+    (cosine, sine), (real, imag) = turn.unbind(), phasors.chunk(2, dim=-1)
+    turned = torch.addcmul(real * cosine, imag, sine, value=-1), torch.addcmul(real * sine, imag, cosine)
+    after = torch.cat(turned, dim=-1)
+    for grain, own in enumerate(constants["struck"].unbind()):
+        after = torch.addcmul(after, struck[..., grain, None], own)
+    return torch.nn.functional.hardshrink(after, least())
 
 
 def _of_rows(pairs: Tensor, constants: Constants) -> Tensor:
     """Return the sum over what touches each body (or object) that rings, (env, row)."""
-    return pairs.sum(dim=1 if "is_of_object" in constants else 2)
+    dim = 1 if "is_of_object" in constants else 2
+    return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
 
 
 def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
     """Return the impulses of sliding (env, row, grain) [N·s]."""
     assert context.stream is not None
-    rows, grains = sliding.shape[1], constants["strike_time"].shape[0]
+    rows, grains = sliding.shape[1], constants["struck"].shape[0]
     count = (grains + 1) // 2
     index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
     pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)

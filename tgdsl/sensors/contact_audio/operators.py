@@ -1,15 +1,15 @@
-"""A block of samples as one matrix: what of it depends on the modes and the time step, in float64.
+"""A step of the modes, and a block of samples as one matrix: what of it depends on the time step, in float64.
 
-    heard = Hᵀ x,   z′ = Pᵀ x,   x = (Re z, Im z, u)
+    heard = Hᵀ (Re z, Im z, u),   z′ = p z + Bᵀ u
 
 with the phasors z of the modes at the start of a step [N·s] and impulses u at `GRAINS` times within it [N·s]; H holds the
-samples' sines, P what is left of each phasor at the end. Both are exact, whatever the step. A phasor that is turned by the same
-rounded factor at every step drifts by 3e-8 a step. So in float32 each number of P is rounded down at some steps and up at
+samples' sines, p and B what is left of phasors and impulses at the end. All are exact, whatever the step. A phasor that is
+turned by the same rounded factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at
 others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
-last place by which it is above the lower one. What is left are roundings that do not add up.
+last place by which it is above the lower number. What is left are roundings that do not add up.
 
-Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real parts, imaginary parts and impulses, `sample`
-samples of a block, `band` bands, `grain` times of impulses.
+Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `sample` samples of a block,
+`band` bands, `grain` times of impulses.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 GRAINS = 4
@@ -58,13 +58,12 @@ def strike_times(samples: int, step: float, is_paper: bool, has_noise: bool) -> 
     return np.arange(GRAINS if has_noise else 1) * step / GRAINS
 
 
-def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: bool) -> tuple[np.ndarray, np.ndarray]:
+def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: bool) -> Complex[np.ndarray, "row mode"]:
     """Return the phasor that a unit impulse adds to each mode: 1, or e^(iθ)/sin θ of the two-pole response."""
     if not is_paper:
-        return np.ones_like(frequency), np.zeros_like(frequency)
+        return np.ones_like(frequency, dtype=np.complex128)
     angle = 2 * math.pi * frequency * step / samples
-    sine = np.where(np.sin(angle) != 0, np.sin(angle), 1.0)
-    return np.cos(angle) / sine, np.ones_like(frequency)
+    return np.exp(1j * angle) / np.where(np.sin(angle) != 0, np.sin(angle), 1.0)
 
 
 def radiated() -> float:
@@ -81,77 +80,53 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         step: The time step.
     """
     samples, is_paper, scrape = int(constants["samples"]), "is_paper" in constants, float(constants["scrape"])
-    frequency, decay = constants["frequency"], constants["decay"]
+    frequency = constants["frequency"]
     is_heard = (frequency > 0) & (frequency <= highest(samples, step) * (1 + 1e-12))
-    gain = np.where(is_heard, constants["gain"], 0.0)
+    rate, gain = -constants["decay"] + 2j * math.pi * frequency, np.where(is_heard, constants["gain"], 0.0)
     times, strikes = np.arange(1, samples + 1) * step / samples, strike_times(samples, step, is_paper, scrape > 0)
-
-    def factors(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return real and imaginary part of e^((−d + 2πif) t), (row, mode, *time), of silent modes 0 and before the start."""
-        shape = (..., *[None] * time.ndim)
-        size = np.where(time >= -1e-12 * step, is_heard[shape] * np.exp(-decay[shape] * np.maximum(time, 0.0)), 0.0)
-        angle = 2 * math.pi * frequency[shape] * time
-        return size * np.cos(angle), size * np.sin(angle)
-
-    real, imag = factors(times)
     begun = strike_phasors(frequency, samples, step, is_paper)
-    late_real, late_imag = factors(times - strikes[:, None])
+
+    def factors(time: np.ndarray) -> np.ndarray:
+        """Return e^((−d + 2πif) t), (row, mode, *time); 0 of modes that are not heard, and before an impulse."""
+        shape = (..., *[None] * time.ndim)
+        return np.where(is_heard[shape] & (time >= -1e-12 * step), np.exp(rate[shape] * np.maximum(time, 0.0)), 0.0)
+
+    kept, turn, left = math.exp(-step / float(constants["settling"])), factors(np.array(step)), factors(step - strikes)
+    added = (begun[..., None] * left).transpose(2, 0, 1)
     found = {
-        "mixed": _advance(factors(np.array(step)), begun, factors(step - strikes)),
-        "kept": np.asarray(math.exp(-step / float(constants["settling"]))),
+        "kept": np.asarray(kept),
+        "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
-        "strike_time": strikes,
+        "struck": np.concatenate([added.real, added.imag], axis=2),
+        **_rounded("turn", np.stack([turn.real, turn.imag])),
     }
     if scrape > 0:
         found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
     if "band" in constants:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
-        found["heard"] = np.concatenate([energy, energy], axis=1)
-    else:
-        struck = begun[0][..., None, None] * late_imag + begun[1][..., None, None] * late_real
-        of_impulses = (gain[..., None, None] * struck).sum(axis=1)
-        found["heard"] = np.concatenate([gain[..., None] * imag, gain[..., None] * real, of_impulses], axis=1)
-    return found | _rounded(found.pop("mixed"))
+        return found | {"energy": np.concatenate([energy, energy], axis=1)}
+    free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
+    parts = [gain[..., None] * free.imag, gain[..., None] * free.real, (gain[..., None, None] * of_impulses.imag).sum(axis=1)]
+    return found | {"heard": np.concatenate(parts, axis=1)}
 
 
-def _rounded(exact: np.ndarray) -> dict[str, np.ndarray]:
+def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:
     """Return the float32 numbers below and above each number, and how far on the way from one to the other it is."""
     nearest = exact.astype(np.float32)
     low = np.where(nearest > exact, np.nextafter(nearest, np.float32(-np.inf)), nearest)
     high = np.nextafter(low, np.float32(np.inf))
     low, high = low.astype(np.float64), high.astype(np.float64)
-    return {"advance_low": low, "advance_high": high, "advance_share": (exact - low) / (high - low)}
+    return {f"{name}_low": low, f"{name}_high": high, f"{name}_share": (exact - low) / (high - low)}
 
 
-def advance_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "row part both"]:
-    """Return P as a step uses it: exact in float64, rounded down or up in float32.
+def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "part row mode"]:
+    """Return p as a step uses it, its real and imaginary parts: exact in float64, rounded down or up in float32.
 
     Args:
         constants: The module's.
         count: Number of the step, int64; any steps will do that follow one another.
     """
-    low, high, share = (constants[f"advance_{name}"] for name in ("low", "high", "share"))
+    low, high, share = (constants[f"turn_{name}"] for name in ("low", "high", "share"))
     if low.dtype == torch.float64:
         return low + share * (high - low)
     return torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
-
-
-def _advance(
-    turn: tuple[np.ndarray, np.ndarray], begun: tuple[np.ndarray, np.ndarray], late: tuple[np.ndarray, np.ndarray]
-) -> Float[np.ndarray, "row part both"]:
-    """Return P: from phasors and impulses to phasors at the end of the step.
-
-    Args:
-        turn: The factor of each phasor, (row, mode).
-        begun: What a unit impulse adds to it, (row, mode).
-        late: The factor from the time of each impulse on, (row, mode, grain).
-    """
-    rows, modes, grains = late[0].shape
-    made = np.zeros((rows, 2 * modes + grains, 2 * modes))
-    each = np.arange(modes)
-    made[:, each, each], made[:, modes + each, each] = turn[0], -turn[1]
-    made[:, each, modes + each], made[:, modes + each, modes + each] = turn[1], turn[0]
-    real = begun[0][..., None] * late[0] - begun[1][..., None] * late[1]
-    imag = begun[0][..., None] * late[1] + begun[1][..., None] * late[0]
-    made[:, 2 * modes :, :modes], made[:, 2 * modes :, modes:] = real.swapaxes(1, 2), imag.swapaxes(1, 2)
-    return made

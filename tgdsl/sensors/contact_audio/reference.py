@@ -38,9 +38,9 @@ def reference(
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
     is_paper, below = spec.model == "paper", highest(spec.samples, step)
-    steady = loads.force if context.is_first else state["steady"]
-    pending = state.get("pending", np.zeros_like(steady))
-    impulse, steady, pending = reference_impulses(loads.force, (steady, pending), step, spec.settling, is_paper)
+    before = loads.force if context.is_first else state["steady"]
+    pending = state.get("pending", np.zeros_like(before))
+    impulse, steady, pending = reference_impulses(loads.force, (before, pending), step, spec.settling, is_paper)
     axis = 1 if spec.of == "link" else 0
     struck, rubbed = impulse.sum(axis=axis), loads.sliding.sum(axis=axis)
     num = len(struck)
