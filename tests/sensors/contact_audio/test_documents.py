@@ -36,7 +36,7 @@ HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 1
     ],
 )
 def test_mistakes_are_named_where_they_are(tmp_path, given, message):
-    with pytest.raises(SpecError, match=".") as caught:
+    with pytest.raises(SpecError, match=r".") as caught:
         plate(tmp_path, **given)
     assert message in str(caught.value)
 
