@@ -76,7 +76,10 @@ def test_every_drop_is_told_apart(drops, feature):
 
 @pytest.mark.parametrize("name", BOXES)
 def test_peaks_of_the_spectrum_are_at_modes(drops, name):
-    """Of every drop the strong peaks are each within 1 % of a mode and half its width, d/2π; at least four are in band."""
+    """Of every drop the strong peaks are each at a mode; at least four are in band.
+
+    That is within 1 %, half its width d/2π, and half of the 17 Hz that 60 ms tell apart.
+    """
     modes, decays = drops[3][name]
     assert len(modes) >= 4
     for sound in drops[0][name]:
@@ -84,7 +87,8 @@ def test_peaks_of_the_spectrum_are_at_modes(drops, name):
         frequency = np.fft.rfftfreq(1 << 15, 1 / RATE)
         peaks = frequency[find_peaks(spectrum, prominence=0.25 * spectrum.max())[0]]
         assert len(peaks) >= 4
-        assert all((np.abs(modes - peak) - 0.01 * modes - decays / (2 * np.pi)).min() < 0 for peak in peaks)
+        allowed = 0.01 * modes + decays / (2 * np.pi) + 0.5 * RATE / SPAN
+        assert all((np.abs(modes - peak) < allowed).any() for peak in peaks)
 
 
 def test_an_ear_hears_a_box_as_much_later_and_fainter_as_it_is_away():
