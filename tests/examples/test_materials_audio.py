@@ -23,7 +23,7 @@ def drops():
     touch = tgdsl.compile(EXAMPLE, sensors=BOXES, dtype="float64")
     sim = tgdsl.simulate(touch, NUM_DROPS)
     rng = np.random.default_rng(5)
-    place, height = rng.uniform(-0.07, 0.07, size=(NUM_DROPS, 2)), rng.uniform(0.05, 0.35, size=NUM_DROPS)
+    place, height = rng.uniform(-0.07, 0.07, size=(NUM_DROPS, 2)), rng.uniform(0.1, 0.4, size=NUM_DROPS)
     for i, centre in enumerate((-0.3, 0.0, 0.3)):
         ball = sim.joints[f"ball_{i + 1}"].qpos
         ball = slice(ball.start, ball.start + 3)
@@ -36,7 +36,8 @@ def drops():
         for name in BOXES:
             blocks[name].append(readings[name][:, :, 0, 0])
     found = {name: torch.cat(blocks[name], dim=1).numpy() for name in BOXES}
-    first = {name: (np.abs(own) > 0).argmax(axis=1) for name, own in found.items()}
+    loud = {name: np.abs(own) > 0.01 * np.abs(own).max(axis=1, keepdims=True) for name, own in found.items()}
+    first = {name: own.argmax(axis=1) for name, own in loud.items()}
     assert all((np.abs(own).max(axis=1) > 1e-3).all() for own in found.values()) and sim.num_envs == NUM_DROPS
     cut = {n: np.stack([own[k : k + SPAN] for own, k in zip(found[n], first[n], strict=True)]) for n in BOXES}
     balls = [sim.qpos[:, sim.joints[f"ball_{i + 1}"].qpos].numpy() for i in range(3)]
