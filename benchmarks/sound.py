@@ -128,7 +128,7 @@ def run_cpu(options: argparse.Namespace) -> None:
     force, loop = torch.rand(n, LINKS, 1), Loop(constants, n)
     state = {name: torch.zeros(n, *part.shape) for name, part in silent.plan.sensors[0].state.items()}
     states = [whole.example_state(n, seed=seed, dtype=torch.float32) for seed in range(3)]
-    compiled = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
+    compiled: list[Any] = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
 
     def advance(step: Callable[..., Any]) -> None:
         for name, value in step(force, context, constants, state)[1].items():
@@ -199,7 +199,7 @@ def run_gpu(options: argparse.Namespace) -> None:
             replay = captured(lambda core=core, of=tensors, into=memory: core(of, into), device)
             ready, ms = time.perf_counter() - start, median_ms(replay, options.repeats, device, batch=20)
         heard = next(iter(core(tensors, memory).values()))
-        assert bool(heard.isfinite().all()) and bool(heard.any()), name
+        assert bool(heard.isfinite().all()) and bool(heard.any()) == ("scrape" not in CASES[name]), name  # loads are steady
         rows.append({"case": name, "envs": options.envs, "ms": ms, "ready_s": ready})
         print(f"{name:<16}{options.envs:>8}{ms:9.4f} ms   (ready after {ready:.0f} s)", flush=True)
     write(options, {"device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu", "rows": rows})

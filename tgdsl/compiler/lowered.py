@@ -221,9 +221,10 @@ def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
 
 def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
     """Return a spec with the scene's time step, if it has a field `timestep` that is left out."""
-    if "timestep" not in type(spec).model_fields or spec.timestep is not None:  # type: ignore[attr-defined]
+    field = "timestep"
+    if field not in type(spec).model_fields or getattr(spec, field) is not None:
         return spec
-    return spec.model_copy(update={"timestep": float(resolved.scene.compiled.opt.timestep)})
+    return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
 
 
 def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:

@@ -25,7 +25,7 @@ HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 1
         ),
         ({"bodies": {"lid": MODES}}, 'sensors.s.bodies: `bodies`: no link of the sensor matches "lid"; it has plate'),
         ({"scale": "decibel"}, "`scale` is used by `outputs: bands` alone, expected it to be left out"),
-        ({"modes": []}, "at least 1 item"),
+        ({"modes": []}, "sensors.s.modes: found a list of 0, expected at least 1 entry"),
         ({"modes": [{"frequency": 100, "decay": 0}]}, "0 is out of range, expected more than 0"),
         ({"modes": [{"frequency": "100 kg", "decay": 1}]}, '"kg" is not a unit of frequency'),
         ({"modes": "stel"}, 'did you mean "steel"?'),
@@ -36,7 +36,7 @@ HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 1
     ],
 )
 def test_mistakes_are_named_where_they_are(tmp_path, given, message):
-    with pytest.raises(SpecError, match=r".") as caught:
+    with pytest.raises(SpecError) as caught:
         plate(tmp_path, **given)
     assert message in str(caught.value)
 

@@ -28,14 +28,14 @@ UNKNOWN = 1e30
 
 def impulses(force: Load, constants: Constants, state: State) -> tuple[Load, dict[str, Tensor]]:
     """Return the impulses that strike at the start of this step [N·s], and what is remembered."""
-    steady, kept = state["steady"], constants["kept"]
-    grown = (force - steady).clamp(min=0.0) * constants["step"]
+    above, kept = force - state["steady"], constants["kept"]
+    grown = above.clamp(min=0.0) * constants["step"]
     if "is_paper" in constants:
         return grown, {"steady": force}
     pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
     is_over = grown <= constants["leaked"] * pending
     impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
-    after = torch.where(is_over, force, torch.lerp(force, steady, kept))
+    after = torch.where(is_over, force, torch.addcmul(force, above, kept, value=-1))
     return impulse, {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
 
 

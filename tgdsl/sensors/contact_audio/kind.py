@@ -123,19 +123,19 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     if "noise" in constants:
         strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
         struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
-    before = state["phasors"]
-    new["phasors"] = after = _turned(before, struck, turn_of(constants, context.step[0] + context.substep), constants)
+    parts = torch.cat([state["phasors"], struck], dim=-1)
+    new["phasors"] = after = _turned(parts, turn_of(constants, context.step[0] + context.substep), constants)
     if "heard" in constants:
-        parts = torch.cat([before, struck], dim=-1)
         made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
 
-def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants) -> Tensor:
-    """Return the phasors at the end of a step, (env, row, part · mode) [N·s]."""
-    (cosine, sine), (real, imag) = turn.unbind(), phasors.chunk(2, dim=-1)
+def _turned(parts: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step, (env, row, part · mode) [N·s], of those at its start and what strikes them."""
+    (cosine, sine), modes = turn.unbind(), turn.shape[-1]
+    real, imag, struck = parts[..., :modes], parts[..., modes : 2 * modes], parts[..., 2 * modes :]
     turned = torch.addcmul(real * cosine, imag, sine, value=-1), torch.addcmul(real * sine, imag, cosine)
     after = torch.cat(turned, dim=-1)
     for grain, own in enumerate(constants["struck"].unbind()):

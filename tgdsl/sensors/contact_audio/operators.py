@@ -68,7 +68,7 @@ def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: b
 
 def radiated() -> float:
     """Return the sound pressure at 1 m per velocity of a surface of 0.01 m², ρc √(A/4π), of air at 20 °C [Pa·s/m]."""
-    return 1.204 * 343.2 * math.sqrt(0.01 / (4 * math.pi))
+    return 1.204 * 343.2 * 0.028209479177387815  # a float of a module, such as math.pi, is an input of a compiled graph
 
 
 def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
@@ -97,8 +97,8 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         "kept": np.asarray(kept),
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
-        "struck": np.concatenate([added.real, added.imag], axis=2),
-        **_rounded("turn", np.stack([turn.real, turn.imag])),
+        "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
+        **_rounded("turn", np.stack([np.real(turn), np.imag(turn)])),
     }
     if scrape > 0:
         found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
@@ -106,7 +106,11 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return found | {"energy": np.concatenate([energy, energy], axis=1)}
     free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
-    parts = [gain[..., None] * free.imag, gain[..., None] * free.real, (gain[..., None, None] * of_impulses.imag).sum(axis=1)]
+    parts = [
+        gain[..., None] * np.imag(free),
+        gain[..., None] * np.real(free),
+        (gain[..., None, None] * np.imag(of_impulses)).sum(axis=1),
+    ]
     return found | {"heard": np.concatenate(parts, axis=1)}
 
 
