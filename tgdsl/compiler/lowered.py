@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgdsl.compiler.choice import check_accuracy
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
@@ -133,6 +134,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     taxels, layout = resolved.layout_on(name)
     clean = kind.lower(spec, layout, resolved.surface_of)
     check_lowered(kind, clean, spec)
+    check_accuracy(loaded, name, clean)
     _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
         return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]

@@ -10,16 +10,17 @@ from typing import Any
 
 import torch
 
-from tgdsl.compiler.pipeline import Document, compile
+from tgdsl.compiler.pipeline import Document
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module.accuracy.variants import bare
 from tgdsl.module.module import TactileModule
 from tgdsl.report.bench.physics import measure_physics
-from tgdsl.report.bench.recording import Recording, load_recording, record, save_recording
 from tgdsl.report.bench.results import Report, Subject
-from tgdsl.report.bench.sensors import Options, Sensor, measure
+from tgdsl.report.bench.sensors import Options, measure
 from tgdsl.runtime.scripted import script_of
+from tgdsl.tuning.recording import Recording, load_recording, record, save_recording
+from tgdsl.tuning.trials import Sensor
 
 PHYSICS = "physics"
 """What the physics is called among the sensors."""

@@ -27,7 +27,7 @@ from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.scripted import Script, script_of
 
 LEAST_ENVS = 2
-"""Half of the environments choose, the other half verify."""
+"""Half of the environments choose, the others verify."""
 SWAY, PERIODS = 0.03, (0.05, 0.4)
 """Amplitude of what is added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
 REACH = (0.5, 1.1)
