@@ -30,7 +30,7 @@ class Choice:
 
     def noted(self, plan: Plan) -> Plan:
         """Return a Plan that says why its fields are what they are."""
-        sensors = [dataclasses.replace(own, notes=(*own.notes, *self.notes.get(own.sensor, ()))) for own in plan.sensors]
+        sensors = [dataclasses.replace(own, notes=(*own.notes, *self.notes.get(own.name, ()))) for own in plan.sensors]
         return dataclasses.replace(plan, sensors=tuple(sensors))
 
 
@@ -42,7 +42,7 @@ def check_chosen(loaded: Loaded, choice: Choice) -> None:
     """
     names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
     if names:
-        what = f"{listed(names)} have an `accuracy`, which takes a run of the scene"
+        what = f"{listed(names)}: `accuracy` takes a run of the scene"
         raise TgdslError(f"{loaded.source.file}: {what}; compile with `tgdsl.compile`, or set it to null")
 
 

@@ -21,20 +21,19 @@ from tgdsl.fields.accuracy import Accuracy
 from tgdsl.files.cache import cached
 from tgdsl.module.accuracy.variants import Variant, bare, is_taken
 from tgdsl.module.module import TactileModule
-from tgdsl.plan.plan import Plan
 from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.objects import query_alternatives
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.tuning.recording import Recording, record
-from tgdsl.tuning.trial import Level, Outcome, Places, Trial, cheapest, level_of, shown, shown_errors, written_fields
+from tgdsl.tuning.trial import Level, Outcome, Places, Trial, brief, cheapest, level_of, shown, shown_errors, written_fields
 from tgdsl.tuning.trials import Sensor
 
 FORMAT = 1
 """Version of how choices are made."""
-ENVS = 16
-"""Environments of the run, of which half choose and half verify; more where objects have more variants than that."""
+ENVS, STEPS = 16, 90
+"""Environments of the run, of which half choose and half verify, more where objects have more variants; and its control steps."""
 
 
 class Task(NamedTuple):
@@ -43,6 +42,7 @@ class Task(NamedTuple):
     document: Document
     overrides: Mapping[str, Any]
     kinds: Sequence[Kind]
+    sensors: Collection[str] | None
     loaded: Loaded
     wanted: Mapping[str, Accuracy]
     progress: Progress
@@ -73,22 +73,42 @@ def choose(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
-        loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
-        wanted = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
-        if not wanted:
-            return Choice()
-        task = Task(document, overrides or {}, kinds, loaded, wanted, progress or silent)
-        own = compile_plan(document, overrides, kinds, progress, sensors, Choice(notes=dict.fromkeys(wanted, ())))
-        return cached(_key(task, own), lambda: _chosen(task), _packed, _unpacked)
+        task = task_of(document, overrides, kinds, progress, sensors)
+        return cached(key_of(task), lambda: _chosen(task), packed, unpacked) if task.wanted else Choice()
 
 
-def _key(task: Task, own: Plan) -> str:
-    """Return a hash of all that a choice follows from: what the document computes now, what is asked for, and what is free."""
+def task_of(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
+) -> Task:
+    """Return what is to be chosen: see `choose`."""
+    loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
+    wanted = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
+    return Task(document, overrides or {}, kinds, sensors, loaded, wanted, progress or silent)
+
+
+def key_of(task: Task) -> str:
+    """Return a hash of all that a choice follows from: what the document computes now, what is asked for, and what is free.
+
+    Raises:
+        SpecError: What is wrong with the document.
+    """
+    unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
+    own = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
     blank = dataclasses.replace(own.origin, document_sha256="")
     specs = {"sensors": task.loaded.spec.sensors, "objects": task.loaded.spec.objects}
     written = {f"{part}.{name}": sorted(spec.model_fields_set) for part, each in specs.items() for name, spec in each.items()}
     known = {kind.name: kind.alternatives(spec) for kind, spec in _kinds(task)}
-    parts = [FORMAT, ENVS, dataclasses.replace(own, origin=blank).to_json(), {n: repr(a) for n, a in task.wanted.items()}]
+    parts = [
+        FORMAT,
+        ENVS,
+        STEPS,
+        dataclasses.replace(own, origin=blank).to_json(),
+        {n: repr(a) for n, a in task.wanted.items()},
+    ]
     parts += [written, known, query_alternatives(), {name: version(name) for name in ("tgdsl", "torch", "mujoco")}]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=repr).encode()).hexdigest()
 
@@ -99,12 +119,14 @@ def _kinds(task: Task) -> list[tuple[Kind, Any]]:
     return [(known[specs[name].kind], specs[name]) for name in task.wanted]  # type: ignore[attr-defined]
 
 
-def _packed(choice: Choice) -> dict[str, np.ndarray]:
+def packed(choice: Choice) -> dict[str, np.ndarray]:
+    """Return what a cache file holds of a choice."""
     text = json.dumps({"changes": dict(choice.changes), "notes": dict(choice.notes)})
     return {"choice": np.frombuffer(text.encode(), dtype=np.uint8)}
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
+def unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
+    """Return the choice that `packed` packed."""
     found = json.loads(arrays["choice"].tobytes())
     return Choice(found["changes"], {name: tuple(lines) for name, lines in found["notes"].items()})
 
@@ -176,7 +198,9 @@ def _states(task: Task) -> Recording:
     inputs = plan.inputs
     num_envs = max([ENVS, *(2 * num for num in (*inputs.num_variants, *inputs.num_materials))])
     try:
-        return record(TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, progress=task.progress)
+        return record(
+            TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, steps=STEPS, progress=task.progress
+        )
     except SimulationError as error:
         what = f"there are no states to measure errors on: {error}"
         at = [("sensors", name, "accuracy") for name in task.wanted]
@@ -194,14 +218,13 @@ def _notes(trial: Trial, own: Outcome, places: Places, alone: Mapping[str, Place
         for (name, errors), bound in zip(own.chosen.items(), trial.bounds.values(), strict=True)
     ]
     lines += spread
-    scales = dict(zip(trial.exact.quantities, zip(trial.exact.magnitude.scale, trial.exact.units, strict=True), strict=True))
-    changes = ", ".join(f"{name} {scale:.3g} {unit}" for name, (scale, unit) in scales.items())
+    scales = {name: (scale, unit) for name, scale, unit in zip(*_changes(trial), strict=True)}
+    changes = ", ".join(f"{name} {scale:.3g}{'' if unit == '1' else f' {unit}'}" for name, (scale, unit) in scales.items())
     lines.append(f"against {trial.exact.variant.label} in float64, on a {trial.recording.source}; largest changes: {changes}")
     lines.append(f"cheapest by count: {cost.operations} operations, {cost.constants} bytes of constants")
-    less = [other for other in trial.outcomes.values() if _cost(other) < _cost(own) and not other.is_held]
-    if less:
-        worst = [f"{other.variant.label} ({max(other.excess, other.verified_excess):.2g} times the bound)" for other in less]
-        lines.append(f"cheaper, but not within it: {', '.join(worst)}")
+    failed = sorted((other for other in trial.outcomes.values() if not other.is_held), key=_cost)
+    worst = [f"{other.variant.label} ({brief(max(other.excess, other.verified_excess))} times the bound)" for other in failed]
+    lines += [f"not within it: {', '.join(worst)}"] if worst else []
     for target, place in alone[trial.sensor.name].items():
         others = [name for name, own_places in alone.items() if own_places.get(target) == places[target]]
         if place < places[target]:
@@ -210,6 +233,10 @@ def _notes(trial: Trial, own: Outcome, places: Places, alone: Mapping[str, Place
             lines.append(f"object {target}: no coarser than written, as sensors without an accuracy feel it too")
     lines += [f"left as written: {', '.join(written)}"] if written else []
     return (lines[0], *(f"  {line}" for line in lines[1:]))
+
+
+def _changes(trial: Trial) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
+    return trial.exact.quantities, trial.exact.magnitude.scale.tolist(), trial.exact.units
 
 
 def _cost(outcome: Outcome) -> tuple[int, int]:

@@ -265,4 +265,9 @@ def shown_errors(trial: Trial, outcome: Outcome) -> str:
 
 def shown(error: float, bound: Bound) -> str:
     """Return an error in a bound's unit."""
-    return f"{error:.2g} {bound.unit}" if bound.unit else f"{100 * error:.2g} %"
+    return f"{brief(error)} {bound.unit}" if bound.unit else f"{brief(100 * error)} %"
+
+
+def brief(value: float) -> str:
+    """Return two digits of a number, and all before the point."""
+    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.2g}"

@@ -102,7 +102,9 @@ class Sensor:
             return self.own
         key = repr(sorted(variant.changes.items()))
         if key not in self.plans:
-            self.plans[key] = quiet_plan(self.document, {**self.overrides, **variant.changes}, self.name, self.kinds)
+            plan = quiet_plan(self.document, {**self.overrides, **variant.changes}, self.name, self.kinds)
+            self.module(plan, torch.float32)  # which may need a library that is missing
+            self.plans[key] = plan
         return self.plans[key]
 
     def module(self, plan: Plan, dtype: torch.dtype) -> TactileModule:

@@ -52,6 +52,7 @@ class Subject:
         magnitudes: What each quantity's errors are relative to, with its unit.
         points: The variants.
         left_out: Variants that cannot be had, and why.
+        chosen: What `accuracy` chose and why, line by line; empty: there is none.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Subject:
     magnitudes: Mapping[str, str]
     points: tuple[Measured, ...]
     left_out: tuple[tuple[str, str], ...]
+    chosen: tuple[str, ...] = ()
 
     @property
     def own(self) -> Measured:
