@@ -11,6 +11,7 @@ import tgdsl
 from tgdsl.compiler import pipeline
 from tgdsl.compiler.choice import Choice
 from tgdsl.errors import SpecError, TgdslError
+from tgdsl.files import cache
 from tgdsl.module.accuracy.errors import halves
 from tgdsl.module.artifact import save_plan
 from tgdsl.tuning import choose as choosing
@@ -125,13 +126,10 @@ def test_imperfections_change_nothing_of_it(tmp_path):
 
 
 def test_fields_and_distances_are_chosen_together(tmp_path):
-    """An elastomer on a mesh has both."""
-    made = chosen_document(
-        tmp_path, "skin: {kind: elastomer, gate: geometric, standoff: 1 mm, shear_strength: 0, accuracy: 5 %}"
-    )
-    choice = choose(made)
-    assert {*KEYS, "sensors.skin.operator"} <= choice.changes.keys() and choice.changes[KEYS[0]] == "sdf"
-    assert "dense" in choice.notes["skin"][3] and "raycast in float64" in choice.notes["skin"][3]
+    """Newton steps, 4 if nobody writes them, and how the mesh is asked."""
+    choice = choose(chosen_document(tmp_path, "force: {kind: force_taxel, gate: geometric, accuracy: 5 %}"))
+    assert choice.changes[KEYS[0]] == "sdf" and choice.changes["sensors.force.moment_iterations"] < 4
+    assert any("against 16 Newton steps, raycast in float64" in line for line in choice.notes["force"])
 
 
 def forget_choices():
@@ -252,7 +250,8 @@ def test_what_nothing_holds_names_the_best(tmp_path):
 def test_a_reading_that_never_changes_has_no_error(tmp_path):
     made = chosen_document(tmp_path, depth_at("1 %"))
     scene = made.parent / "scene.xml"
-    scene.write_text(scene.read_text().replace('pos="0 0 .0305"', 'pos="0 0 .5"').replace('ctrl="-5 .05"', 'ctrl="5 .05"'))
+    text = scene.read_text().replace('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')
+    scene.write_text(text.replace('pos="0 0 .0305"', 'pos="0 0 .5"').replace('ctrl="-5 .05"', 'ctrl="5 .05"'))
     with pytest.raises(SpecError) as caught:
         tgdsl.compile(made)
     (problem,) = caught.value.problems

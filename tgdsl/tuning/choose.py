@@ -33,7 +33,7 @@ from tgdsl.tuning.trials import Sensor
 FORMAT = 1
 """Version of how choices are made."""
 ENVS, STEPS = 16, 90
-"""Environments of the run, of which half choose and half verify, more where objects have more variants; and its control steps."""
+"""Environments of the run, of which half choose and half verify (more where objects have more variants), and control steps."""
 
 
 class Task(NamedTuple):
