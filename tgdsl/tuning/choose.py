@@ -6,8 +6,10 @@ import dataclasses
 import hashlib
 import json
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,18 +18,20 @@ import torch
 from tgdsl.compiler.choice import Choice
 from tgdsl.compiler.pipeline import Document, compile_plan
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError, Problem, SimulationError, SpecError, listed
+from tgdsl.errors import LowerError, SpecError, TgdslError
 from tgdsl.fields.accuracy import Accuracy
 from tgdsl.files.cache import cached
-from tgdsl.module.accuracy.variants import Variant, bare, is_taken
+from tgdsl.files.find import is_file
+from tgdsl.module.accuracy.variants import bare, is_taken
 from tgdsl.module.module import TactileModule
 from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.objects import query_alternatives
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
+from tgdsl.tuning.account import Shared, account
 from tgdsl.tuning.recording import Recording, record
-from tgdsl.tuning.trial import Level, Outcome, Places, Trial, brief, cheapest, level_of, shown, shown_errors, written_fields
+from tgdsl.tuning.trial import Level, Outcome, Places, Trial, cheapest, level_of
 from tgdsl.tuning.trials import Sensor
 
 FORMAT = 1
@@ -71,10 +75,21 @@ def choose(
     Raises:
         SpecError: What is wrong with the document, or an `accuracy` that nothing holds.
     """
+    if not _is_asked(document, overrides):
+        return Choice()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
         task = task_of(document, overrides, kinds, progress, sensors)
         return cached(key_of(task), lambda: _chosen(task), packed, unpacked) if task.wanted else Choice()
+
+
+def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
+    """Return whether a document may have an `accuracy`, without reading it twice; one that cannot be read has none."""
+    if "accuracy" in repr(overrides):
+        return True
+    if isinstance(document, (str, PathLike)):
+        return is_file(Path(document)) and b"accuracy" in Path(document).read_bytes()
+    return "accuracy" in repr(document)
 
 
 def task_of(
@@ -84,7 +99,11 @@ def task_of(
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
 ) -> Task:
-    """Return what is to be chosen: see `choose`."""
+    """Return what is to be chosen: see `choose`.
+
+    Raises:
+        SpecError: If so much is wrong with the document that it cannot be looked at.
+    """
     loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
     wanted = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
     return Task(document, overrides or {}, kinds, sensors, loaded, wanted, progress or silent)
@@ -101,22 +120,12 @@ def key_of(task: Task) -> str:
     blank = dataclasses.replace(own.origin, document_sha256="")
     specs = {"sensors": task.loaded.spec.sensors, "objects": task.loaded.spec.objects}
     written = {f"{part}.{name}": sorted(spec.model_fields_set) for part, each in specs.items() for name, spec in each.items()}
-    known = {kind.name: kind.alternatives(spec) for kind, spec in _kinds(task)}
-    parts = [
-        FORMAT,
-        ENVS,
-        STEPS,
-        dataclasses.replace(own, origin=blank).to_json(),
-        {n: repr(a) for n, a in task.wanted.items()},
-    ]
-    parts += [written, known, query_alternatives(), {name: version(name) for name in ("tgdsl", "torch", "mujoco")}]
+    kinds = {kind.name: kind for kind in known_kinds(task.kinds)}
+    asked = {name: task.loaded.spec.sensors[name] for name in task.wanted}
+    known = {name: kinds[spec.kind].alternatives(spec) for name, spec in asked.items()}  # type: ignore[attr-defined]
+    parts = [FORMAT, ENVS, STEPS, dataclasses.replace(own, origin=blank).to_json(), repr(task.wanted), written, known]
+    parts += [query_alternatives(), {name: version(name) for name in ("tgdsl", "torch", "mujoco")}]
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=repr).encode()).hexdigest()
-
-
-def _kinds(task: Task) -> list[tuple[Kind, Any]]:
-    known = {kind.name: kind for kind in known_kinds(task.kinds)}
-    specs = task.loaded.spec.sensors
-    return [(known[specs[name].kind], specs[name]) for name in task.wanted]  # type: ignore[attr-defined]
 
 
 def packed(choice: Choice) -> dict[str, np.ndarray]:
@@ -131,49 +140,59 @@ def unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
     return Choice(found["changes"], {name: tuple(lines) for name, lines in found["notes"].items()})
 
 
+class Found(NamedTuple):
+    """What was chosen for a sensor."""
+
+    trial: Trial
+    outcome: Outcome
+    level: Level
+
+
 def _chosen(task: Task) -> Choice:
-    """Measure and choose.
+    """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs.
 
     Raises:
         SpecError: If there is a sensor whose accuracy nothing holds, or that cannot be measured.
     """
-    recording = _states(task)
-    problems: list[Problem] = []
-    trials: dict[str, Trial] = {}
-    found: dict[str, tuple[Outcome, Variant, Level]] = {}
-    floors = _floors(task.loaded, task.wanted)
+    recording, floors = _states(task), _floors(task.loaded, task.wanted)
 
-    def attempt(name: str, work: Any) -> None:
+    def by_itself(name: str) -> Found:
+        sensor = Sensor.of(task.document, task.overrides, name, task.kinds)
+        trial = Trial(sensor, task.wanted[name], recording, task.progress)
+        return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
+
+    found = _each(task, list(task.wanted), by_itself)
+    alone = {name: own.level.places for name, own in found.items()}
+    places: dict[str, int] = {}
+    for own in alone.values():
+        places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
+
+    def with_others(name: str) -> Found:
+        trial, level = found[name].trial, level_of({target: places[target] for target in alone[name]})
+        return Found(trial, *cheapest(trial, trial.fields(), [level]))
+
+    moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
+    found |= _each(task, moved, with_others)
+    changes = {key: value for own in found.values() for key, value in own.outcome.variant.changes.items()}
+    shared = Shared(places, alone, floors)
+    return Choice(changes, {name: account(own.trial, own.outcome, shared) for name, own in found.items()})
+
+
+def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
+    """Return what work returns of each sensor.
+
+    Raises:
+        SpecError: All that it refuses, where `accuracy` stands.
+    """
+    found, problems = {}, []
+    for name in names:
         try:
-            work()
+            found[name] = work(name)
         except LowerError as error:
             problems.append(task.loaded.problem(("sensors", name, "accuracy"), error.what, error.hint))
-
-    def first(name: str, accuracy: Accuracy) -> None:
-        sensor = Sensor.of(task.document, task.overrides, name, task.kinds)
-        trial = trials[name] = Trial(sensor, accuracy, recording, task.progress)
-        found[name] = cheapest(trial, trial.fields(), trial.levels(floors))
-
-    for name, accuracy in task.wanted.items():
-        attempt(name, lambda name=name, accuracy=accuracy: first(name, accuracy))
     if problems:
         raise SpecError(problems)
-    places: dict[str, int] = {}
-    for _, _, level in found.values():
-        places |= {target: max(place, places.get(target, place)) for target, place in level.places.items()}
-
-    def again(name: str) -> None:
-        level = level_of({target: places[target] for target in found[name][2].places})
-        found[name] = cheapest(trials[name], trials[name].fields(), [level])
-
-    alone = {name: level.places for name, (_, _, level) in found.items()}
-    for name, own in alone.items():
-        if any(places[target] != place for target, place in own.items()):
-            attempt(name, lambda name=name: again(name))
-    if problems:
-        raise SpecError(problems)
-    changes = {key: value for outcome, _, _ in found.values() for key, value in outcome.variant.changes.items()}
-    return Choice(changes, {name: _notes(trials[name], own, places, alone, floors) for name, (own, _, _) in found.items()})
+    return found
 
 
 def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
@@ -201,43 +220,9 @@ def _states(task: Task) -> Recording:
         return record(
             TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, steps=STEPS, progress=task.progress
         )
-    except SimulationError as error:
+    except TgdslError as error:
         what = f"there are no states to measure errors on: {error}"
         at = [("sensors", name, "accuracy") for name in task.wanted]
         raise SpecError(
             [task.loaded.problem(path, what, "take it out, or give a scene that can be run") for path in at]
         ) from error
-
-
-def _notes(trial: Trial, own: Outcome, places: Places, alone: Mapping[str, Places], floors: Places) -> tuple[str, ...]:
-    """Return what an account of a sensor says of what was chosen, what was measured, and why."""
-    cost, written = own.cost, written_fields(trial)
-    lines = [f"accuracy {trial.accuracy}: {own.variant.label}", shown_errors(trial, own)]
-    spread = [
-        f"{name}: 99 % within {shown(errors.p99, bound)}, largest {shown(errors.largest.value, bound)}"
-        for (name, errors), bound in zip(own.chosen.items(), trial.bounds.values(), strict=True)
-    ]
-    lines += spread
-    scales = {name: (scale, unit) for name, scale, unit in zip(*_changes(trial), strict=True)}
-    changes = ", ".join(f"{name} {scale:.3g}{'' if unit == '1' else f' {unit}'}" for name, (scale, unit) in scales.items())
-    lines.append(f"against {trial.exact.variant.label} in float64, on a {trial.recording.source}; largest changes: {changes}")
-    lines.append(f"cheapest by count: {cost.operations} operations, {cost.constants} bytes of constants")
-    failed = sorted((other for other in trial.outcomes.values() if not other.is_held), key=_cost)
-    worst = [f"{other.variant.label} ({brief(max(other.excess, other.verified_excess))} times the bound)" for other in failed]
-    lines += [f"not within it: {', '.join(worst)}"] if worst else []
-    for target, place in alone[trial.sensor.name].items():
-        others = [name for name, own_places in alone.items() if own_places.get(target) == places[target]]
-        if place < places[target]:
-            lines.append(f"object {target}: as fine as {listed(others)} needs")
-        elif floors.get(target) == place:
-            lines.append(f"object {target}: no coarser than written, as sensors without an accuracy feel it too")
-    lines += [f"left as written: {', '.join(written)}"] if written else []
-    return (lines[0], *(f"  {line}" for line in lines[1:]))
-
-
-def _changes(trial: Trial) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
-    return trial.exact.quantities, trial.exact.magnitude.scale.tolist(), trial.exact.units
-
-
-def _cost(outcome: Outcome) -> tuple[int, int]:
-    return outcome.cost.operations or 0, outcome.cost.constants

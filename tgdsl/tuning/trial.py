@@ -197,8 +197,8 @@ def joined(fields: Variant, level: Level) -> Variant:
     return level.variant if not fields.changes else fields.joined(level.variant)
 
 
-def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Variant, Level]:
-    """Return the cheapest variant that holds an accuracy, and what it is of: fewest operations, then fewest bytes.
+def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Level]:
+    """Return the cheapest variant that holds an accuracy, and how it finds distances: fewest operations, then fewest bytes.
 
     Where there are choices of both, those that do not hold it beside the finest of the other kind are left out first.
 
@@ -211,14 +211,14 @@ def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -
         fields = [own for own in fields if _is_near(trial, joined(own, fine))] or fields
         finest = fields[-1]
         levels = [own for own in levels if _is_near(trial, joined(finest, own))] or levels
-    options = [(joined(own, level), own, level) for own in fields for level in levels]
+    options = [(joined(own, level), level) for own in fields for level in levels]
     costs = {option[0].label: cost for option in options if (cost := trial.cost(option[0])) is not None}
     options = [option for option in options if option[0].label in costs]
     options.sort(key=lambda option: (costs[option[0].label].operations or 0, costs[option[0].label].constants))
-    for variant, own, level in options:
+    for variant, level in options:
         outcome = trial.outcome(variant)
         if outcome is not None and outcome.is_held:
-            return outcome, own, level
+            return outcome, level
     raise _missed(trial)
 
 
