@@ -62,19 +62,19 @@ def compile_plan(
     loaded = load(document, {**(overrides or {}), **choice.changes}, known, sensors=sensors)
     resolved = resolve(loaded, tell)
     check_chosen(loaded, choice)
-    written = loaded.source.value if not choice.changes else _written(document, overrides, known, sensors)
-    plan = lower.plan(loaded, resolved, known, _origin(loaded, written), tell)
+    written = _written(document, overrides, known, sensors) if choice.changes else loaded
+    plan = lower.plan(loaded, resolved, known, _origin(written), tell)
     tell("compiling the scene")
     return choice.noted(dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own)))
 
 
 def _written(
     document: Document, overrides: Mapping[str, Any] | None, kinds: tuple[Kind, ...], sensors: Collection[str] | None
-) -> Any:
-    """Return the values of a document, what was chosen left out."""
+) -> Loaded:
+    """Return a document as it is written, what was chosen left out."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
-        return load(document, overrides, kinds, sensors=sensors).source.value
+        return load(document, overrides, kinds, sensors=sensors)
 
 
 class Placed(NamedTuple):
@@ -136,13 +136,13 @@ def placed(
     return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, found)
 
 
-def _origin(loaded: Loaded, written: Any) -> Origin:
+def _origin(loaded: Loaded) -> Origin:
     robot = loaded.robot_file
     assert robot is not None
     digest = hashlib.sha256()
     for path in xml_files(robot):
         digest.update(path.read_bytes())
-    parts = [written, loaded.layout.source.value if loaded.layout else None]
+    parts = [loaded.source.value, loaded.layout.source.value if loaded.layout else None]
     text = json.dumps(parts, sort_keys=True, default=str)
     return Origin(
         document_sha256=hashlib.sha256(text.encode()).hexdigest(),
