@@ -9,7 +9,7 @@ from chosen_pads import chosen_document
 
 import tgdsl
 from tgdsl.compiler import pipeline
-from tgdsl.compiler.choice import Choice
+from tgdsl.compiler.pipeline import Choice
 from tgdsl.errors import SpecError, TgdslError
 from tgdsl.files import cache
 from tgdsl.module.accuracy.errors import halves

@@ -7,6 +7,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from os import PathLike
 from typing import Any, NamedTuple
@@ -14,11 +15,10 @@ from typing import Any, NamedTuple
 import mujoco
 
 from tgdsl.compiler import lower
-from tgdsl.compiler.choice import Choice, check_chosen
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import Unfelt
@@ -31,6 +31,26 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
 
 Document = str | PathLike[str] | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen.
+
+    Attributes:
+        changes: Fields that nobody wrote, by dotted path: `objects.mug.tolerance`.
+        notes: What an account of each sensor that has an `accuracy` says of it, line by line.
+    """
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def noted(self, plan: Plan) -> Plan:
+        """Return a Plan that says why its fields are what they are."""
+        sensors = [dataclasses.replace(own, notes=(*own.notes, *self.notes.get(own.name, ()))) for own in plan.sensors]
+        return dataclasses.replace(plan, sensors=tuple(sensors))
+
+
 UNCHOSEN = Choice()
 """Of documents without an `accuracy`."""
 
@@ -61,11 +81,23 @@ def compile_plan(
     known, tell = known_kinds(kinds), progress or silent
     loaded = load(document, {**(overrides or {}), **choice.changes}, known, sensors=sensors)
     resolved = resolve(loaded, tell)
-    check_chosen(loaded, choice)
+    _check_chosen(loaded, choice)
     written = _written(document, overrides, known, sensors) if choice.changes else loaded
     plan = lower.plan(loaded, resolved, known, _origin(written), tell)
     tell("compiling the scene")
     return choice.noted(dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own)))
+
+
+def _check_chosen(loaded: Loaded, choice: Choice) -> None:
+    """Refuse a document some `accuracy` of which nobody has looked at.
+
+    Raises:
+        TgdslError: With the sensors.
+    """
+    names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
+    if names:
+        what = f"{listed(names)}: `accuracy` takes a run of the scene"
+        raise TgdslError(f"{loaded.source.file}: {what}; compile with `tgdsl.compile`, or set it to null")
 
 
 def _written(

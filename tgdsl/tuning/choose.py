@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from tgdsl.compiler.choice import Choice
-from tgdsl.compiler.pipeline import Document, compile_plan
+from tgdsl.compiler.pipeline import Choice, Document, compile_plan
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, SpecError, TgdslError
 from tgdsl.fields.accuracy import Accuracy
