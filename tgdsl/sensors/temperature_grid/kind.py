@@ -70,6 +70,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
                 f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
             )
     constants = tables(count, size, spec.exposed) | {
+        "box": np.concatenate([boxes[:, 0], size / count, count], axis=1),
         "conductivity": np.array([own.conductivity for own in made_of]),
         "volumetric_heat": np.array([own.density * own.specific_heat for own in made_of]),
         "ambient": scalar(spec.ambient),
@@ -84,6 +85,8 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         constants["convection"] = scalar(spec.convection)
     if spec.source is not None:
         constants |= _source(spec, count, size)
+    if "source" in constants:
+        constants["power"] = constants["source"].sum(axis=(1, 2, 3))
     shape = there.shape
     state = {"cells": Memory(shape=shape), "cells_low": Memory(shape=shape)}
     if spec.feels:
