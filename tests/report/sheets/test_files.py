@@ -22,7 +22,7 @@ def sheet():
 def test_files_have_every_number_and_a_plot_of_each(tmp_path):
     written = write_sheet(sheet(), tmp_path)
     assert [file.name for file in written] == ["oracles.csv", "oracles.json", "oracles.html"]
-    rows = list(csv.DictReader(written[0].open()))
+    rows = list(csv.DictReader(written[0].read_text().splitlines()))
     assert [row["section"] for row in rows] == ["filters", "filters", "loads"]
     assert float(rows[0]["paper_error"]) > 0.6 and rows[0]["holds"] == "True"
     told = json.loads(written[1].read_text())["entries"]
