@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from tgdsl.errors import TgdslError
 from tgdsl.report.oracles import (
+    bodies,
     cooling,
     filters,
     forces,
@@ -33,6 +34,7 @@ FIELDS: Mapping[str, tuple[Oracle, ...]] = {
     "contact mechanics: friction": friction.ORACLES,
     "forces: contacts": forces.ORACLES,
     "forces: depth and velocity": kinematic.ORACLES,
+    "forces: bodies and bits": bodies.ORACLES,
     "geometry": geometry.ORACLES,
     "proximity": proximity.ORACLES,
     "noise": noise.ORACLES,
