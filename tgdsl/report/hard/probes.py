@@ -196,7 +196,9 @@ def needles() -> trimesh.Trimesh:
 def twins() -> trimesh.Trimesh:
     """Return two boxes that share a face, both of whose copies are there."""
     parts = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (-0.01, 0.01)]
-    return trimesh.util.concatenate(parts)
+    found = trimesh.util.concatenate(parts)
+    assert isinstance(found, trimesh.Trimesh)
+    return found
 
 
 Probes = list[tuple[float, float, float]]

@@ -16,15 +16,15 @@ from tgdsl.compiler.pipeline import compile
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 
-Contact = tuple[Sequence[float], Sequence[float], float]
+Contact = tuple[Sequence[Any], Sequence[Any], float | int]
 """A point [m], a normal out of the object, and a normal force [N]."""
 
 
 def heat_module(
     folder: Path,
-    links: Mapping[str, Sequence[float]],
+    links: Mapping[str, Sequence[Any]],
     sensor: Mapping[str, Any],
-    objects: Mapping[str, tuple[Sequence[float] | None, Mapping[str, Any]]] | None = None,
+    objects: Mapping[str, tuple[Sequence[Any] | None, Mapping[str, Any]]] | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> TactileModule:
     """Return a module with one sensor, `heat`, on boxes.
@@ -55,7 +55,10 @@ def heat_module(
 
 
 def heat_state(
-    module: TactileModule, dt: float, contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None, num_envs: int = 1
+    module: TactileModule,
+    dt: float | int,
+    contacts: Mapping[tuple[str, str], Sequence[Contact]] | None = None,
+    num_envs: int = 1,
 ) -> SceneState:
     """Return a state whose bodies are all at the origin, with contacts by (link, object), in the world's axes."""
     inputs, values = module.inputs, dict[str, Any]()
@@ -79,7 +82,7 @@ def heat_state(
 
 
 def face_contacts(
-    sides: Sequence[float], height: float, normal: Sequence[float] = (0, 0, 1), force: float = 1.0
+    sides: Sequence[Any], height: float, normal: Sequence[Any] = (0, 0, 1), force: float | int = 1.0
 ) -> list[Contact]:
     """Return contacts at the corners of a rectangle across z, about the origin, at a height [m]."""
     x, y = 0.5 * sides[0], 0.5 * sides[1]

@@ -17,7 +17,7 @@ from tgdsl.report.oracles.scenes import compiled, folder, points, probed, state
 
 KINDS = ("geometry", "contact_depth", "surface_distance")
 THIRD = 1 / np.sqrt(3)
-Row = tuple[str, tuple[float, ...], tuple[float, ...], float, tuple[float, ...]]
+Row = tuple[str, tuple[float | int, ...], tuple[float | int, ...], float, tuple[float | int, ...]]
 KNOWN: tuple[Row, ...] = (
     ("plane", (0, 0, 0), (5, -3, -2), -2.0, (0, 0, 1)),
     ("sphere", (2, 0, 0), (0, 0, 0), -2.0, (1, 0, 0)),
@@ -56,7 +56,7 @@ HALF, REACH = 0.02, 0.01
 
 
 def distances(
-    shape: str, size: tuple[float, ...], pos: np.ndarray, dtype: torch.dtype = torch.float64
+    shape: str, size: tuple[float | int, ...], pos: np.ndarray, dtype: torch.dtype = torch.float64
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return this package's signed distances (point,) [m] and their gradients (point, 3) [1]."""
     p, s = torch.tensor(pos, dtype=dtype), torch.tensor(size, dtype=dtype)
@@ -124,7 +124,7 @@ Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Points of a surface, outward normals there, and how deep a point stays the nearest one [m]."""
 
 
-def surface_points(shape: str, size: tuple[float, ...], rng: np.random.Generator, num: int) -> Surface:
+def surface_points(shape: str, size: tuple[float | int, ...], rng: np.random.Generator, num: int) -> Surface:
     """Return random points of a primitive's surface."""
     whole = np.array(size)
     if shape == "plane":
@@ -169,7 +169,7 @@ def _cylinder_points(size: np.ndarray, rng: np.random.Generator, num: int) -> Su
     return rho[:, None] * radial + height[:, None] * [0, 0, 1], normal, depth
 
 
-def at_known_distances(shape: str, size: tuple[float, ...], num: int = 100_000) -> Comparison:
+def at_known_distances(shape: str, size: tuple[float | int, ...], num: int = 100_000) -> Comparison:
     """Return distances and directions of points built at known ones, in float64 and float32, over the shape's size.
 
     A point X of a surface with outward normal n, moved by t along n, is at the distance t as long as X stays the nearest

@@ -55,7 +55,7 @@ class Noise:
         channels: Sequence[str] = ("depth",),
         *,
         num_envs: int = 1,
-        dt: float = 0.0,
+        dt: float | int = 0.0,
         seed: int = 0,
         name: str = "touch",
         first_env: int = 0,
@@ -83,7 +83,7 @@ class Noise:
         """Return the definition, for each environment."""
         return [ReferenceNoise(self._rows, self.channels, self.key, int(env), self.layout) for env in self.env]
 
-    def now(self, dt: float = 0.0, is_sample: Tensor | None = None) -> stages.Now:
+    def now(self, dt: float | int = 0.0, is_sample: Tensor | None = None) -> stages.Now:
         """Return the circumstances of the next call."""
         step, drawn = torch.full((self.num_envs,), self.step), {}
         if self.lowered.streams:
@@ -92,7 +92,7 @@ class Noise:
             torch.tensor(dt, dtype=self.dtype), step[:, None], self.age[:, None], self.ages + dt, is_sample, None, drawn
         )
 
-    def read(self, signal: Any, dt: float = 0.0, is_sample: Tensor | None = None) -> Tensor:
+    def read(self, signal: Any, dt: float | int = 0.0, is_sample: Tensor | None = None) -> Tensor:
         """Return what is read of a signal, which is broadcast to (env, row, channel)."""
         shape = (self.num_envs, self.layout.num_taxels, len(self.channels))
         signal = torch.as_tensor(signal, dtype=self.dtype).expand(shape).transpose(1, 2)
@@ -116,17 +116,17 @@ class Noise:
         self.age[env_ids] = 0
 
 
-def one(noise: Noise, signal: Sequence[float], dt: float) -> np.ndarray:
+def one(noise: Noise, signal: Sequence[Any], dt: float | int) -> np.ndarray:
     """Return what one environment's only channel reads of a signal over time, the same in all its rows (call, row)."""
     return np.stack([noise.read(value, dt)[0, :, 0].numpy() for value in signal])
 
 
-def uniform_distance(sample: np.ndarray, low: float, high: float) -> float:
+def uniform_distance(sample: np.ndarray, low: float | int, high: float | int) -> float:
     """Return √N times the largest distance of the sample's distribution from the uniform one (Kolmogorov and Smirnov)."""
     return _distance((np.sort(sample, axis=None) - low) / (high - low))
 
 
-def normal_distance(sample: np.ndarray, deviation: float) -> float:
+def normal_distance(sample: np.ndarray, deviation: float | int) -> float:
     """Return √N times the largest distance of the sample's distribution from a normal one of mean 0."""
     return _distance(ndtr(np.sort(sample, axis=None) / deviation))
 
@@ -147,6 +147,6 @@ def correlation(a: np.ndarray, b: np.ndarray) -> float:
     return math.sqrt(a.size) * float((a @ b) / math.sqrt((a @ a) * (b @ b)))
 
 
-def standard_errors(found: float, expected: float, error: float) -> float:
+def standard_errors(found: float | int, expected: float | int, error: float | int) -> float:
     """Return how many standard errors a number is from what is expected."""
     return abs(found - expected) / error

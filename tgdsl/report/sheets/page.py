@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from tgdsl.console.tables import text_table
 from tgdsl.report.bench.page import STYLE, svg_of
-from tgdsl.report.defects import DEFECTS, Answer, answers
+from tgdsl.report.defects import DEFECTS, Answer, Defect, answers
 from tgdsl.report.sheets.sheet import Entry, Section, Sheet
 
 GRID = """
@@ -92,7 +92,7 @@ def _findings(sheet: Sheet) -> str:
     return "\n".join([f'<section id="findings"><h2>Findings</h2><p>{about}</p>', *rows, "</table></section>"])
 
 
-def _answered(sheet: Sheet) -> list[tuple[object, Answer | None]]:
+def _answered(sheet: Sheet) -> list[tuple[Defect, Answer | None]]:
     found = answers((entry.title, entry.figure, entry.defects) for entry in sheet.entries)
     return [(defect, found.get(defect.number)) for defect in DEFECTS]
 
