@@ -1,6 +1,6 @@
 """The batched noise alone, fed a signal of our choice call by call; layouts for crosstalk; bounds of statistics."""
 
-from tgdsl.report.oracles.signals import (
+from tgdsl.report.oracles.setups.signals import (
     KOLMOGOROV,
     MM,
     Noise,

@@ -119,7 +119,7 @@ def test_derivatives_with_respect_to_the_radius():
 
 
 def test_lists_hold_every_point_within_reach():
-    cloud, pos = sample_cloud([CUBE], R, 3000), places(300, reach=0.05)
+    cloud, pos = sample_cloud([CUBE], R, 3000), places(300, extent=0.05)
     for radius in (R, 0.6 * R):
         way = cloud.points[None] - pos[:, None]
         weight = cloud.weight * np.maximum(radius - np.linalg.norm(way, axis=2), 0)

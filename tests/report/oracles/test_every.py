@@ -6,7 +6,8 @@ from held import assert_holds
 
 from tgdsl.errors import TgdslError
 from tgdsl.report.defects import DEFECTS
-from tgdsl.report.oracles import every, half_space
+from tgdsl.report.oracles import every
+from tgdsl.report.oracles.contact_mechanics import half_space
 from tgdsl.report.oracles.results import Comparison, along, array, cases
 from tgdsl.sensors import KINDS
 

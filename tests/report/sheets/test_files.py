@@ -9,7 +9,8 @@ import numpy as np
 from tgdsl.report.defects import DEFECTS, answers
 from tgdsl.report.hard import every as hard
 from tgdsl.report.hard.results import Allowed, HardCase
-from tgdsl.report.oracles import every, filters, half_space
+from tgdsl.report.oracles import every, filters
+from tgdsl.report.oracles.contact_mechanics import half_space
 from tgdsl.report.sheets.files import write_sheet
 from tgdsl.report.sheets.page import sheet_page, sheet_text
 

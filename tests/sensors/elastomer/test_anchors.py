@@ -10,7 +10,7 @@ from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.quantities.geoms.distance import Frame
-from tgdsl.report.oracles import friction
+from tgdsl.report.oracles.contact_mechanics import friction
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
 STICK_SLIP = StickSlip(0.0, 1e-5, 1e-4, None)

@@ -8,8 +8,8 @@ from scenes import module, state
 
 import tgdsl
 from tgdsl.errors import SpecError
-from tgdsl.report.oracles import markers
-from tgdsl.report.oracles.markers import BALL, ELASTIC, PROBES, pressed
+from tgdsl.report.oracles.contact_mechanics import markers
+from tgdsl.report.oracles.contact_mechanics.markers import BALL, ELASTIC, PROBES, pressed
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.testing import SCENE, KindConformance, assert_agrees
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import Document, OptionalFile, Overrides, parsed_overrides
+from tgdsl.commands.arguments import FILE, OptionalFile, Overrides, parsed_overrides
 
 if TYPE_CHECKING:
     from tgdsl.report.bench.bench import Bench as Work
@@ -31,7 +31,7 @@ class Bench:
     Errors are of states of the document's own scene, run as by `tgdsl run`, against the finest variant in float64.
     """
 
-    document: Document | None = None
+    document: Annotated[tyro.conf.Positional[Path | None], FILE] = None
     """The YAML document; not for `--oracles` and `--hard`."""
     oracles: bool = False
     """Compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""

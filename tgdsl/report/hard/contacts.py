@@ -17,8 +17,8 @@ from tgdsl.report.hard.results import Allowed, Case, HardCase
 from tgdsl.report.hard.scene import DTYPES, pair_of, quiet, worst_of
 from tgdsl.report.oracles.filters import STRENGTH, TAU
 from tgdsl.report.oracles.forces import made_up
-from tgdsl.report.oracles.scenes import compiled, folder, pad, points, probed, state
-from tgdsl.report.oracles.signals import Noise, one
+from tgdsl.report.oracles.setups.scenes import compiled, folder, pad, points, probed, state
+from tgdsl.report.oracles.setups.signals import Noise, one
 
 STEPS = (1e-6, 1e-4, 1e-2, 1.0, 10.0)
 """Seconds between calls."""

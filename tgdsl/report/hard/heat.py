@@ -11,8 +11,8 @@ import torch
 from tgdsl.fields.materials import MATERIALS
 from tgdsl.report.hard.results import Allowed, Case, HardCase
 from tgdsl.report.hard.scene import DTYPES
-from tgdsl.report.oracles.boxes import begin, heat_module, heat_state
-from tgdsl.report.oracles.scenes import compiled, folder
+from tgdsl.report.oracles.setups.boxes import begin, heat_module, heat_state
+from tgdsl.report.oracles.setups.scenes import compiled, folder
 
 STEPS = (1e-4, 0.01, 1.0, 10.0)
 """Seconds between calls."""

@@ -20,7 +20,7 @@ from tgdsl.report.hard.results import Allowed, Case, HardCase
 from tgdsl.report.hard.scene import DTYPES, quiet
 from tgdsl.report.hard.trembling import jittered
 from tgdsl.report.oracles.geometry import mesh_scene
-from tgdsl.report.oracles.scenes import probed, state
+from tgdsl.report.oracles.setups.scenes import probed, state
 
 GEOMS = tuple(HARD)
 NAMES = tuple(geom.split('"')[1] for geom in GEOMS)

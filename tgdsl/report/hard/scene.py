@@ -19,7 +19,7 @@ from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
-from tgdsl.report.oracles.scenes import folder
+from tgdsl.report.oracles.setups.scenes import folder
 from tgdsl.schema.load import load
 from tgdsl.sensors import KINDS
 

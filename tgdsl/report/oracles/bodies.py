@@ -6,7 +6,7 @@ import numpy as np
 
 from tgdsl.report.oracles.forces import AT_REST, AXES, MASS, G
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import folder, pad, probed, settled, state
+from tgdsl.report.oracles.setups.scenes import folder, pad, probed, settled, state
 
 
 def link_weight() -> Comparison:

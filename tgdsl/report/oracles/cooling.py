@@ -10,9 +10,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles.boxes import begin, heat_module, heat_state
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import folder
+from tgdsl.report.oracles.setups.boxes import begin, heat_module, heat_state
+from tgdsl.report.oracles.setups.scenes import folder
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 
 ALUMINIUM = MATERIALS["aluminium"]

@@ -8,21 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from tgdsl.errors import TgdslError
-from tgdsl.report.oracles import (
-    bodies,
-    cooling,
-    filters,
-    forces,
-    friction,
-    geometry,
-    half_space,
-    heat,
-    kinematic,
-    layer,
-    markers,
-    noise,
-    proximity,
-)
+from tgdsl.report.oracles import bodies, cooling, filters, forces, geometry, heat, kinematic, noise, proximity
+from tgdsl.report.oracles.contact_mechanics import friction, half_space, layer, markers
 from tgdsl.report.oracles.results import Comparison, Oracle
 from tgdsl.report.sheets.sheet import Entry, Section, Sheet
 from tgdsl.view.style import FAINT, INK

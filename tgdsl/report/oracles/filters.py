@@ -11,7 +11,7 @@ import torch
 from tgdsl.layout.layout import Layout
 from tgdsl.report.oracles.noise import DT, KINDS
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.signals import MM, Noise, make_layout, one
+from tgdsl.report.oracles.setups.signals import MM, Noise, make_layout, one
 from tgdsl.sensors.noise.lower import crosstalk_kernel
 
 EXACT = 1e-12

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import TAXELS, compiled, folder, pad, points, settled, wrench
+from tgdsl.report.oracles.setups.scenes import TAXELS, compiled, folder, pad, points, settled, wrench
 from tgdsl.runtime.simulate import simulate
 
 G = 9.81

@@ -13,7 +13,7 @@ from tgdsl.geometry.planes import split
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.module.state import SceneState
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import compiled, folder, points, probed, state
+from tgdsl.report.oracles.setups.scenes import compiled, folder, points, probed, state
 
 KINDS = ("geometry", "contact_depth", "surface_distance")
 THIRD = 1 / np.sqrt(3)

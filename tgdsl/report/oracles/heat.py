@@ -10,9 +10,9 @@ import torch
 from scipy.special import erfc
 
 from tgdsl.fields.materials import MATERIALS
-from tgdsl.report.oracles.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import folder
+from tgdsl.report.oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
+from tgdsl.report.oracles.setups.scenes import folder
 from tgdsl.sensors.temperature_grid.shares import Boxes, conductances
 
 STEEL = MATERIALS["steel"]

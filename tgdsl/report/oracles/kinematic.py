@@ -13,7 +13,7 @@ import torch
 
 from tgdsl.report.oracles.forces import MASS, PAPER, G
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import folder, module, pad, probed, settled, state, wrench
+from tgdsl.report.oracles.setups.scenes import folder, module, pad, probed, settled, state, wrench
 from tgdsl.runtime.simulate import simulate
 
 BOX = '<geom type="box" size=".02 .02 .02"/>'

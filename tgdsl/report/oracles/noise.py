@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.signals import (
+from tgdsl.report.oracles.setups.signals import (
     KOLMOGOROV,
     MM,
     Noise,

@@ -18,7 +18,7 @@ from tgdsl.quantities.moments.clouds import sample_cloud
 from tgdsl.quantities.moments.fields import bake_field, moment_sums, surface_area
 from tgdsl.quantities.moments.moments import MomentField, PointCloud, cloud_moments, field_moments, plane_moments
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import probed, state
+from tgdsl.report.oracles.setups.scenes import probed, state
 from tgdsl.surfaces.geom import Geom, SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 from tgdsl.surfaces.surface import Surface
@@ -37,7 +37,7 @@ SOURCE = "Chung et al., appendix, ProximityTaxel; S0 and S1 by hand"
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 
 
-def felt(shape: str, size: Sequence[float], pos: Sequence[float] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
+def felt(shape: str, size: Sequence[Any], pos: Sequence[Any] = (0, 0, 0), surface: Surface | None = None) -> SurfaceGeom:
     """Return an object's geom of some size [m] at a place [m]."""
     whole = np.array([*size, 0, 0][:3], float)
     kind = "mesh" if surface is not None else shape
@@ -67,7 +67,7 @@ def sphere_moments(pos: np.ndarray, b: float = 0.02, radius: float = R) -> np.nd
     return np.array(found)
 
 
-def box_moments(pos: np.ndarray, half: Sequence[float], radius: float = R, num: int = 120) -> np.ndarray:
+def box_moments(pos: np.ndarray, half: Sequence[Any], radius: float = R, num: int = 120) -> np.ndarray:
     """Return S0 and S1 (point, 4) of a box by midpoint sums over each face."""
     found = np.zeros((len(pos), 4))
     for axis in range(3):

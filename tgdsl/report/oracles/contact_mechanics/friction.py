@@ -10,7 +10,7 @@ import torch
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.geoms.distance import Frame
-from tgdsl.report.oracles.half_space import KINDS
+from tgdsl.report.oracles.contact_mechanics.half_space import KINDS
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from scipy.integrate import solve_bvp
 
-from tgdsl.report.oracles.half_space import KINDS, G
+from tgdsl.report.oracles.contact_mechanics.half_space import KINDS, G
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
 from tgdsl.sensors.elastomer.bonded_layer import Layer, profiles, response, tabulated
 from tgdsl.sensors.elastomer.half_space import half_space

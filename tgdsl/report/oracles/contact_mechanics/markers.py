@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from tgdsl.report.oracles.half_space import KINDS
+from tgdsl.report.oracles.contact_mechanics.half_space import KINDS
 from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
-from tgdsl.report.oracles.scenes import probed, state
+from tgdsl.report.oracles.setups.scenes import probed, state
 from tgdsl.sensors.elastomer.blocks import responses
 from tgdsl.sensors.elastomer.half_space import half_space, patch_radius
 from tgdsl.sensors.elastomer.kernels import Gaussian, LinkTaxels, offset
