@@ -31,10 +31,10 @@ FIELDS: Mapping[str, tuple[Oracle, ...]] = {
 }
 """The oracles of each field."""
 OURS, PAPER = "#1f6f8b", "#c0392b"
-HEADER = ("comparison", "quantity", "largest exact", "error", "allowed", "error of the paper's", "source")
+HEADER = ("comparison", "quantity", "largest exact", "error", "of allowed", "error of the paper's", "source")
 ABOUT = (
     "Each quantity as tgdsl computes it, its exact value, and the paper's formula (Chung et al., Tactile Genesis) where it "
-    "differs. Errors are absolute, in the quantity's unit, the largest of all points; `allowed` is the share of what may be "
+    "differs. Errors are absolute, in the quantity's unit, the largest of all points; `of allowed` is the share of what may be "
     "off there, and holds up to 1."
 )
 
