@@ -59,7 +59,7 @@ def compile_plan(
     resolved = resolve(loaded, tell)
     plan = lower.plan(loaded, resolved, known, _origin(loaded), tell)
     tell("compiling the scene")
-    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
+    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives))
 
 
 class Placed(NamedTuple):

@@ -124,6 +124,8 @@ def compile_sensed(
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
+    if spec.physics.collision is not None:
+        overrides["robot.collision"] = spec.physics.collision
     felt, felts = None, {}
     if feels is not None:
         felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}
