@@ -27,12 +27,12 @@ from tgdsl.surfaces.convex import hull_planes
 from tgdsl.surfaces.surface import Surface
 
 MM = 1e-3
-TOUCHED_SCALE, REST_SCALE = 0.5, 2.0
+TOUCHED_SCALE, REST_SCALE = 0.5, 3.0
 """Distances that count alike where objects touch the link and elsewhere [mm]."""
 CONE = 60.0
 """Largest angle between a surface's normal and a direction that objects come from [deg]."""
 NUM_SAMPLES = 1500
-MOST_STEPS = 30
+MOST_STEPS = 40
 STRAY, STRAY_TURN = 8.0, 30.0
 """How far the fit may move a primitive's numbers from the table's [mm], [deg]."""
 _LINE = np.linspace(-1, 1, 9)
@@ -217,15 +217,15 @@ def fitted(link: Link, surface: Surface) -> list[Collider]:
         whole[free] = chosen
         return np.split(whole, ends)
 
-    def residuals(chosen: np.ndarray, power: int) -> np.ndarray:
+    def residuals(chosen: np.ndarray, power: float) -> np.ndarray:
         placed = all_placed(link, numbers(chosen))
         found = distance(placed, points.pos).min(axis=0) / scale
         edges = sharp(placed, planes) / (TOUCHED_SCALE * MM)
-        return np.concatenate([np.sign(found) * np.abs(found) ** power, edges**power])
+        return np.concatenate([np.sign(found) * np.abs(found) ** np.where(points.is_touched, power, 2), edges**power])
 
     chosen = np.concatenate(start)[free]
     low, high = (np.concatenate([_bound(own, sign) for own in link.primitives])[free] for sign in (-1, 1))
-    for power in (2, 3):
+    for power in (2, 3, 4):
         made = least_squares(
             residuals, chosen, bounds=(low, high), x_scale=1.0, diff_step=1e-5, max_nfev=MOST_STEPS, args=(power,)
         )
@@ -360,11 +360,16 @@ def write(model: Path, links: Mapping[str, Link]) -> None:
     for name, link in links.items():
         found[name] = fitted(link, surface_of(robot, name))
         print(row(name, found[name], deviations(link, found[name], surface_of(robot, name))))
+    save(found, robot, model.parent)
+
+
+def save(found: Mapping[str, Sequence[Collider]], robot: Model, folder: Path) -> None:
+    """Write the colliders of the links with each mesh, and those of the left hand, into a folder."""
     placed = {body: found[mesh] for body, mesh in meshes(robot).items() if mesh in found}
     mirror = Mirror()
     others = {mirror.renamed(body): [mirrored(own, mirror) for own in parts] for body, parts in placed.items()}
     for name, bodies in (("colliders.yaml", placed), ("colliders_left.yaml", others)):
-        (model.parent / name).write_text(text(bodies, model.parent.name), encoding="utf-8")
+        (folder / name).write_text(text(bodies, folder.name), encoding="utf-8")
 
 
 def mirrored(own: Collider, mirror: Mirror) -> Collider:

@@ -63,22 +63,26 @@ INDEX_BEND = Link(
 THUMB_FRONT, THUMB_END = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 THUMB_BEND = Link(
     primitives=(
-        Primitive("box", (0, 14, 0), (8.5, 20, 7.6), is_core=True),
-        Primitive("box", (0, 28, 0), (9.5, 8, 8.5)),
+        Primitive("box", (-0.4, 14, -1), (8, 19, 6), is_core=True),
+        Primitive("capsule", (2.8, 0, 1.8), (6,), (3.4, 27, 2.4), is_pair=True),
     ),
     touched=(THUMB_FRONT,),
     region=((-20, -2, 0), (20, 30, 20)),
+    lateral=0,
+    middle=-0.4,
 )
 THUMB_LINK1 = Link(
     primitives=(
         Primitive("box", (0, 28, 3), (17.0, 18.5, 8.5), is_core=True),
         Primitive("box", (-7, 2, 0), (7, 8, 9.5)),
         Primitive("box", (9, 54, 0), (5, 8, 10)),
+        Primitive("capsule", (-12.5, 16, 6), (5,), (-12.5, 42, 6)),
+        Primitive("capsule", (12.5, 16, 6), (5,), (12.5, 42, 6)),
         Primitive("capsule", (-6, 18, -5), (11,), (-6, 38, -6)),
         Primitive("capsule", (6, 18, -5), (11,), (6, 38, -6)),
     ),
     touched=(THUMB_FRONT,),
-    region=((-20, 11, 0), (20, 46, 20)),
+    region=((-20, 13, 0), (20, 45, 20)),
 )
 THUMB_LINK2 = Link(
     primitives=(
