@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
@@ -22,8 +22,8 @@ from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import WINDOW, Memory, kept, store
-from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows
+from tgdsl.module.memory.memory import Memory, kept, store
+from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows, rows_of
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
 from tgdsl.module.sensing import Sensing, sense
@@ -156,13 +156,24 @@ class TactileModule(HookedModule):
         tensors, num_envs = self._tensors(state)
         step = "advance"
         if mask is not None or env_ids is not None:
-            step, tensors["mask"] = "advance_some", self._chosen(mask, env_ids, num_envs)
+            step, tensors["mask"] = "advance_some", self.incoming.chosen(mask, env_ids, num_envs, self.device)
+            self.memory.keep_last(num_envs)
         else:
             self.memory.keep_no_other(num_envs)
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
         readings = self._run(step, tensors, memory)
         self.hand_out(readings)
-        return self._with_views(readings)
+        return self.memory.with_views(readings)
+
+    def read_few(self, state: SceneState, rows: Int[Tensor, " n"], num_envs: int) -> dict[str, Tensor]:
+        """Do what a call with a mask of so many environments does, from a state of some alone, which `few_rows` has named."""
+        self.constants.refresh()
+        tensors = self.incoming.tensors(state, self.dtype, self.device)
+        self.memory.keep_last(num_envs)
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        readings = read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
+        self.hand_out(readings)
+        return self.memory.with_views(readings)
 
     def hand_out(self, readings: Mapping[str, Tensor]) -> None:
         """Note what a call has handed out; for who replays a captured graph of calls in their place."""
@@ -204,17 +215,11 @@ class TactileModule(HookedModule):
             raise StateError(f"{what}; `free()` lets go of it")
         return tensors, num_envs
 
-    def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
-        """Return which environments are read, and see to it that there is something to read of the others."""
-        chosen = self.incoming.chosen(mask, env_ids, num_envs, self.device)
-        self.memory.keep_last(num_envs)
-        return chosen
-
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
         rows = few_rows(tensors["mask"]) if name == "advance_some" else None
         if rows is not None:
-            return read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
+            return read_rows(self.calls.of(self.flat_core), rows, rows_of(tensors, rows), memory)
         found = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: found[name] for name in self.plan.readings()}
 
@@ -378,11 +383,6 @@ class TactileModule(HookedModule):
 
     def _explained(self) -> Explained:
         return Explained(self.plan, self._quantities, self.constants, self.memory, self.core)
-
-    def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Put the memory itself in the place of stacks that are declared as views."""
-        views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
-        return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all tensors; a captured graph has read the old ones.

@@ -49,6 +49,7 @@ class Memory(HookedModule):
             for name, reading in readings.items()
             if name not in stacks
         }
+        self._views = [reading.name for s in sensors if s.history and s.history.view for reading in s.windows]
         self._last: dict[str, tuple[Tensor, int]] = {}
         self._is_filled = False  # whether what is kept was handed out
         self.keeps_last = False
@@ -111,6 +112,10 @@ class Memory(HookedModule):
         self._last = {}
         if not self._is_filled:
             self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in readings.items()}
+
+    def with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Put the memory itself in the place of stacks that are declared as views."""
+        return readings | {name: self.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in self._views}
 
     def keep_last(self, num_envs: int) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.

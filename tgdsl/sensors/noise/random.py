@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt
+from jaxtyping import Float, Int, UInt
 from torch import Tensor
 
 from tgdsl.geometry.planes import pi
@@ -98,6 +98,14 @@ def uniform(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> Tensor:
 def _share(word: Int[Tensor, "*row taxel"], num_bits: int, dtype: torch.dtype) -> Tensor:
     """Return the middle of one of 2ⁿ equal parts of 0 to 1, by a word's first n bits."""
     return ((word >> (32 - num_bits)) & (2**num_bits - 1)).to(dtype) * 2.0**-num_bits + 2.0 ** -(num_bits + 1)
+
+
+def uniform_on_host(word: UInt[np.ndarray, "*row"]) -> Float[np.ndarray, "*row"]:
+    """Return `uniform` of words, uint32, in NumPy: float32."""
+    share = (word >> np.uint32(32 - UNIFORM_BITS)).astype(np.float32)
+    share *= np.float32(2.0**-UNIFORM_BITS)
+    share += np.float32(2.0 ** -(UNIFORM_BITS + 1))
+    return share
 
 
 def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
