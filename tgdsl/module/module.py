@@ -356,7 +356,7 @@ class TactileModule(HookedModule):
         self.calls.compile(graph, **{**defaults, **options})
         return self
 
-    def inductor_options(self) -> dict[str, bool]:
+    def inductor_options(self) -> dict[str, Any]:
         """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
         return inductor_options(self.plan, self._quantities)
 

@@ -232,6 +232,7 @@ class Quantity:
         num_rows: `(part, use) → rows` of memory with one per row of the value, for `Memory(rows=…)`.
         explain: `(part, use, objects of the Plan) → what an account of a sensor says of it`.
         is_light: `(part) → whether` little is found per taxel, so that kernels may be tiled over environments and taxels.
+        is_fused: Whether kernels are to be as large as can be: all that is computed is alike, and would be read again.
         account: `(part, objects of the Plan) → lines by headline`: what was measured of what is computed beforehand.
     """
 
@@ -246,6 +247,7 @@ class Quantity:
     num_rows: Callable[[Any, int], int] | None = None
     explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = _nothing_to_explain
     is_light: Callable[[Any], bool] = _not_light
+    is_fused: bool = False
     account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = _nothing_measured
 
 

@@ -129,14 +129,20 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     return MethodType(own, method.__self__)
 
 
-def inductor_options(checks_indices: bool, has_tiles: bool) -> dict[str, bool]:
+MOST_FUSED = 1024
+"""Operations of a kernel that is to be as large as can be."""
+
+
+def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> dict[str, Any]:
     """Return options for torch.compile, which are names of Inductor's private configuration.
 
     Args:
         checks_indices: Whether kernels assert that indices read from tensors are in range.
         has_tiles: Whether kernels on a GPU prefer blocks of two axes to one flat axis.
+        is_fused: Whether kernels have as many operations as can be, instead of 64 at most.
     """
-    return {"assert_indirect_indexing": checks_indices, "triton.prefer_nd_tiling": has_tiles}
+    options: dict[str, Any] = {"assert_indirect_indexing": checks_indices, "triton.prefer_nd_tiling": has_tiles}
+    return options | {"max_fusion_size": MOST_FUSED} if is_fused else options
 
 
 def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:

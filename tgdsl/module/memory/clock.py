@@ -159,7 +159,7 @@ class Clock(HookedModule):
             return UNTIMED
         assert dt is not None
         count = max(sensor.substeps, 1)
-        age, own = memory["clock/age"][:, None], dt / count
+        age, own = memory["clock/age"][:, None], dt / count if count > 1 else dt
         time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * own)
         is_first = (age == 0) & (substep == 0)
         return Context(own, memory["clock/step"][:, None], substep, time, is_first)
