@@ -11,7 +11,7 @@ FLOORS = (
     ("errors",),
     ("fields", "console", "tensors", "files"),
     ("geometry", "surfaces", "layout"),
-    ("quantities",),
+    ("quantities", "modal"),
     ("sensors", "observations"),
     ("plan", "schema"),
     ("scene",),

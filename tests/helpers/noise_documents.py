@@ -17,6 +17,7 @@ LINKS = ("a_tip", "b_tip", "palm")
 DEFAULTS = {
     "proximity": {"backend": "points", "points": 100},
     "temperature_grid": {"feels": [], "cells": [1, 1, 1], "material": "steel"},
+    "contact_audio": {"modes": [{"frequency": 500.0, "decay": 10.0}]},
 }
 """What keeps compiling fast."""
 

@@ -248,6 +248,7 @@ def _inputs(
         contacts_of=touched.objects,
         link_parts=touched.links,
         substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
+        dt=max((sensor.lowered.timestep * max(sensor.lowered.substeps, 1) for sensor in sensors), default=0.0),
     )
 
 
@@ -287,6 +288,8 @@ def _sensor(
         notes=lowered.notes,
         is_timed=sensor.kind.is_timed,
         substeps=lowered.substeps,
+        is_random=sensor.kind.is_random,
+        timestep=lowered.timestep,
     )
 
 

@@ -12,6 +12,7 @@ from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError
+from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
 from tgdsl.schema.loaded import Loaded
@@ -20,6 +21,7 @@ from tgdsl.sensors import Kind
 from tgdsl.sensors.base import Axis, Lowered, SensorSpec, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
 from tgdsl.sensors.noise.lower import LoweredNoise
+from tgdsl.surfaces.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,22 @@ class LoweredSensor:
     def rows(self) -> Axis:
         """What its own reading has rows of."""
         return rows_of(self.lowered, self.layout, self.spec)
+
+
+class Surfaces:
+    """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
+
+    def __init__(self, resolved: Resolved):
+        """Be those of a document."""
+        self._resolved = resolved
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
+        return self._resolved.surface_of(link, region)
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m]."""
+        return self._resolved.surface_of_object(name)
 
 
 def rows_of(lowered: Lowered, layout: Layout, spec: SensorSpec) -> Axis:
@@ -127,11 +145,20 @@ def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
             loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what, "expected as many of all"))
 
 
+def _with_timestep(spec: SensorSpec, resolved: Resolved) -> SensorSpec:
+    """Return a spec with the scene's time step, if it has a field `timestep` that is left out."""
+    field = "timestep"
+    if field not in type(spec).model_fields or getattr(spec, field) is not None:
+        return spec
+    return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
+
+
 def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
-    spec = loaded.spec.sensors[name]
+    spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)
-    clean = kind.lower(spec, layout, resolved.surface_of)
+    surfaces = Surfaces(resolved)
+    clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
     _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
@@ -139,7 +166,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     knobs = knobs_of(loaded, resolved, name, layout, kind)
     loaded.raise_problems()
     noisy = measured_spec(spec, knobs)
-    lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, surfaces)
     rows = rows_of(lowered, layout, spec)
     noise = imperfections(name, spec, kind, knobs, lowered, rows, layout, loaded.spec.noise)
     both = spec.readout == "both"

@@ -80,6 +80,22 @@ class Resolved:
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
+    def surface_of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m], meshes as they are, not their hulls.
+
+        Raises:
+            LowerError: If one of its geoms has no bounded surface.
+        """
+        parts = []
+        for own in self.objects[name].variants[0]:
+            mesh = own.surface if own.mesh is None else own.mesh
+            try:
+                placed = self.scene.surface((own.geom,)) if mesh is None else mesh.placed(own.geom.pos, own.geom.rotation)
+            except RobotError as error:
+                raise LowerError(str(error), field="feels") from error
+            parts.append(placed)
+        return Surface.joined(parts)
+
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
         """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
         triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh

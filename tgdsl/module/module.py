@@ -73,7 +73,7 @@ class TactileModule(HookedModule):
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
         self.calls = Calls()
-        self.incoming = Incoming(plan)
+        self.incoming = Incoming(plan, self._kinds, self.constants)
 
     def __repr__(self) -> str:
         layout, origin = self.plan.layout, self.plan.origin

@@ -129,7 +129,8 @@ def block(
         state = {**state, **new}
         made = _stacked(found, "signal", sensor.signal)
         samples.append(made if made.ndim == 4 else made[:, None])
-    return {sensor.name: torch.cat(samples, dim=1).transpose(2, 3)}, dict(state)
+    made = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
+    return {sensor.name: made.transpose(2, 3)}, dict(state)
 
 
 def _answer(
@@ -168,7 +169,7 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
             raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
-def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:
+def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
     """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 

@@ -4,6 +4,7 @@ from tgdsl.quantities.base import Gathered, Planning, Quantity, Request, Scene, 
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
 from tgdsl.quantities.known import QUANTITIES, known_quantities
+from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.moments import MomentsRequest
 from tgdsl.quantities.motion import LinkMotion
 from tgdsl.quantities.points import Points
@@ -15,6 +16,7 @@ __all__ = [
     "Contacts",
     "Gathered",
     "LinkMotion",
+    "Loads",
     "MomentsRequest",
     "Planning",
     "Points",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.contact import CONTACT
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
 from tgdsl.sensors.elastomer import ELASTOMER
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL
@@ -23,12 +24,14 @@ KINDS: tuple[Kind, ...] = (
     FORCE_TAXEL,
     LINK_CONTACT,
     TEMPERATURE_GRID,
+    CONTACT_AUDIO,
 )
 """The kinds that come with tgdsl."""
 
 
 __all__ = [
     "CONTACT",
+    "CONTACT_AUDIO",
     "CONTACT_DEPTH",
     "ELASTOMER",
     "FORCE_TAXEL",

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt64
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
+from tgdsl.sensors.noise.random import Stream
 from tgdsl.surfaces.surface import Surface
 
 
@@ -179,6 +180,8 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
+            between calls is another one, a warning says so.
     """
 
     channels: tuple[Channel, ...]
@@ -192,6 +195,7 @@ class Lowered:
     signal: tuple[Channel, ...] | None = None
     substeps: int = 0
     samples: int = 0
+    timestep: float = 0.0
 
 
 class Context(NamedTuple):
@@ -203,6 +207,7 @@ class Context(NamedTuple):
         substep: Which substep of the call this is, from 0.
         time: Time since each environment's reset [s], (env, 1); 0 at the first call after it.
         is_first: Whether it is the first call after each environment's reset, (env, 1).
+        stream: Random words of this call, or this substep, of a kind that `is_random`: see `noise.random`.
     """
 
     dt: Tensor
@@ -210,6 +215,7 @@ class Context(NamedTuple):
     substep: int
     time: Tensor
     is_first: Tensor
+    stream: Stream | None = None
 
 
 UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]
@@ -224,10 +230,23 @@ class ReferenceContext(NamedTuple):
     substep: int
     time: float
     is_first: bool
+    words: Callable[[UInt64[np.ndarray, "*word"]], UInt64[np.ndarray, "*word"]]
+    """Returns the random words of this call, or this substep, by their numbers: those of `Context.stream`."""
 
 
-SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
-"""Returns the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+@runtime_checkable
+class SurfaceOf(Protocol):
+    """Triangles of links and objects."""
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+        ...
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
+        ...
+
+
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
@@ -278,6 +297,9 @@ class Kind:
         is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
             computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
         is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
+        is_random: Whether it draws random numbers of its own, from `Context.stream`.
+        retimed: `(constants, dt) → constants`: those of its constants that depend on the time between calls of `forward` [s],
+            anew. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
         quantities: Quantities of its own that it asks for, which no installed package brings.
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
@@ -294,6 +316,8 @@ class Kind:
     idle_knobs: frozenset[str] = frozenset()
     is_pointwise: bool = False
     is_timed: bool = False
+    is_random: bool = False
+    retimed: Callable[[Mapping[str, np.ndarray], float], Mapping[str, np.ndarray]] | None = None
     quantities: tuple[Quantity, ...] = ()
     indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
     alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives

@@ -189,12 +189,13 @@ class KindConformance:
         turn = Rotation.from_rotvec([0.3, -1.1, 0.7])
         for state in self.states(module):
             readings = module(moved(state, distance * np.array([0.6, -0.8, 0.1]), turn))["s"]
-            assert_agrees(readings, reference, state, tolerance or self.float32_tolerance)
+            allowed = self.float32_tolerance if tolerance is None else max(tolerance, self.float64_tolerance)
+            assert_agrees(readings, reference, state, allowed)
 
     def test_batch_equals_singles(self, scene: Path) -> None:
         """An environment does not see the others."""
         module, _ = self.build(self.document(scene), torch.float64)
-        singles = [self.build(self.document(scene), torch.float64)[0] for _ in range(3)]
+        singles = [self.build(self.document(scene), torch.float64)[0].seed(0, first_env=i) for i in range(3)]
         for state in self.states(module, num_envs=3):
             together = module(state)["s"]
             alone = torch.cat([single(only(state, slice(i, i + 1)))["s"] for i, single in enumerate(singles)])
@@ -264,7 +265,7 @@ class KindConformance:
             changed = dict(zip(names, values, strict=True))
             if state.contact_normal is not None:  # a force that grows from nothing has a kink there, in its direction
                 is_used = (state.contact_normal != 0).any(dim=-1, keepdim=True)
-                changed |= {n: torch.where(is_used, changed[n], getattr(state, n)) for n in SLOT_FIELDS}
+                changed |= {n: torch.where(is_used, changed[n], getattr(state, n)) for n in SLOT_FIELDS if n in changed}
             return module(dataclasses.replace(state, **changed))["s"]
 
         if self.is_differentiable:
@@ -303,10 +304,13 @@ class KindConformance:
         untouched = [module(first), module(second)][1]["s"]
         for chosen in (torch.tensor([2]), torch.tensor([False, False, True, False])):
             module.reset()
+            module.seed(0)  # whoever draws numbers draws those of the first calls again
             module(first)
             module.reset(chosen)
             readings = module(second)["s"]
             torch.testing.assert_close(readings[[0, 1, 3]], untouched[[0, 1, 3]], rtol=0, atol=0)
+            other.seed(0)
+            other(first)
             other.reset()
             torch.testing.assert_close(readings[2], other(second)["s"][2], rtol=0, atol=0)
 

@@ -5,6 +5,8 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from tgdsl.module.state import SHAPES, SceneState
@@ -12,6 +14,8 @@ from tgdsl.plan.plan import Plan
 from tgdsl.quantities.reference import References, ReferenceScene
 from tgdsl.sensors.base import Kind, ReferenceContext, SensorSpec
 from tgdsl.sensors.known import quantities_of
+from tgdsl.sensors.noise.random import KIND, sensor_key
+from tgdsl.sensors.noise.reference import words
 
 Memory = dict[int, dict[str, np.ndarray]]
 """What a sensor remembers, by environment and name."""
@@ -38,7 +42,7 @@ class ReferenceModule:
             rest = {name: np.full(memory.shape, memory.rest) for name, memory in self.sensor.state.items()}
             memory, samples = self.memory.get(env, rest), []
             for i, part in enumerate([*state.substeps, state] if self.sensor.substeps else [state]):
-                gathered, context = self.gathered(part, env, shift), self.context(state, i)
+                gathered, context = self.gathered(part, env, shift), self.context(state, i, env)
                 reading, memory = self.kind.reference(self.spec, self.layout, gathered, context, memory)
                 samples.append(reading)
             memories[env] = memory
@@ -51,11 +55,13 @@ class ReferenceModule:
         """Go on to the next call."""
         self.memory, self.num_calls = memory, self.num_calls + 1
 
-    def context(self, state: SceneState, substep: int) -> ReferenceContext:
-        """Return when the kind is called, all calls having been as long as this one."""
+    def context(self, state: SceneState, substep: int, env: int) -> ReferenceContext:
+        """Return when the kind is called, all calls having been as long as this one, with the random numbers of seed 0."""
         dt, count = state.dt or 0.0, max(self.sensor.substeps, 1)
         time = 0.0 if self.num_calls == 0 else (self.num_calls - 1) * dt + (substep + 1) * dt / count
-        return ReferenceContext(dt / count, self.num_calls, substep, time, self.num_calls == 0 and substep == 0)
+        call = sensor_key(0, self.sensor.sensor), env, self.num_calls * count + substep, KIND
+        is_first = self.num_calls == 0 and substep == 0
+        return ReferenceContext(dt / count, self.num_calls, substep, time, is_first, functools.partial(words, *call))
 
     def gathered(self, state: SceneState, env: int, shift: np.ndarray) -> References:
         """Return what the sensor asked for, in one environment."""
