@@ -132,7 +132,8 @@ def _links(touch: Explained) -> list[str]:
 
 
 def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    where = f"{len(sensor.taxels)} taxels" if len(sensor.taxels) else f"{len(sensor.links)} links"
+    what, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
+    where = f"{what} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if what else "on no link"
     lines = [f"{sensor.name}: {sensor.kind}, {where}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))

@@ -26,7 +26,7 @@ from tgdsl.module.memory.memory import Memory, kept, store
 from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows, rows_of
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
-from tgdsl.module.sensing import Sensing, sense
+from tgdsl.module.sensing import Sensing, in_order, sense
 from tgdsl.module.state import SceneState
 from tgdsl.module.taxels.identity import SavedTaxels
 from tgdsl.module.taxels.tables import images_of, row_tables, taxel_table
@@ -69,10 +69,10 @@ class TactileModule(HookedModule):
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
-        self.memory = Memory(plan.sensors, plan.readings())
+        self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
-        self.calls = Calls()
+        self.calls, self._order = Calls(), in_order(plan.sensors)
         self.incoming = Incoming(plan, self._kinds, self.constants)
 
     def __repr__(self) -> str:
@@ -262,7 +262,7 @@ class TactileModule(HookedModule):
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
-        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock)
+        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock, self._order)
         return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:

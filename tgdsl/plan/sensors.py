@@ -114,6 +114,8 @@ class PlannedSensor(Generic[Array]):
         notes: What an account of it says of its parameters, line by line.
         is_timed: Whether its kind wants to know when it is called: see `sensors.base.Context`.
         substeps: Physics steps of a call that it is advanced at; 0: once per call.
+        upstream: Sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it.
+        provides: Planes that it has for others.
         is_random: Whether its kind draws random numbers of its own.
         timestep: Time between the calls of its kind that its constants are made for [s]; 0: any will do.
     """
@@ -137,6 +139,8 @@ class PlannedSensor(Generic[Array]):
     notes: tuple[str, ...] = ()
     is_timed: bool = False
     substeps: int = 0
+    upstream: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
     is_random: bool = False
     timestep: float = 0.0
 

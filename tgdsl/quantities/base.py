@@ -15,7 +15,7 @@ Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` r
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -115,6 +115,8 @@ class Planning:
         geoms_of: Returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls.
         report: Notes a mistake.
         progress: Is told what is done.
+        joints: The joints that are read, in the order of the state.
+        anchors: Where the anchor of each is in the frame of the body that it moves, by its name [m].
     """
 
     layout: Layout
@@ -126,6 +128,8 @@ class Planning:
     geoms_of: Callable[[str], tuple[SurfaceGeom, ...]]
     report: Report
     progress: Progress
+    joints: tuple[str, ...] = ()
+    anchors: Mapping[str, Float[np.ndarray, 3]] = field(default_factory=dict)
 
     def bodies_of(self, taxels: Int[np.ndarray, " taxel"]) -> list[str]:
         """Return the body of each taxel."""

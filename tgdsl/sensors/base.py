@@ -23,6 +23,7 @@ from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
 from tgdsl.sensors.noise.random import Stream
+from tgdsl.sensors.upstream import Upstream
 from tgdsl.surfaces.surface import Surface
 
 
@@ -51,11 +52,9 @@ History = Annotated[
 ]
 
 
-class SensorSpec(SpecModel):
-    """What every kind of sensor has. A kind's own spec adds `kind: Literal["its_name"]` and its parameters."""
+class AnySensorSpec(SpecModel):
+    """What every kind of sensor has, wherever it is. A kind's own spec adds `kind: Literal["its_name"]` and its parameters."""
 
-    links: Selector
-    """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
     noise: NoiseField = "clean"
     """A noise profile's name, or the knobs in line."""
     readout: Literal["clean", "measured", "both"] = "measured"
@@ -75,9 +74,30 @@ class SensorSpec(SpecModel):
         return ()
 
     @property
+    def named_bodies(self) -> Mapping[str, str]:
+        """Bodies of the scene that the spec names, by the field that does; none by default."""
+        return {}
+
+    @property
     def is_gated(self) -> bool:
         """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
         return False
+
+
+class SensorSpec(AnySensorSpec):
+    """A sensor that some links carry."""
+
+    links: Selector
+    """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
+
+
+class OnJointsSpec(AnySensorSpec):
+    """A sensor that has a place on each of some joints; its layout's links are called as these are, on the bodies they move."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Names or shell wildcards of hinges and slides; default: the robot's actuated joints, in the order of the actuators."""
+    is_on_taxels: ClassVar[bool] = False
+    needs_taxels: ClassVar[bool] = False
 
 
 class LinkSpec(SensorSpec):
@@ -180,6 +200,9 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        provides: Planes that `forward` returns for other sensors to read, of those of `Kind.provides`.
+        sound: Samples of sound that it provides at each call of `forward`; 0: none, see `sensors.upstream`.
+        upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
         timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
             between calls is another one, a warning says so.
     """
@@ -196,6 +219,28 @@ class Lowered:
     substeps: int = 0
     samples: int = 0
     timestep: float = 0.0
+    provides: frozenset[str] = frozenset()
+    sound: int = 0
+    upstream: Upstream | None = None
+
+
+class ReadSensor(NamedTuple):
+    """A sensor that another one reads: what its kind made of it, and what it has rows of."""
+
+    lowered: Lowered
+    rows: Axis
+
+
+class Fitting(NamedTuple):
+    """What is known once all that a sensor reads is lowered.
+
+    Attributes:
+        timestep: Time of a physics step of the scene [s].
+        upstream: The sensors that it reads, by their names, in order.
+    """
+
+    timestep: float
+    upstream: Mapping[str, ReadSensor]
 
 
 class Context(NamedTuple):
@@ -251,7 +296,9 @@ Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
-Reading = Float[np.ndarray, "row channel"]
+Kept = dict[str, np.ndarray]
+ReferenceAnswer = tuple[np.ndarray, Kept] | tuple[np.ndarray, Kept, Mapping[str, np.ndarray]]
+"""A reading (row, channel), or (sample, row, channel) of a block, and what is kept; and planes, where a kind provides them."""
 
 
 class Alternative(NamedTuple):
@@ -264,6 +311,9 @@ class Alternative(NamedTuple):
 
     label: str
     changes: Mapping[str, Any]
+
+
+Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]
 
 
 def no_alternatives(spec: Any) -> Sequence[Alternative]:
@@ -304,12 +354,18 @@ class Kind:
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
             measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
+        provides: Planes that `forward` can return beside its channels for other sensors to read, see `sensors.upstream`:
+            it does so for those of `Lowered.provides`, and `reference` returns them too, by name, as a third value.
+        reads: The field of its spec that names sensors that it reads, if it does so.
+        warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
+            environments) → messages`: what users are to be warned of, each once.
+        fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
     """
 
-    spec: type[SensorSpec]
+    spec: type[AnySensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
     forward: Callable[[Gathered, Context, Constants, State], tuple[Planes, State]]
-    reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], tuple[Reading, dict[str, np.ndarray]]]
+    reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], ReferenceAnswer]
     decide: Callable[[Planes, Constants, State], tuple[Planes, State]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
@@ -321,6 +377,10 @@ class Kind:
     quantities: tuple[Quantity, ...] = ()
     indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
     alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives
+    provides: frozenset[str] = frozenset()
+    reads: str = ""
+    warns: tuple[tuple[str, Warn], ...] = ()
+    fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
 
     @property
     def name(self) -> str:

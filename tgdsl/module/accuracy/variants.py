@@ -8,7 +8,7 @@ from typing import Any
 
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.geoms.tables import GeomTable
-from tgdsl.sensors.base import Alternative, Kind, SensorSpec
+from tgdsl.sensors.base import Alternative, AnySensorSpec, Kind
 
 BARE: Mapping[str, Any] = {"readout": "clean", "rate": None, "history": None}
 """Fields of a sensor without imperfections, so that two variants can be compared reading by reading."""
@@ -54,7 +54,7 @@ def bare(name: str) -> dict[str, Any]:
 
 
 def variants_of(
-    kind: Kind, name: str, spec: SensorSpec, queries: Mapping[str, Any], alternatives: Sequence[Alternative]
+    kind: Kind, name: str, spec: AnySensorSpec, queries: Mapping[str, Any], alternatives: Sequence[Alternative]
 ) -> Variants:
     """Return the variants of a sensor.
 

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory.watch import StateWatch
 from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
+from tgdsl.sensors.base import Kind
 from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
@@ -33,9 +35,21 @@ class Memory(HookedModule):
             alone, which needs them: code that is compiled for the first call then serves all later ones.
     """
 
-    def __init__(self, sensors: Sequence[PlannedSensor], readings: Mapping[str, PlannedReading]):
-        """Note what sensors carry, and what all readings are."""
+    def __init__(
+        self,
+        sensors: Sequence[PlannedSensor],
+        readings: Mapping[str, PlannedReading],
+        kinds: Mapping[str, Kind] | None = None,
+    ):
+        """Note what sensors carry, and what all readings are.
+
+        Args:
+            sensors: The sensors.
+            readings: All readings, by name.
+            kinds: The kind of each sensor, by its name, where what kinds warn of is to be watched.
+        """
         super().__init__()
+        self._watch = StateWatch(sensors, kinds or {})
         self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
         for s in sensors:
             for reading in s.windows:
@@ -99,6 +113,7 @@ class Memory(HookedModule):
             if _calls(planned, dt)[0] > held[path].shape[1]:
                 what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
                 raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
+        self._watch.look(held)
         return held | self.clock.tensors()
 
     @property

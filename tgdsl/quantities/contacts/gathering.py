@@ -16,7 +16,7 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Scene
-from tgdsl.quantities.contacts.part import ContactsPart
+from tgdsl.quantities.contacts.part import SLOT_FIELDS, ContactsPart
 from tgdsl.quantities.contacts.request import ContactPoints
 
 
@@ -43,7 +43,7 @@ def contacts_of(
     rotation = planes.rotation(state["body_quat"][:, bodies])
     whole = _of_pairs(state["contact_netforce"], index)
     net = planes.rotate_back(rotation, planes.split(whole.sum(dim=2)))
-    if "contact_force" not in state:
+    if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         own = [(none, none, none)] * 4
     else:

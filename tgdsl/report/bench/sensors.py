@@ -32,7 +32,7 @@ from tgdsl.report.bench.results import Cost, Measured, Subject
 from tgdsl.report.bench.timing import times_of
 from tgdsl.schema.load import load
 from tgdsl.schema.objects import query_alternatives
-from tgdsl.sensors.base import Kind, SensorSpec
+from tgdsl.sensors.base import AnySensorSpec, Kind
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.lower import quantity
 
@@ -80,9 +80,11 @@ class Sensor:
     overrides: Mapping[str, Any]
     name: str
     kind: Kind
-    spec: SensorSpec
+    spec: AnySensorSpec
     own: Plan
     variants: Variants
+    others: Mapping[str, tuple[Kind, AnySensorSpec]]
+    """Kind and spec of all sensors that its plan has: those that it reads, and itself."""
 
     @staticmethod
     def of(document: Document, overrides: Mapping[str, Any], name: str) -> Sensor:
@@ -93,12 +95,12 @@ class Sensor:
         """
         changed = {**overrides, **bare(name)}
         loaded = load(document, changed, known_kinds())
-        kind = next(kind for kind in known_kinds() if kind.name == loaded.spec.sensors[name].kind)  # type: ignore[attr-defined]
-        spec = loaded.spec.sensors[name]
-        own = _plan(document, changed, name)
+        own, kinds = _plan(document, changed, name), {kind.name: kind for kind in known_kinds()}
+        others = {s.sensor: (kinds[s.kind], loaded.spec.sensors[s.sensor]) for s in own.sensors}
+        kind, spec = others[name]
         queried = {target: loaded.spec.objects[target] for target in queried_objects(own)}
         variants = variants_of(kind, name, spec, queried, query_alternatives())
-        return Sensor(document, changed, name, kind, spec, own, variants)
+        return Sensor(document, changed, name, kind, spec, own, variants, others)
 
     def plan(self, variant: Variant) -> Plan:
         """Return the Plan of a variant.
@@ -137,7 +139,7 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
     progress(f"{sensor.name}: {finest.label}, float64")
     fine = TactileModule(sensor.plan(finest), known_kinds(), torch.float64)
     exact = taken(readings_of(fine, recording.for_module(fine.inputs), sensor.name), rows_at(own, fine, sensor.name))
-    channels = own.outputs[0].channels
+    channels = own.plan.readings()[sensor.name].channels
     magnitude = magnitude_of(exact, [quantity(channel) for channel in channels])
     ways = [Way(variant, plan, "float32") for variant, plan in plans.items()]
     more = ["float64", "bfloat16 readings", *(["tf32"] if options.device.type == "cuda" else [])]
@@ -154,7 +156,7 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
         kind=sensor.kind.name,
         reference=f"{finest.label}, float64",
         check=_check(sensor, states),
-        magnitudes=_magnitudes(own, magnitude),
+        magnitudes=_magnitudes(own, sensor.name, magnitude),
         points=tuple(dataclasses.replace(p, is_on_front=f) for p, f in zip(points, is_on_front, strict=True)),
         left_out=tuple(left_out),
     )
@@ -284,13 +286,13 @@ def _check(sensor: Sensor, states: Sequence[SceneState]) -> str:
         return "the kind's definition knows primitives alone, and meshes are felt"
     few = [first_envs(state, CHECKED_ENVS) for state in states[-CHECKED_STEPS:]]
     touch = TactileModule(sensor.own, known_kinds(), torch.float64)
-    reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec), []
+    reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec, sensor.others, sensor.name), []
     for state in few:
         reading, memory = reference(state, np.zeros(3))
         reference.remember(memory)
         expected.append(reading.reshape(reading.shape[0], -1, reading.shape[-1]))
     exact = np.stack(expected)
-    magnitude = magnitude_of(exact, [quantity(channel) for channel in touch.outputs[0].channels])
+    magnitude = magnitude_of(exact, [quantity(channel) for channel in touch.plan.readings()[sensor.name].channels])
     largest = errors_of(readings_of(touch, few, sensor.name), exact, magnitude).largest.value
     return f"as written, float64 differs from the kind's NumPy definition by {largest:.1e} at most ({len(few)} steps)"
 
@@ -301,8 +303,8 @@ def first_envs(state: SceneState, count: int) -> SceneState:
     return SceneState(**values, dt=state.dt, substeps=tuple(first_envs(part, count) for part in state.substeps))
 
 
-def _magnitudes(touch: TactileModule, magnitude: Magnitude) -> dict[str, str]:
-    """Return the magnitude of each quantity, with its unit."""
-    output = touch.outputs[0]
+def _magnitudes(touch: TactileModule, name: str, magnitude: Magnitude) -> dict[str, str]:
+    """Return the magnitude of each quantity of a sensor, with its unit."""
+    output = touch.plan.readings()[name]
     named = zip(output.channels, output.units, magnitude.scale, strict=True)
     return {quantity(channel): f"{scale:.4g} {unit}" for channel, unit, scale in named}

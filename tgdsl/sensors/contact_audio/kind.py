@@ -26,6 +26,9 @@ Impulses u act at four times of each step, t_n = (0, ¼, ½, ¾) Δt:
 A step is one matrix, made in float64 beforehand: exact at any step, without drift. Components of phasors within 1e-12 N·s of
 zero are flushed to it.
 
+A microphone hears it at the frames of the bodies that ring, as ρc √(A/4π) s at 1 m [Pa]: what a surface of A = 0.01 m² radiates
+that moves with s, at all frequencies alike (Kinsler et al., *Fundamentals of Acoustics*, 7.5).
+
 `model: paper`: y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], a₁ = 2r cos(2πfΔt/K), a₂ = r², r = e^(−dΔt/K), and s = Σ g y, with
 u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is then depends on K and Δt.
 
@@ -48,14 +51,16 @@ from tgdsl.geometry import planes
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads
+from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
 from tgdsl.sensors.contact_audio.bands import band_numbers, membership, middle
 from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
-from tgdsl.sensors.contact_audio.operators import least, operators, quiet, turn_of
+from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise import random
+from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
 from tgdsl.surfaces.surface import Surface
 
 
@@ -87,17 +92,27 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in band_numbers(modes.frequency))
     pairs = (len(layout.bodies), len(spec.feels))
     state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
+    is_heard = spec.outputs == "samples"
     return Lowered(
         channels=channels,
         constants=constants | operators(constants, step),
         state=state | ({} if spec.model == "paper" else {"pending": Memory(shape=pairs)}),
-        requests=(Loads(spec.feels, slots=spec.slots, of=spec.of),),
+        requests=(Loads(spec.feels, slots=spec.slots, of=spec.of), *((_places(spec, layout),) if is_heard else ())),
         rows=rows,
         notes=(f"{spec.samples} samples per step of {step:g} s: {spec.samples / step:g} Hz", *modes.notes),
         substeps=spec.substeps,
-        samples=spec.samples if spec.outputs == "samples" else 0,
+        samples=spec.samples if is_heard else 0,
         timestep=step,
+        provides=SOUND if is_heard else frozenset(),
+        sound=spec.samples if is_heard else 0,
     )
+
+
+def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
+    """Return the request for where the sound comes from."""
+    if spec.of == "object":
+        return Places(spec.feels)
+    return Places(bodies=layout.bodies, offset=np.zeros((len(layout.bodies), 3)))
 
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
@@ -111,7 +126,8 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     parts = torch.cat([state["phasors"], struck], dim=-1)
     new["phasors"] = after = _turned(parts, turn_of(constants, context.step[0] + context.substep), constants)
     if "heard" in constants:
-        return {"signal": torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)[:, :, None]}, new
+        made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
+        return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
@@ -163,4 +179,5 @@ CONTACT_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     retimed=retimed,
+    provides=SOUND,
 )

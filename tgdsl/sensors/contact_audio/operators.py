@@ -66,6 +66,11 @@ def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: b
     return np.exp(1j * angle) / np.where(np.sin(angle) != 0, np.sin(angle), 1.0)
 
 
+def radiated() -> float:
+    """Return the sound pressure at 1 m per velocity of a surface of 0.01 m², ρc √(A/4π), of air at 20 °C [Pa·s/m]."""
+    return 1.204 * 343.2 * 0.028209479177387815  # a float of a module, such as math.pi, is an input of a compiled graph
+
+
 def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
     """Return what of a sensor's constants depends on the time step [s].
 

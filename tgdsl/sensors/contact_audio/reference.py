@@ -12,14 +12,16 @@ from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.loads import Loads
+from tgdsl.quantities.places import Places
 from tgdsl.quantities.reference import References
-from tgdsl.sensors.base import ReferenceContext, ReferenceState
+from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
 from tgdsl.sensors.contact_audio.bands import band_numbers, middle
 from tgdsl.sensors.contact_audio.impulses import reference_impulses
-from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet
+from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet, radiated
 from tgdsl.sensors.contact_audio.rows import ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise.reference import normal_pair
+from tgdsl.sensors.upstream import PLACE, SAMPLES
 from tgdsl.surfaces.surface import Surface
 
 Strikes = list[tuple[float, float]]
@@ -28,8 +30,11 @@ Strikes = list[tuple[float, float]]
 
 def reference(
     spec: ContactAudioSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the samples of one step (sample, row, 1) [m/s], or the energies of its bands (row, band); and what is kept."""
+) -> ReferenceAnswer:
+    """Return the samples of one step (sample, row, 1) [m/s], or the energies of its bands (row, band); and what is kept.
+
+    Of samples there is also what a microphone hears.
+    """
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
     is_paper, below = spec.model == "paper", highest(spec.samples, step)
@@ -55,7 +60,9 @@ def reference(
             phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
     after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
-    return (heard[..., None] if spec.outputs == "samples" else _bands(spec, modes.frequency, amplitude)), after
+    if spec.outputs == "bands":
+        return _bands(spec, modes.frequency, amplitude), after
+    return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
 
 
 def _no_surface(name: str) -> Surface:
