@@ -18,7 +18,7 @@ FLOORS = (
     ("module", "formats"),
     ("placement",),
     ("compiler", "runtime"),
-    ("view",),
+    ("tuning", "view"),
     ("calibrate", "rl"),
     ("report",),
     ("commands",),

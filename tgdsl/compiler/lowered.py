@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,8 @@ import numpy as np
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
-from tgdsl.errors import LowerError, TgdslError, did_you_mean
+from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
+from tgdsl.fields.accuracy import Bound
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
@@ -20,7 +21,7 @@ from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
 from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
-from tgdsl.sensors.noise.lower import LoweredNoise
+from tgdsl.sensors.noise.lower import LoweredNoise, quantity
 from tgdsl.surfaces.surface import Surface
 
 
@@ -234,6 +235,7 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
     surfaces = Surfaces(resolved)
     clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
+    _check_accuracy(loaded, name, clean)
     _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
         return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
@@ -252,3 +254,39 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
         without = dataclasses.replace(clean, reports={})
         ways.append(LoweredSensor(again, kind, spec, taxels, layout, without, (again,), None))
     return ways
+
+
+def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
+    """Note a sensor's `accuracy` that is not of what it reads."""
+    own = loaded.spec.sensors[name].accuracy
+    if own is None:
+        return
+    units = {quantity(channel.name): channel.unit for channel in lowered.channels}
+    at: Path = ("sensors", name, "accuracy")
+    shown = listed([f"{found} [{unit}]" for found, unit in units.items()])
+    for key, bound in own.bounds:
+        path = (*at, key) if key else at
+        if key and key not in units:
+            what = f'the reading has no quantity "{key}"'
+            loaded.problems.append(loaded.problem(path, what, did_you_mean(key, units, "quantities"), on_key=True))
+        wrong = [found for found in ([key] if key in units else [] if key else units) if not _is_of(bound, units[found])]
+        if wrong:
+            what = f'"{bound.text}" is in {bound.unit}, and the reading has {shown}'
+            loaded.problems.append(loaded.problem(path, what, _hint(units)))
+    missing = [found for found in units if own.of(found) is None]
+    if missing:
+        what = f"nothing is said of {listed(missing)}, which the reading has too"
+        loaded.problems.append(loaded.problem(at, what, "expected a bound of each quantity"))
+
+
+def _is_of(bound: Bound, unit: str) -> bool:
+    return not bound.unit or bound.unit == unit
+
+
+def _hint(units: Mapping[str, str]) -> str:
+    fraction = 'expected a fraction of the largest change, such as "1 %"'
+    if len(units) == 1 or "1" in units.values():
+        amounts = {unit for unit in units.values() if unit != "1"}
+        return f"{fraction}, or an amount in {amounts.pop()}" if len(units) == 1 and amounts else fraction
+    each = ", ".join(f"{name}: {'1 %' if i else f'… {unit}'}" for i, (name, unit) in enumerate(units.items()))
+    return f"{fraction}, or one of each: {{{each}}}"

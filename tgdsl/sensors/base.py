@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, UInt64
 from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
 from torch import Tensor
 
+from tgdsl.fields.accuracy import AccuracyField
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
@@ -63,6 +64,10 @@ class AnySensorSpec(SpecModel):
     """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
     history: History | None = None
     """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
+    accuracy: AccuracyField = None
+    """RMS error that its reading may have on states of the scene, before noise: a fraction of the largest change, `1 %`, an
+    amount, `0.02 mm`, or one of each quantity, `{force: 5 mN, torque: 1 %}`. The cheapest fields that hold it are then chosen
+    among those that nobody wrote, here and in the objects that it feels."""
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
     needs_taxels: ClassVar[bool] = True
@@ -307,10 +312,15 @@ class Alternative(NamedTuple):
     Attributes:
         label: What to call it: `svd, 0.1 %`.
         changes: Fields and what they are then, as a document has them; None: left out.
+        unused: Fields that mean nothing then: who wrote one of them does not want this choice.
+        is_exact: Whether it is exact but for rounding, so that errors of others may be measured against it and it may be chosen
+            without one.
     """
 
     label: str
     changes: Mapping[str, Any]
+    unused: tuple[str, ...] = ()
+    is_exact: bool = False
 
 
 Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]

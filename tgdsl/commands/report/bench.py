@@ -112,7 +112,11 @@ def _text(report: Report) -> str:
         header, *rows = cells_of(subject)
         marks = [("now" if p.is_own else "") + (" ●" if p.is_on_front else "") for p in subject.points]
         table = text_table((*header, ""), [(*row, mark.strip()) for row, mark in zip(rows, marks, strict=True)])
-        lines = [f"{subject.name} ({subject.kind}), against {subject.reference}", *([subject.check] if subject.check else [])]
+        lines = [
+            f"{subject.name} ({subject.kind}), against {subject.reference}",
+            *([subject.check] if subject.check else []),
+            *subject.chosen,
+        ]
         lines += [table, *(f"not to be had: {label}: {why}" for label, why in subject.left_out)]
         parts.append("\n".join(lines))
     parts.append("now: what the compiler takes; ●: on the front of time and RMS error, overlapping intervals being equal")
