@@ -85,7 +85,8 @@ def compile_plan(
     written = _written(document, overrides, known, sensors) if choice.changes else loaded
     plan = lower.plan(loaded, resolved, known, _origin(written), tell)
     tell("compiling the scene")
-    return choice.noted(dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own)))
+    scene = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
+    return choice.noted(dataclasses.replace(plan, scene=scene))
 
 
 def _check_chosen(loaded: Loaded, choice: Choice) -> None:

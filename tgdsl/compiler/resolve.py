@@ -13,15 +13,18 @@ from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError, Problem, RobotError, SampleError, did_you_mean, listed
+from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError, did_you_mean, listed
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
-from tgdsl.files.find import is_file, robot_names
+from tgdsl.files.find import colliders_file, is_file, robot_names
 from tgdsl.formats.joints import RobotJoints, robot_joints
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders, Reach, reach
+from tgdsl.plan.scene import Collider
+from tgdsl.scene.colliders import with_colliders
+from tgdsl.schema.colliders import load_colliders
 from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
@@ -51,6 +54,7 @@ class Resolved:
         link_bodies: The bodies of each link that carries taxels or is a sensor's.
         joints: The robot's joints and actuators.
         on_joints: Names of the joints of each sensor that is on joints.
+        primitives: What links collide with in the scene in place of their own geoms.
     """
 
     layout: Layout
@@ -67,6 +71,7 @@ class Resolved:
     link_bodies: LinkBodies
     joints: RobotJoints
     on_joints: Mapping[str, tuple[str, ...]]
+    primitives: tuple[Collider, ...] = ()
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -145,7 +150,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, SensedObject] = {}
-    own = OwnObjects()
+    own, primitives = OwnObjects(), ()
     joints, on_joints = RobotJoints((), 0, frozenset(), (), ()), {}
     on_links = frozenset(name for name, own in loaded.spec.sensors.items() if loaded.is_without_layout or not own.is_on_taxels)
     if robot is not None and loaded.is_without_layout:
@@ -159,6 +164,8 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
         scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
+        primitives = _primitives(loaded, scene)
+        scene = scene.changed(lambda spec: with_colliders(spec, primitives)) if primitives else scene
         objects = sensed_objects(loaded, scene, own)
         check_named_bodies(loaded, scene)
         joints = robot_joints(robot, scene)
@@ -181,7 +188,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     rigid = {i for bodies in (*(sensed.bodies for sensed in objects.values()), *parts_of.values()) for i in bodies}
     unused += [(f"body {body}", why) for body, why in _unlisted(robot, scene, listed_bodies, rigid)]
     by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
-    own_links = (on_links, parts_of, joints, on_joints)
+    own_links = (on_links, parts_of, joints, on_joints, primitives)
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
@@ -245,6 +252,29 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
         what = f'there is no file "{loaded.spec.scene.model}"'
         loaded.problems.append(loaded.problem(("scene", "model"), what, "paths are relative to this document"))
     return robot, scene
+
+
+def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
+    """Return the primitive colliders that the document asks for: those of a file beside the robot's."""
+    if loaded.spec.robot.collision != "primitive" or loaded.robot_file is None:
+        return ()
+    place, file = ("robot", "collision"), colliders_file(loaded.robot_file)
+    if file is None:
+        beside = loaded.robot_file.with_name("colliders.yaml")
+        what = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
+        loaded.problems.append(loaded.problem(place, what, "expected `collision: mesh`, or such a file"))
+        return ()
+    try:
+        found = load_colliders(file)
+    except SpecError as error:
+        loaded.problems += error.problems
+        return ()
+    unknown = [own.body for own in found if own.body not in scene.bodies]
+    if unknown:
+        what = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
+        loaded.problems.append(loaded.problem(place, what, did_you_mean(unknown[0], scene.bodies, "bodies")))
+        return ()
+    return found
 
 
 def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:

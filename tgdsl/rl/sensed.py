@@ -126,6 +126,8 @@ def compile_sensed(
         overrides["resolution"] = spec.resolution
     if spec.variants is not None:
         overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
+    if spec.physics.collision is not None:
+        overrides["robot.collision"] = spec.physics.collision
     felt, felts = None, {}
     if feels is not None:
         felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}
