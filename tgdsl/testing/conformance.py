@@ -22,6 +22,7 @@ from torch import Tensor
 
 from tgdsl.compiler.pipeline import compile_plan
 from tgdsl.errors import UnfeltWarning
+from tgdsl.module.accuracy.changed import moved, only
 from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.module.module import TactileModule
@@ -33,7 +34,6 @@ from tgdsl.sensors.base import Kind
 from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.torch_internals import num_compiled_graphs
 from tgdsl.testing.reference import assert_agrees
-from tgdsl.testing.states import moved, only
 
 FLOAT32_TOLERANCE = 1e-5
 """Largest error of a float32 module over the largest magnitude of the channel: some 80 roundings of 2⁻²⁴."""

@@ -129,6 +129,16 @@ def plot(subject: Subject, salt: str) -> str:
     axes.margins(0.12)
     figure.tight_layout()
     _label(axes, subject.points)
+    return svg_of(figure, salt)
+
+
+def svg_of(figure: Figure, salt: str) -> str:
+    """Return a figure as SVG, to stand in HTML; the same bytes each time.
+
+    Args:
+        figure: What is drawn.
+        salt: What makes the identifiers in it differ from those of other plots.
+    """
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "none"}):
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
