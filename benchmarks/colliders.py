@@ -26,6 +26,7 @@ from colliders_error import COLLISIONS, CONES, Variant
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
+from tgdsl.runtime.warp.simulation import WarpSimulation
 
 TASK = Path(__file__).parents[1] / "examples" / "tasks" / "in_palm_rotate.yaml"
 SPEED_OPTIONS: tuple[dict[str, float], ...] = (
@@ -59,22 +60,24 @@ class Timed:
         given |= {"physics.collision": collision, "physics.cone": cone}
         task = load_task(options.task, given)
         self.env = TouchEnv(task, options.envs, device=options.device, simulator="warp", compiled=False, seed=0)
+        assert isinstance(self.env.sim, WarpSimulation)
+        self.sim = self.env.sim
         self.env.steps.copy_(torch.arange(options.envs) * self.env.max_steps // options.envs)
         generator = torch.Generator(self.env.device).manual_seed(0)
         shape = (16, options.envs, self.env.num_actions)
         self._actions = 2.0 * torch.rand(shape, generator=generator, device=self.env.device) - 1.0
         for i in range(options.warm):
             self.env.step(self._actions[i % 16])
-        self._kept = {name: self.env.sim.arrays[name].clone() for name in self.KEPT}
+        self._kept = {name: self.sim.arrays[name].clone() for name in self.KEPT}
         self._own = self._solver()
 
     def _solver(self) -> dict[str, float]:
-        opt = self.env.sim.warp_model.opt
+        opt = self.sim.warp_model.opt
         return {name: float(_number(getattr(opt, name))) for name in ("iterations", "ls_iterations", "tolerance")}
 
     def set(self, options: dict[str, float]) -> None:
         """Give the solver options; those that are left out are as they were."""
-        opt = self.env.sim.warp_model.opt
+        opt = self.sim.warp_model.opt
         for name, value in (self._own | options).items():
             if name == "tolerance":
                 opt.tolerance.fill_(max(value, 1e-6))  # as put_model has it: float32 resolves no more
@@ -89,7 +92,7 @@ class Timed:
     def block(self, call: Callable[[], object], steps: int) -> float:
         """Return milliseconds of a step, from the states that were kept."""
         for name, value in self._kept.items():
-            self.env.sim.arrays[name].copy_(value)
+            self.sim.arrays[name].copy_(value)
         is_cuda = self.env.device.type == "cuda"
         events = [torch.cuda.Event(enable_timing=True) for _ in range(2)] if is_cuda else []
         start = time.process_time()
@@ -107,7 +110,7 @@ class Timed:
 
     def counts(self) -> dict[str, float]:
         """Return what the last step's last substep did, per environment."""
-        data, num = self.env.sim.warp_data, self.env.num_envs
+        data, num = self.sim.warp_data, self.env.num_envs
         rounds, rows = data.solver_niter.numpy(), data.nefc.numpy()
         found = {"rounds": float(rounds.mean()), "rounds_max": float(rounds.max()), "rows": float(rows.mean())}
         found |= {"rows_max": float(rows.max()), "contacts": float(data.nacon.numpy()[0]) / num}
@@ -145,7 +148,7 @@ def speed(options: argparse.Namespace) -> list[dict[str, Any]]:
             numbers = {name: statistics.fmean(own[name] for own in counts) for name in counts[0]}
             rows.append(asdict(variant) | {"ms": statistics.median(times), "blocks": times} | numbers)
             print(variant.name, " ".join(f"{name} {rows[-1][name]:.3f}" for name in ("ms", *numbers)), flush=True)
-        pairs = {name: int(own.env.sim.warp_model.nxn_geom_pair_filtered.shape[0]) for name, own in each.items()}
+        pairs = {name: int(own.sim.warp_model.nxn_geom_pair_filtered.shape[0]) for name, own in each.items()}
         print(f"pairs of geoms that may meet: {pairs}; {time.perf_counter() - start:.0f} s", flush=True)
         rows[-1]["candidates"] = pairs
         colliders_error.write(options, "speed", rows)

@@ -98,7 +98,7 @@ class Samples:
 def samples(surface: Surface, link: Link, count: int = NUM_SAMPLES, seed: int = 0) -> Samples:
     """Return points spread over a link's surface, the same ones every time."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    pos, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    pos, face, *_ = trimesh.sample.sample_surface(mesh, count, seed=seed)
     return Samples(np.asarray(pos), touched(np.asarray(pos), surface.face_normals[face], link))
 
 
@@ -168,7 +168,7 @@ def _placed(primitive: Primitive, numbers: np.ndarray, link: Link, is_mirrored: 
         to = (middle + (numbers[3:6] - middle) * flip) * MM
         axis = to - at
         length = float(np.linalg.norm(axis))
-        turn, _ = Rotation.align_vectors([axis / length], [[0.0, 0.0, 1.0]]) if length > 1e-9 else (Rotation.identity(), 0)
+        turn = Rotation.align_vectors([axis / length], [[0.0, 0.0, 1.0]])[0] if length > 1e-9 else Rotation.identity()
         size, pos = (numbers[6] * MM, 0.5 * length), 0.5 * (at + to)
     elif primitive.shape == "box":
         vector = numbers[3:6] * flip * np.prod(flip)  # a rotation vector is a pseudovector
@@ -295,7 +295,7 @@ def exterior(placed: Sequence[Collider], count: int, seed: int) -> np.ndarray:
         else:
             mesh = trimesh.creation.capsule(2 * own.size[1], own.size[0], count=[48, 48])
             mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
-        pos, _ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+        pos = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
         pos = np.concatenate([np.asarray(pos), np.asarray(mesh.vertices)])
         pos = pos @ Rotation.from_quat(own.quat, scalar_first=True).as_matrix().T + own.pos
         others = [other for j, other in enumerate(placed) if j != i]

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from tgdsl.compiler.pipeline import compile
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.tuning.compile import compile
 
 Contact = tuple[Sequence[Any], Sequence[Any], float | int]
 """A point [m], a normal out of the object, and a normal force [N]."""

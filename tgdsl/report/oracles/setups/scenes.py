@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from tgdsl.compiler.pipeline import compile
 from tgdsl.errors import UnfeltWarning
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.runtime.simulate import simulate
+from tgdsl.tuning.compile import compile
 
 Point = Sequence[Any]
 
