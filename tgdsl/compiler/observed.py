@@ -13,7 +13,7 @@ from tgdsl.errors import Problem, did_you_mean
 from tgdsl.formats.joints import RobotJoints
 from tgdsl.layout.layout import Layout
 from tgdsl.observations import observations
-from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
+from tgdsl.observations.observations import ObservationSpec, OfReading, ReadingObservation, ReadingSpec
 from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
 from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
 from tgdsl.schema.loaded import Loaded
@@ -66,9 +66,9 @@ def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
     return Wanted(chosen, joints, actuators, problems)
 
 
-def _terms(loaded: Loaded) -> list[tuple[str, int, ReadingSpec | JointSpec]]:
+def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
     """Return the observation terms of all groups, with their group and number in it."""
-    return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]  # type: ignore[misc]
+    return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
 
 
 def observed(
