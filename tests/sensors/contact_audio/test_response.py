@@ -10,6 +10,7 @@ from struck_plate import MODES, STEP, energy, plate, pressed, ringing, sound
 
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads, PairLoads
+from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
 from tgdsl.sensors.contact_audio.operators import operators
@@ -57,7 +58,8 @@ def test_roundings_do_not_add_up():
     state, force, found = {"phasors": torch.tensor([[[1.0, 0.0]]]), **load}, torch.zeros(1, 1, 1), []
     for count in range(20_000):
         context = Context(torch.tensor(step), torch.tensor([[count]]), 0, torch.tensor([[1.0]]), torch.tensor([[False]]))
-        read, state = CONTACT_AUDIO.forward(Gathered({Loads: PairLoads(force, force, None)}), context, own, state)
+        gathered = Gathered({Loads: PairLoads(force, force, None), Places: (torch.zeros(1, 3),)})
+        read, state = CONTACT_AUDIO.forward(gathered, context, own, state)
         found.append(read["signal"].flatten())
     heard = torch.cat(found).double().numpy()
     time = np.arange(1, len(heard) + 1) * step / samples

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from tests.helpers.tone import TONE
+from tgdsl.module.accuracy.changed import only
 from tgdsl.sensors import MICROPHONE
 from tgdsl.testing import KindConformance
-from tgdsl.testing.states import only
 
 
 class TestMicrophone(KindConformance):
