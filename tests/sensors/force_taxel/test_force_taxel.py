@@ -281,6 +281,16 @@ def test_pressure_is_the_force_inwards_over_the_area(tmp_path):
     assert touch.outputs[0].units == ("N", "N", "N", "Pa")
 
 
+class NoSurfaces:
+    """No surface is needed."""
+
+    def __call__(self, link, region):
+        pytest.fail(f"the surface of {link} was asked for")
+
+    def of_object(self, name):
+        pytest.fail(f"the surface of {name} was asked for")
+
+
 def test_a_taxel_without_area_has_no_pressure():
     one = np.array([[0.0, 0.0, 1.0]])
     layout = Layout(
@@ -296,8 +306,8 @@ def test_a_taxel_without_area_has_no_pressure():
     )
     spec = ForceTaxelSpec(kind="force_taxel", links={"include": ("pad",)}, feels=("cube",), outputs=("pressure",))
     with pytest.raises(LowerError, match=r"^a taxel of no area has no pressure; leave pressure out, or give its area$"):
-        lower(spec, layout, lambda name, parts: pytest.fail("no surface is needed"))
-    lowered = lower(spec, dataclasses.replace(layout, area=np.ones(1)), lambda name, parts: pytest.fail("none"))
+        lower(spec, layout, NoSurfaces())
+    lowered = lower(spec, dataclasses.replace(layout, area=np.ones(1)), NoSurfaces())
     assert max(request.num_slots for request in lowered.requests) == 8
 
 

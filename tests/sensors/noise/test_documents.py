@@ -43,7 +43,7 @@ KNOBS_OF = {
     "temperature_grid": BASE,
     "contact_audio": set(),
     "actuation_audio": set(),
-    "microphone": BASE,
+    "microphone": set(),
 }
 """The paper's table "Imperfection knobs available per sensor type", the Schmitt threshold that its values give to `bool`, and
 the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` and

@@ -18,9 +18,11 @@ from tgdsl.report.hard.scene import DTYPES, pair_of, quiet, worst_of
 from tgdsl.sensors import KINDS
 
 NAMES = tuple(kind.name for kind in KINDS)
-NUM_ENVS, NUM_CALLS = 4, 2
+NUM_ENVS, NUM_CALLS = 4, 4
 FLOAT32, FLOAT64, FAR = 1e-5, 1e-11, 1e-9
 """Largest error over the largest magnitude of the channel: 80 roundings of float32; rounding; 1 km away."""
+READ_BY = {"contact_audio": ("contact_force",), "actuation_audio": ("joint_vel",)}
+"""What is broken of a state for kinds that poses mean nothing to."""
 DEFINITION = "the kind's float64 definition"
 Change = Callable[[SceneState], SceneState]
 
@@ -109,7 +111,7 @@ def _on_each_other(state: SceneState) -> SceneState:
 
 
 def one_broken_environment() -> HardCase:
-    """Return how far the other environments are off, and whether the broken one says so, with not-a-number in one pose."""
+    """Return how far the other environments are off, and whether the broken one says so, with not-a-number in what it reads."""
     errors: dict[str, Allowed] = {}
     for precision, dtype in DTYPES.items():
         found = []
@@ -118,12 +120,12 @@ def one_broken_environment() -> HardCase:
             worst = 0.0
             for call in range(NUM_CALLS):
                 state = whole.example_state(3, seed=call)
-                assert state.body_pos is not None and state.body_quat is not None
-                pos, quat = state.body_pos.clone(), state.body_quat.clone()
-                pos[1], quat[1] = torch.nan, torch.nan
+                parts = {name: getattr(state, name).clone() for name in READ_BY.get(kind, ("body_pos", "body_quat"))}
+                for part in parts.values():
+                    part[1] = torch.nan
                 with quiet():
                     expected = whole(state)["s"]
-                    reading = broken(dataclasses.replace(state, body_pos=pos, body_quat=quat))["s"]
+                    reading = broken(dataclasses.replace(state, **parts))["s"]
                 worst = max(worst, float((reading[[0, 2]] - expected[[0, 2]]).abs().max()))
                 is_seen = bool(reading[1].isnan().any())
             found.append(worst if is_seen else np.inf)

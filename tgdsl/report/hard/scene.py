@@ -26,14 +26,28 @@ from tgdsl.sensors import KINDS
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 LINKS = ("palm", "tip")
 OBJECTS = ("item", "tool", "floor")
+STRUCK: Mapping[str, Any] = {
+    "modes": [{"frequency": 310.0, "decay": 12.0, "gain": 2.0}, {"frequency": 845.0, "decay": 40.0, "gain": -1.0}],
+    "timestep": 0.002,
+    "samples": 32,
+    "scrape": 0.0,
+}
+"""A sounding body without noise, whose normal numbers are series in float64."""
 SENSORS: Mapping[str, Mapping[str, Any]] = {
     "elastomer": {"standoff": 0.003, "friction": 0.6},
     "proximity": {"tolerance": 0.04},
     "temperature_grid": {"cells": [3, 2, 2], "material": "copper", "emissivity": 0.5, "convection": 20.0},
     "kinematic_taxel": {"friction_cone": 0.5, "balance": "solver", "slots": 2},
     "link_contact": {"outputs": ["contact", "force", "normal_force"]},
+    "contact_audio": STRUCK,
+    "actuation_audio": {"joints": ["wheel"], "samples": 8, "friction": 0.0},
+    "microphone": {"body": "palm", "pos": [0.01, 0.0, 0.02], "speed": 100.0, "reach": 5.0, "nearest": 0.02},
 }
 """Fields of kinds whose defaults are not what is tried, or that need some."""
+READ: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
+    "microphone": {"struck": {"kind": "contact_audio", "links": list(LINKS), "feels": list(OBJECTS), **STRUCK}}
+}
+"""Sensors that kinds read."""
 HEAT: Mapping[str, Mapping[str, Any]] = {
     "item": {"material": "aluminium", "temperature": 45.0},
     "tool": {"material": "rubber", "temperature": -5.0},
@@ -54,8 +68,10 @@ SCENE = """
       <geom type="cylinder" size="{s12} {s30}"/>
       <geom type="ellipsoid" size="{s20} {s12} {s16}" pos="0 0 {s35}" euler="0 25 70"/>
     </body>
+    <body name="wheel" pos="0 0 1">{inertia}<joint name="wheel" type="hinge"/></body>
     <body name="floor" pos="0 0 -{s20}"><geom type="plane" size="1 1 .1"/></body>
   </worldbody>
+  <actuator><motor joint="wheel"/></actuator>
 </mujoco>
 """
 INERTIA = '<inertial pos="0 0 0" mass=".1" diaginertia="1e-4 1e-4 1e-4"/>'
@@ -100,13 +116,14 @@ def taxels(num: int, seed: int, scale: float = 1.0) -> list[dict[str, Any]]:
 def fields_of(kind: str) -> dict[str, Any]:
     """Return a kind's sensor."""
     spec = next(own for own in KINDS if own.name == kind).spec
-    feels = {"feels": list(OBJECTS)} if "feels" in spec.model_fields else {}
-    return {"kind": kind, "links": list(LINKS), **feels, **SENSORS.get(kind, {})}
+    where = {"links": list(LINKS), "feels": list(OBJECTS)}
+    given = {name: value for name, value in where.items() if name in spec.model_fields}
+    return {"kind": kind, **given, **SENSORS.get(kind, {})}
 
 
 @functools.lru_cache(maxsize=64)
-def _planned(kind: str, scale: float, changes: str) -> tuple[Plan, Any]:
-    """Return a kind's plan, and its spec."""
+def _planned(kind: str, scale: float, changes: str) -> tuple[Plan, Mapping[str, Any]]:
+    """Return a kind's plan, and the specs of its sensors."""
     sizes = {f"s{n}": f"{1e-3 * scale * n:.17g}" for n in MILLIMETRES}
     with folder() as where, quiet():
         path = where / "scene.xml"
@@ -120,9 +137,9 @@ def _planned(kind: str, scale: float, changes: str) -> tuple[Plan, Any]:
             "tgdsl": 1,
             "robot": {"model": str(path), "layout": {"resolutions": {"r": layout}}},
             "objects": {name: {"body": name, **made_of.get(name, {})} for name in OBJECTS},
-            "sensors": {"s": {**fields_of(kind), **json.loads(changes)}},
+            "sensors": {"s": {**fields_of(kind), **json.loads(changes)}, **READ.get(kind, {})},
         }
-        return compile_plan(document), load(document).spec.sensors["s"]
+        return compile_plan(document), load(document).spec.sensors
 
 
 def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0, **changes: Any) -> Pair:
@@ -134,9 +151,10 @@ def pair_of(kind: str, dtype: torch.dtype, scale: float = 1.0, **changes: Any) -
         scale: What all lengths of the scene are times.
         **changes: Other fields of the sensor.
     """
-    plan, spec = _planned(kind, scale, json.dumps(changes))
-    own = next(own for own in KINDS if own.name == kind)
-    return Pair(TactileModule(plan, KINDS, dtype), ReferenceModule(plan, own, spec))
+    plan, specs = _planned(kind, scale, json.dumps(changes))
+    kinds = {own.name: own for own in KINDS}
+    read = {name: (kinds[fields["kind"]], specs[name]) for name, fields in READ.get(kind, {}).items()}
+    return Pair(TactileModule(plan, KINDS, dtype), ReferenceModule(plan, kinds[kind], specs["s"], read, "s"))
 
 
 def worst_of(pair: Pair, given: SceneState, truth: SceneState | None = None, enough: float = 0.0) -> float:
