@@ -1,7 +1,7 @@
 """Bodies to be struck, as triangles, and closed forms of how they ring."""
 
-import trimesh
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from tgdsl.report.oracles.setups.solids import ball, box, breathing, lamb, surface_of, timoshenko, torsion

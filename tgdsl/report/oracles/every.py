@@ -8,7 +8,20 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from tgdsl.errors import TgdslError
-from tgdsl.report.oracles import bodies, cooling, filters, forces, geometry, heat, kinematic, noise, proximity
+from tgdsl.report.oracles import (
+    bodies,
+    cooling,
+    filters,
+    forces,
+    geometry,
+    hearing,
+    heat,
+    kinematic,
+    modes,
+    noise,
+    proximity,
+    sound,
+)
 from tgdsl.report.oracles.contact_mechanics import friction, half_space, layer, markers
 from tgdsl.report.oracles.results import Comparison, Oracle
 from tgdsl.report.sheets.sheet import Entry, Section, Sheet
@@ -28,6 +41,9 @@ FIELDS: Mapping[str, tuple[Oracle, ...]] = {
     "filters": filters.ORACLES,
     "heat: conduction and contact": heat.ORACLES,
     "heat: losses and lag": cooling.ORACLES,
+    "sound: contacts and motors": sound.ORACLES,
+    "sound: microphone": hearing.ORACLES,
+    "sound: modes of bodies": modes.ORACLES,
 }
 """The oracles of each field."""
 OURS, PAPER = "#1f6f8b", "#c0392b"

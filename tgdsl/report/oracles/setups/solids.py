@@ -21,7 +21,7 @@ def surface_of(*meshes: trimesh.Trimesh) -> Surface:
     return Surface.joined(parts)
 
 
-def box(*sides: float, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+def box(*sides: float | int, at: tuple[float | int, ...] = (0.0, 0.0, 0.0)) -> trimesh.Trimesh:
     """Return a box by its full sides [m]."""
     return trimesh.creation.box(sides).apply_translation(at)
 
@@ -65,7 +65,7 @@ def roots(function: Callable[[np.ndarray], np.ndarray], low: float, high: float)
     """Return the zeros of a smooth function of arrays."""
     at = np.linspace(low, high, 500)
     value = function(at)
-    return [brentq(function, at[i], at[i + 1]) for i in range(499) if value[i] * value[i + 1] < 0]
+    return [float(np.asarray(brentq(function, at[i], at[i + 1]))) for i in range(499) if value[i] * value[i + 1] < 0]
 
 
 def timoshenko(length: float, height: float, width: float, poissons_ratio: float, below: float) -> list[float]:

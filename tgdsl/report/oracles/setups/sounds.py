@@ -41,7 +41,7 @@ MOTOR = """
 <mujoco>
   <option timestep="0.001"/>
   <worldbody>
-    <body name="arm" pos="0 0 .1"><joint name="elbow" axis="0 1 0" pos=".01 0 .02"/><geom size=".01"/></body>
+    <body name="arm" pos="0 0 .1"><joint name="elbow" axis="0 1 0" pos=".01 0 .02"/><geom size=".01" mass=".5"/></body>
   </worldbody>
   <actuator><motor name="motor" joint="elbow"/></actuator>
 </mujoco>
@@ -66,7 +66,7 @@ def plate(folder: Path, dtype: torch.dtype = torch.float64, **sensor: Any) -> Ta
 
 
 def pressed(
-    touch: TactileModule, force: Sequence[float], speed: Sequence[float] | float = 0.0, step: float = STEP
+    touch: TactileModule, force: Sequence[float | int], speed: Sequence[float | int] | float | int = 0.0, step: float = STEP
 ) -> SceneState:
     """Return the state of a ball in each environment that presses with a normal force [N], sliding at a speed [m/s].
 
@@ -104,7 +104,9 @@ def ringing(impulse: float, time: np.ndarray, modes: Sequence[Mapping[str, float
     return impulse * np.sum(each, axis=0) * (time >= 0)
 
 
-def amplitudes(touch: TactileModule, forces: Sequence[float], step: float = STEP) -> Float[np.ndarray, "step mode"]:
+def amplitudes(
+    touch: TactileModule, forces: Sequence[float | int] | np.ndarray, step: float = STEP
+) -> Float[np.ndarray, "step mode"]:
     """Return the amplitude of the plate's modes, |z| [N·s], after each step of forces [N]."""
     found = []
     for force in forces:
@@ -120,7 +122,9 @@ def half_sine(duration: float, step: float, impulse: float = 0.02, rest: float =
     return [0.0, *(np.diff(passed) / step).tolist()]
 
 
-def struck(touch: TactileModule, forces: Sequence[float], decay: float, step: float = STEP) -> tuple[float, int]:
+def struck(
+    touch: TactileModule, forces: Sequence[float | int] | np.ndarray, decay: float, step: float = STEP
+) -> tuple[float, int]:
     """Return the amplitude of the only mode at the time of the last strike, if it were alone, |z| e^(d Δt) [N·s]; its step."""
     found = amplitudes(touch, forces, step)[:, 0]
     last = int(np.argmax(np.diff([0.0, *found]) > 0))
@@ -137,7 +141,7 @@ def motor(folder: Path, dtype: torch.dtype | str = torch.float64, **fields: Any)
 
 
 def driven(
-    touch: TactileModule, velocities: Sequence[float] | np.ndarray, efforts: Any, num_envs: int = 1
+    touch: TactileModule, velocities: Sequence[float | int] | np.ndarray, efforts: Any, num_envs: int = 1
 ) -> Float[np.ndarray, "env sample"]:
     """Return all samples of a joint whose velocity [rad/s] and effort [N·m] are given at each step [Pa]."""
     state, blocks = touch.example_state(num_envs), []
