@@ -77,6 +77,13 @@ def test_help_waits_for_nothing_heavy():
     assert not heavy & set(said)
 
 
+def test_environments_leave_triton_alone():
+    """Its LLVM and that of MuJoCo's software renderer, which `MUJOCO_GL=osmesa` loads, do not go into one process."""
+    assert in_python(
+        "import sys, tgdsl.rl.env, tgdsl.rl.playing.play, tgdsl.module.explain; print('triton' in sys.modules)"
+    ) == ["False"]
+
+
 def test_the_version_on_the_command_line(here, tmp_path):
     assert here(tmp_path, "--version") == (0, f"tgdsl {version('tgdsl')}\n", "")
 

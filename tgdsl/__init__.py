@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tgdsl import testing
-    from tgdsl.compiler.pipeline import compile as compile
     from tgdsl.compiler.scene import instrument as instrument
     from tgdsl.errors import (
         ArtifactError,
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from tgdsl.runtime.connect import connect as connect
     from tgdsl.runtime.simulate import simulate as simulate
     from tgdsl.runtime.warp import WarpSimulation
+    from tgdsl.tuning.compile import compile as compile
 
 _PLACES = {
     "ArtifactError": "errors",
@@ -56,7 +56,7 @@ _PLACES = {
     "TouchEnv": "rl.env",
     "WarpSimulation": "runtime.warp",
     "check_taxels": "module.taxels.identity",
-    "compile": "compiler.pipeline",
+    "compile": "tuning.compile",
     "connect": "runtime.connect",
     "instrument": "compiler.scene",
     "load": "module.artifact",

@@ -37,3 +37,35 @@ def test_mistakes_end_in_their_message(here, tmp_path, arguments, message):
     assert code == 2 and not said
     assert message is None or error.startswith(message)
     assert not (tmp_path / "report").exists()
+
+
+def test_without_a_document_there_are_oracles_and_hard_cases(here, tmp_path, monkeypatch):
+    from tgdsl.report.hard import contacts
+    from tgdsl.report.hard import every as hard
+    from tgdsl.report.oracles import every, filters
+
+    few, cases = {"filters": (filters.maxwell_step,)}, {"contacts": (contacts.first_reading,)}
+    monkeypatch.setattr(every, "run", lambda begun, run=every.run: run(few, begun))
+    monkeypatch.setattr(hard, "run", lambda begun, run=hard.run: run(cases, begun))
+    code, said, error = here(tmp_path, "bench", "--oracles", "--hard", "-o", "out")
+    assert code == 0, error
+    assert "Maxwell branch: after a step" in said and "the first reading of filters" in said and said.count("1 of 1 hold") == 2
+    names = {f"{stem}.{suffix}" for stem in ("oracles", "hard") for suffix in ("csv", "json", "html")}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == names
+    monkeypatch.setattr(filters, "STRENGTH", 0.6)  # the closed form's; the noise is that of the default
+    monkeypatch.setattr(every, "run", lambda begun, run=every.run: run(begun))
+    code, said, error = here(tmp_path, "bench", "--oracles", "-o", "out")
+    assert code == 2 and error == "tgdsl: 1 results are not as they should be; they are marked in out\n" and "✗" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "tgdsl: bench: found no document, expected one, --oracles or --hard\n"),
+        (("pad.yaml", "--hard"), "tgdsl: bench pad.yaml: --oracles and --hard need no document, expected one or the other\n"),
+    ],
+)
+def test_a_document_or_neither(here, tmp_path, arguments, message):
+    bench_document(tmp_path)
+    code, said, error = here(tmp_path, "bench", *arguments)
+    assert (code, said, error) == (2, "", message)

@@ -3,9 +3,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from held import assert_holds
 
 from tgdsl.geometry.reference import signed_distance
 from tgdsl.geometry.shapes import SHAPES
+from tgdsl.report.oracles import geometry
 
 SIZES = {
     "plane": [(1.0, 1.0, 0.1)],
@@ -21,10 +23,7 @@ DISTANCE_TOLERANCE = {torch.float64: 1e-12, torch.float32: 1e-6}
 
 
 def distances(shape: str, size: tuple[float, ...], points: np.ndarray, dtype: torch.dtype):
-    p = torch.tensor(points, dtype=dtype)
-    s = torch.tensor(size, dtype=dtype)
-    distance, gradient = SHAPES[shape](tuple(p.unbind(-1)), tuple(s.unbind(-1)))
-    return distance.double().numpy(), torch.stack(gradient, dim=-1).double().numpy()
+    return geometry.distances(shape, size, points, dtype)
 
 
 def reference(shape: str, size: tuple[float, ...], points: np.ndarray):
@@ -114,44 +113,7 @@ def test_ellipsoid_derivative_with_respect_to_its_size(size):
         )
 
 
-def test_known_distances():
-    """Distances that need no code: (shape, size, point, distance, gradient)."""
-    third = 1 / np.sqrt(3)
-    table = [
-        ("plane", (0, 0, 0), (5, -3, -2), -2.0, (0, 0, 1)),
-        ("sphere", (2, 0, 0), (0, 0, 0), -2.0, (1, 0, 0)),
-        ("sphere", (2, 0, 0), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
-        ("capsule", (1, 2, 0), (0, 0, 5), 2.0, (0, 0, 1)),
-        ("capsule", (1, 2, 0), (0, 0, 1), -1.0, (1, 0, 0)),
-        ("capsule", (1, 2, 0), (3, 4, 2), 4.0, (0.6, 0.8, 0)),
-        ("box", (1, 2, 3), (2, 3, 4), np.sqrt(3), (third, third, third)),
-        ("box", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
-        ("box", (1, 2, 3), (-0.5, 1.9, 0), -0.1, (0, 1, 0)),
-        ("box", (1, 2, 3), (1, 2, 3), 0.0, (1, 0, 0)),
-        ("cylinder", (1, 2, 0), (4, 0, 6), 5.0, (0.6, 0, 0.8)),
-        ("cylinder", (1, 2, 0), (0, 0, 0), -1.0, (1, 0, 0)),
-        ("cylinder", (3, 1, 0), (0, 0, -0.5), -0.5, (0, 0, -1)),
-        ("ellipsoid", (1, 2, 3), (0, 0, 5), 2.0, (0, 0, 1)),
-        ("ellipsoid", (1, 2, 3), (-4, 0, 0), 3.0, (-1, 0, 0)),
-        ("ellipsoid", (1, 2, 3), (0, 0, 0), -1.0, (1, 0, 0)),
-        ("ellipsoid", (2, 2, 2), (0, 3, 4), 3.0, (0, 0.6, 0.8)),
-    ]
-    for shape, size, point, distance, gradient in table:
-        found, direction = distances(shape, size, np.array([point], dtype=float), torch.float64)
-        assert found[0] == pytest.approx(distance, abs=1e-12), (shape, point)
-        np.testing.assert_allclose(direction[0], gradient, atol=1e-12, err_msg=f"{shape} {point}")
-
-
-def test_half_way_to_the_surface_of_an_ellipsoid():
-    """P = X + t n with X on the surface and n its normal has the distance t: exact for every X."""
-    rng = np.random.default_rng(0)
-    size = np.array([0.02, 0.012, 0.03])
-    on_sphere = rng.normal(size=(1000, 3))
-    surface = size * on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True)
-    normal = surface / size**2
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    least_curvature_radius = size.min() ** 2 / size.max()
-    for t in (0.05, 0.5 * least_curvature_radius, 0.0, -0.5 * least_curvature_radius):
-        found, gradient = distances("ellipsoid", tuple(size), surface + t * normal, torch.float64)
-        np.testing.assert_allclose(found, t, atol=1e-14)
-        np.testing.assert_allclose(gradient, normal, atol=1e-11)
+@pytest.mark.parametrize("compare", [geometry.known_distances, geometry.ellipsoid_normals])
+def test_known_distances(compare):
+    """Distances that need no code, and P = X + t n with X on an ellipsoid and n its normal: t, exact for every X."""
+    assert_holds(compare())

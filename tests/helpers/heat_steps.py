@@ -48,6 +48,7 @@ def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
     found = tables(count, size)
     there = found["outer"] > 0
     constants = {key: tensor(value) for key, value in found.items()} | {
+        "box": tensor(np.concatenate([low, size / count, count], axis=1)),
         "conductivity": tensor(rng.uniform(0.2, 50.0, num)),
         "volumetric_heat": tensor(rng.uniform(1e6, 3e6, num)),
         "ambient": tensor(22.0),
@@ -57,6 +58,8 @@ def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
     }
     given = {"emissivity": rng.uniform(0.3, 0.9, num), "convection": 20.0, "source": rng.uniform(0, 0.5, there.shape) * there}
     constants |= {key: tensor(given[key]) for key in case.terms}
+    if "source" in constants:
+        constants["power"] = constants["source"].sum(dim=(1, 2, 3))
     where = Topology(num, ((1, 1, 1),) * objects, (), tuple(range(objects)), (-1,) * objects, tuple(np.ndindex(num, objects)))
     of = (num_envs if case.is_per_env else 1, objects)
     volume = rng.uniform(1e-6, 1e-5, of)

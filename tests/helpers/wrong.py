@@ -27,7 +27,7 @@ WRONG = {
     "unknown key named as the kind": (
         after("    contact: {links: 1}\n"),
         'hand.yaml:12:5: sensors.touch.contact: unknown key "contact"; known keys: '
-        "feels, gate, history, kind, links, noise, rate, readout, release_threshold, threshold",
+        "accuracy, feels, gate, history, kind, links, noise, rate, readout, release_threshold, threshold",
     ),
     "unknown kind": (
         instead("kind: contact", "kind: contakt"),

@@ -38,7 +38,5 @@ def test_no_number_of_the_code_or_the_plan_is_an_input(name, monkeypatch):
 
 def arguments(touch):
     state = touch.example_state(3, dtype=torch.float32)
-    tensors = state.checked(touch.inputs, touch.device)
-    if "dt" in touch.inputs.fields:
-        tensors["dt"] = torch.tensor(state.dt, dtype=torch.float32)
+    tensors = touch.incoming.tensors(state, torch.float32, touch.device)
     return tensors, touch.memory.tensors(3, state.dt, torch.float32, touch.device)

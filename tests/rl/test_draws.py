@@ -97,3 +97,21 @@ def test_words_are_mixed_alike_by_torch_and_by_numpy():
         assert found.dtype == np.uint32
         np.testing.assert_array_equal(found.view(np.int32), mix(own).numpy())
     assert word.min() < 0 < word.max()
+
+
+@pytest.mark.parametrize("is_compiled", [False, True])
+def test_numbers_made_ahead_are_those_asked_for_one_by_one(is_compiled):
+    """While counters go on by one, after some environments begin anew, counters go back or stay, and with another seed."""
+    draws, plain, counts = Draws(2, 4), Draws(2, 4), torch.arange(4) + (3 << 32)
+    draws._is_on_host = not is_compiled
+    for call in range(24):
+        if call in (4, 5, 13):
+            counts[call % 4] = (call + 9) << 32
+        if call == 9:
+            counts -= 2
+        if call == 17:
+            draws.reseed(5), plain.reseed(5)
+        found = draws.shares_ahead("noise", counts, 3, ahead=5)
+        assert torch.equal(found, plain.shares({"noise": 3}, counts)["noise"]), call
+        counts += call != 11
+    assert torch.equal(draws.shares_ahead("other", counts, 2, ahead=5), plain.shares({"other": 2}, counts)["other"])

@@ -81,7 +81,7 @@ resolution: middle
 
 def test_many_mistakes_are_sorted_each_once_and_cause_no_others(tmp_path):
     assert mistakes(tmp_path, MANY, LAYOUT.replace("2 mm", "2 mn", 1)) == [
-        'hand.yaml:2:45: robot.colour: unknown key "colour"; known keys: layout, model',
+        'hand.yaml:2:45: robot.colour: unknown key "colour"; known keys: collision, layout, model',
         'hand.yaml:4:10: objects.ball.bodi: unknown key "bodi"; did you mean "body"?',
         "hand.yaml:6:60: sensors.touch.gate: found \"far\", expected 'contact_pair' or 'geometric'",
         'hand.yaml:7:59: sensors.depth.feels[1]: unknown object "cube"; known objects: ball',

@@ -1,46 +1,35 @@
 import numpy as np
 import pytest
 import torch
-from hard_places import HALF, HARD, R
+from hard_places import HALF, R
+from held import assert_holds, assert_stands
 from scenes import module, state
-from scipy.spatial.transform import Rotation
 
+from tgdsl.report.hard import probes
+from tgdsl.report.oracles import geometry
 from tgdsl.sensors.contact_depth import CONTACT_DEPTH
-from tgdsl.testing import FAR_TOLERANCE, KindConformance, moved
+from tgdsl.testing import KindConformance
 
 
 class TestContactDepth(KindConformance):
     kind = CONTACT_DEPTH
 
 
-@pytest.mark.parametrize("geom", HARD)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-15), (torch.float32, 3e-9)])
-def test_depth_on_faces_edges_corners_and_centres(tmp_path, geom, dtype, tolerance):
-    """3e-9 m is float32's rounding of a few centimetres."""
-    points, depths = zip(*HARD[geom], strict=True)
-    touch = module(tmp_path, points, geom, kind="contact_depth", radius=R, dtype=dtype)
-    found = touch(state(touch))["s"][0, :, 0].double().numpy()
-    np.testing.assert_allclose(found, depths, atol=tolerance, rtol=0)
+@pytest.mark.parametrize("is_far", [False, True])
+def test_depth_on_faces_edges_corners_and_centres(is_far):
+    """3e-9 m is float32's rounding of a few centimetres; also 1 km from the origin."""
+    assert_stands(probes.depths_at_places(is_far))
 
 
-@pytest.mark.parametrize("geom", HARD)
-def test_depth_1_km_from_the_origin(tmp_path, geom):
-    points, depths = zip(*HARD[geom], strict=True)
-    for dtype, tolerance in ((torch.float64, FAR_TOLERANCE), (torch.float32, 1e-6)):
-        touch = module(tmp_path, points, geom, kind="contact_depth", radius=R, dtype=dtype)
-        far = moved(state(touch), np.array([600.0, -800.0, 50.0]), Rotation.from_rotvec([0.4, 1.0, -2.0]))
-        found = touch(far)["s"][0, :, 0].double().numpy()
-        np.testing.assert_allclose(found, depths, atol=tolerance * max(depths), rtol=0)
+def test_a_contact_that_just_begins():
+    assert_stands(probes.grazing())
 
 
-def test_a_probe_reaches_its_radius_and_no_further(tmp_path):
+def test_a_probe_reaches_its_radius_and_no_further():
     """A 4 cm cube and a radius of 10 mm: the right depth at every clearance, near or far compared with the cube."""
-    clearances = np.array([-5.0, 0.0, 1.0, 2.5, 4.0, 5.0, 7.5, 9.0, 9.9, 10.0, 10.1]) * 1e-3
-    touch = module(
-        tmp_path, [(0, 0, HALF + c) for c in clearances], '<geom type="box" size=".02 .02 .02"/>', kind="contact_depth"
-    )
-    found = touch(state(touch))["s"][0, :, 0].numpy()
-    np.testing.assert_allclose(found, np.maximum(R - clearances, 0), atol=1e-15)
+    found = geometry.reach()
+    assert_holds(found)
+    assert found.paper_error == pytest.approx(5e-3)
 
 
 def test_the_deepest_geom_of_a_compound_wins(tmp_path):

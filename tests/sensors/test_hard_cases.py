@@ -5,21 +5,16 @@ import pytest
 import torch
 from at_rest import NUM_STEPS, jittered, repeated
 from hard_places import HARD
+from held import assert_stands
 from scenes import module, state
 
 import tgdsl
+from tgdsl.report.hard import probes
 
 
-@pytest.mark.parametrize("geom", HARD)
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_at_rest_on_a_face_edge_corner_or_centre_the_normal_does_not_alternate(tmp_path, geom, dtype):
-    probes = [place for place, depth in HARD[geom] if depth > 0]
-    touch = module(tmp_path, probes, geom, kind="kinematic_taxel", outputs=["force"], dtype=dtype)
-    force = touch(jittered(state(touch), NUM_STEPS))["s"].double()
-    direction = force / force.norm(dim=2, keepdim=True)
-    spread = (direction - direction[:1]).norm(dim=2).amax(dim=0)
-    # Off a surface of curvature 1/r the normal turns by jitter / r at the most; 1e-3 is far below any jump between faces.
-    assert spread.max() < 1e-3, f"the normal of probe {probes[int(spread.argmax())]} turns by {spread.max():.2f} rad"
+def test_at_rest_on_a_face_edge_corner_or_centre_the_normal_does_not_alternate():
+    """Off a surface of curvature 1/r the normal turns by jitter / r at the most; 1e-3 is far below any jump between faces."""
+    assert_stands(probes.trembling(NUM_STEPS))
 
 
 def two_cubes(tmp_path, dtype=torch.float64, bodies=("left", "right")):
@@ -75,24 +70,14 @@ def test_clearly_deeper_wins_whatever_the_order(tmp_path):
     assert touch(scene)["s"][0, 0, 1].item() == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize("geom", HARD)
-def test_deep_overlap_is_bounded(tmp_path, geom):
+def test_deep_overlap_is_bounded():
     """A whole ball of probes inside: depths are at most radius plus the object's inner radius, forces finite."""
-    rng = np.random.default_rng(0)
-    touch = module(tmp_path, rng.normal(scale=0.004, size=(200, 3)), geom, kind="kinematic_taxel", dtype=torch.float32)
-    for scale in (1e-12, 1e-3, 1.0):
-        scene = state(touch, pos=scale * np.array([0.001, -0.002, 0.0005]))
-        readings = touch(scene)["s"]
-        assert torch.isfinite(readings).all()
-        assert readings[..., :3].norm(dim=-1).max() < 500 * 0.1**1.2
+    assert_stands(probes.deep_overlap())
 
 
-def test_a_fast_spin_is_felt_as_it_is(tmp_path):
+def test_a_fast_spin_is_felt_as_it_is():
     """1,000 rad/s of a ball over a probe 4 mm inside: v = ω × r, exactly, and no heed of the rest."""
-    touch = module(tmp_path, [(0.016, 0, 0)], '<geom type="sphere" size=".02"/>', kind="kinematic_taxel", dtype=torch.float32)
-    reading = touch(state(touch, angvel=[0, 0, 1000.0]))["s"][0, 0].double().numpy()
-    depth = 0.01 + 0.004
-    np.testing.assert_allclose(reading[:3], [500 * depth**1.2, 2 * 1000 * 0.016, 0], rtol=1e-5)
+    assert_stands(probes.fast_spin())
 
 
 def test_quaternions_need_not_have_unit_length(tmp_path):

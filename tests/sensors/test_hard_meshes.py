@@ -3,43 +3,18 @@
 import numpy as np
 import pytest
 import torch
-import trimesh
 from at_rest import NUM_STEPS, jittered
 from brute import brute_force
 
 import tgdsl
 from tgdsl.module.state import SceneState
+from tgdsl.report.hard import probes
+from tgdsl.report.hard.probes import TOLERANCE
 
 R = 0.006
-TOLERANCE = 1e-4
 
 
-def plate():
-    """A sheet of two sides that coincide."""
-    corners = np.array([[-0.02, -0.015, 0], [0.02, -0.015, 0], [0.02, 0.015, 0], [-0.02, 0.015, 0]])
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]], process=False)
-
-
-def needles():
-    """A wedge 40 mm long whose sides are triangles as thin as 1 to 4,000."""
-    low = np.array([[0, 0, 0], [0.04, 0, 0], [0.04, 1e-5, 0]])
-    faces = [[2, 1, 0], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
-    return trimesh.Trimesh(np.concatenate([low, low + [0, 0, 0.02]]), faces, process=False)
-
-
-def twins():
-    """Two boxes that share a face, both of whose copies are there."""
-    return trimesh.util.concatenate(
-        [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation((x, 0, 0)) for x in (-0.01, 0.01)]
-    )
-
-
-CASES = {
-    "plate": (plate, [(0.003, 0.002, 0.004), (0.003, 0.002, -0.004), (0.0215, 0.004, 0.0), (0.021, 0.016, 0.001)]),
-    "needles": (needles, [(0.03, -0.003, 0.01), (0.03, 0.004, 0.01), (0.042, 0.0, 0.01), (0.0425, 0.0, 0.022)]),
-    "twins": (twins, [(0.0, 0.004, 0.013), (0.0, 0.013, 0.0), (0.003, 0.002, 0.014), (0.0215, 0.0115, 0.0115)]),
-}
-"""The mesh, and probes beside it: over its middle, its edges and its corners."""
+CASES = probes.MESHES
 
 
 def compiled(folder, mesh, probes, dtype, **target):

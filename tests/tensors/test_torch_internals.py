@@ -120,6 +120,22 @@ def test_writes_are_counted():
         assert num_writes(torch.zeros(3)) == -1
 
 
+def test_below_autograd_tensors_stay_ordinary_ones():
+    """They can be used with derivatives afterwards, writes are counted, and what is computed is the same to the last bit."""
+    parameter = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    base = torch.rand(3)
+    expected, before = (2 * base)[1:].exp().sum(), num_writes(base)
+    with torch.no_grad(), torch_internals.below_autograd():
+        twice = 2 * base
+        part = twice[1:]
+        part.exp_()
+        assert not (parameter * base).requires_grad
+    assert torch.equal(twice[1:].sum(), expected) and num_writes(base) == before
+    assert num_writes(twice) == num_writes(part) == 1 and not twice.is_inference()
+    (parameter * twice).sum().backward()
+    assert torch.equal(parameter.grad, twice)
+
+
 def test_each_of_some_tensors_is_written():
     tensors = [torch.zeros(2), torch.ones(3)]
     torch_internals.add_each(tensors, [2, 3])
@@ -148,5 +164,5 @@ def test_objects_share_no_compiled_code():
 def test_inductor_has_the_options():
     from torch._inductor import config
 
-    for name in torch_internals.inductor_options(True, True):
+    for name in torch_internals.inductor_options(True, True, True):
         assert name in config.get_config_copy()

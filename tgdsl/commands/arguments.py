@@ -81,8 +81,8 @@ def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progres
     Raises:
         TgdslError: If an artefact shall be overridden, or what is wrong with the document or artefact.
     """
-    from tgdsl.compiler.pipeline import compile
     from tgdsl.module.artifact import load
+    from tgdsl.tuning.compile import compile
 
     if document.suffix == ".safetensors":
         if overrides:

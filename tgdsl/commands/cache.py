@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Cache:
-    """Show where baked distances and moments are kept, how many and how large they are; or remove them all."""
+    """Show where baked distances, moments and modes are kept, how many and how large they are; or remove them all."""
 
     clear: bool = False
     """Remove all of it; it is computed anew when it is wanted."""

@@ -24,6 +24,7 @@ from tgdsl.commands.learning.evaluate import Evaluate
 from tgdsl.commands.learning.sweep import Sweep
 from tgdsl.commands.learning.train import Train
 from tgdsl.commands.links import Links
+from tgdsl.commands.listen import Listen
 from tgdsl.commands.play import Play
 from tgdsl.commands.render import Render
 from tgdsl.commands.report.bench import Bench
@@ -37,6 +38,7 @@ Command = (
     | Annotated[Explain, tyro.conf.subcommand("explain")]
     | Annotated[Schema, tyro.conf.subcommand("schema")]
     | Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Listen, tyro.conf.subcommand("listen")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Distill, tyro.conf.subcommand("distill")]

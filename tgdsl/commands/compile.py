@@ -25,9 +25,9 @@ class Compile:
 
     def run(self) -> None:
         """Compile, write and say what came of it."""
-        from tgdsl.compiler.pipeline import compile_plan
         from tgdsl.files.write import check_writable, with_folder
         from tgdsl.module.artifact import save_plan
+        from tgdsl.tuning.compile import compile_plan
 
         start = time.perf_counter()
         out = check_writable(self.out or in_working_folder(self.document, ".safetensors"))

@@ -35,8 +35,8 @@ class Run:
     """Recorded controls instead: an .npz file with an array `ctrl` (step, actuator) or (step, env, actuator)."""
     num_envs: int = 1
     """Environments; the table and the picture show the first."""
-    substeps: int = 5
-    """Physics steps per control step."""
+    substeps: int | None = None
+    """Physics steps per control step; default: as many as sensors that read blocks want, else 5."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = Path("out")
     """Folder for readings.npz, picture.png and, where there are several readings, overview.png."""
     compiled: bool = False
@@ -65,7 +65,7 @@ class Run:
             if self.compiled:
                 touch.compile()
             progress(f"starting {self.num_envs} environments" if self.num_envs > 1 else "starting the simulation")
-            sim, controls = self._start(touch, progress)
+            sim, controls = self.start(touch, progress)
             recorder = Recorder(touch, len(controls), self.num_envs)
         readings = self._steps(touch, sim, controls, recorder)
         if touch.plan.objects and not is_touched(touch, sim):
@@ -74,19 +74,21 @@ class Run:
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)
 
-    def _start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
+    def start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
         from tgdsl.runtime.rollout import recorded_controls
         from tgdsl.runtime.scripted import script_of
         from tgdsl.runtime.simulate import simulate
 
+        blocks = max(sensor.substeps for sensor in touch.plan.sensors)
+        substeps = (blocks or 5) if self.substeps is None else self.substeps
         if self.controls is not None:
-            return simulate(touch, self.num_envs, substeps=self.substeps), recorded_controls(self.controls)
+            return simulate(touch, self.num_envs, substeps=substeps), recorded_controls(self.controls)
         script = script_of(touch, self.keyframes, progress)
         if script.note:
             held = "" if script.closing else f": its initial state is held for {self.seconds:g} s"
             print(f"{script.note}{held}")
-        return script.begin(touch, self.num_envs, self.substeps, self.seconds)
+        return script.begin(touch, self.num_envs, substeps, self.seconds)
 
     def _steps(self, touch: TactileModule, sim: BatchSimulation, controls: Controls, recorder: Recorder) -> dict[str, Tensor]:
         """Make all steps, and return the last readings."""

@@ -14,12 +14,12 @@ from tgdsl.layout.layout import Layout, Link
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.select import select
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Axis, Lowered, SensorSpec
+from tgdsl.sensors.base import AnySensorSpec, Axis, Lowered
 from tgdsl.sensors.noise import Knobs, NoiseSpec, built_in, resolve_noise
 from tgdsl.sensors.noise.lower import LoweredNoise, lower_noise
 
 
-def measured_spec(spec: SensorSpec, knobs: Sequence[Knobs]) -> SensorSpec:
+def measured_spec(spec: AnySensorSpec, knobs: Sequence[Knobs]) -> AnySensorSpec:
     """Return the spec of the measured reading: knobs may set what is a field of the sensor's own.
 
     Raises:
@@ -71,7 +71,7 @@ def _matching(loaded: Loaded, resolved: Resolved, name: str, links: Sequence[Lin
 
 def imperfections(
     name: str,
-    spec: SensorSpec,
+    spec: AnySensorSpec,
     kind: Kind,
     knobs: Sequence[Knobs],
     lowered: Lowered,

@@ -1,12 +1,18 @@
-"""Which bodies a document's links are: that of their name or taxels, and what is welded to it from below."""
+"""Which bodies a document's links are: that of their name or taxels, and what is welded to it from below; and its joints."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from tgdsl.compiler.sensed import Report, contact_parts
+from tgdsl.errors import did_you_mean
+from tgdsl.formats.joints import RobotJoints
 from tgdsl.formats.model import Model
 from tgdsl.plan.inputs import ContactPart
+from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.select import matching
+from tgdsl.schema.yaml import Path
+from tgdsl.sensors.base import OnJointsSpec
 
 LinkBodies = Mapping[str, tuple[int, ...]]
 """Indices of the bodies that each link's body is one rigid body with, its own first, by its name."""
@@ -36,3 +42,58 @@ def link_parts(scene: Model, bodies: tuple[int, ...], report: Report) -> tuple[C
     if not any(scene.compiled.geom_bodyid[geom.id] != bodies[0] for geom in colliding):
         return ()
     return contact_parts(scene, bodies, {geom.id for geom in colliding}, report)
+
+
+def joints_matching(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list[str]:
+    """Return the joints that a pattern matches, in their order; that there are none is noted."""
+    hits = matching(pattern, [name for name in own.joints if name])
+    if not hits:
+        known = [name for name in (*own.joints, *own.others) if name]
+        what, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, known, "joints")
+        if matching(pattern, own.others):
+            what, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
+        loaded.problems.append(loaded.problem(path, what, hint))
+    return hits
+
+
+def joints_chosen(loaded: Loaded, path: Path, patterns: Sequence[str] | None, own: RobotJoints) -> tuple[str, ...]:
+    """Return the joints of some patterns, each once, in the order of these; default: the actuated ones.
+
+    Args:
+        loaded: The document, which mistakes are noted in.
+        path: Where its list `joints` is.
+        patterns: Names and wildcards; None: there is no such list.
+        own: The robot's joints.
+    """
+    wanted: dict[str, None] = {}
+    if patterns is None:
+        wanted = dict.fromkeys(own.joints[: own.num_actuated])
+    for k, pattern in enumerate(patterns or ()):
+        wanted |= dict.fromkeys(joints_matching(loaded, (*path, k), pattern, own))
+    return tuple(wanted)
+
+
+def sensor_joints(loaded: Loaded, own: RobotJoints) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield each sensor that is on joints, and these; that there are none, or nameless ones, is noted."""
+    for name, spec in loaded.spec.sensors.items():
+        if not isinstance(spec, OnJointsSpec):
+            continue
+        before = len(loaded.problems)
+        chosen = joints_chosen(loaded, ("sensors", name, "joints"), spec.joints, own)
+        if len(loaded.problems) == before and not chosen:
+            what, hint = "the robot has no actuated joints", 'name them: joints: ["*"]' if own.joints else ""
+            loaded.problems.append(loaded.problem(("sensors", name), what, hint))
+        if "" in chosen:
+            what = "an actuated joint of the robot has no name"
+            loaded.problems.append(loaded.problem(("sensors", name), what, "name it in the robot's file, or list `joints`"))
+        yield name, chosen
+
+
+def check_named_bodies(loaded: Loaded, scene: Model) -> None:
+    """Note bodies that a sensor's spec names and the scene does not have."""
+    for name, spec in loaded.spec.sensors.items():
+        for field, body in spec.named_bodies.items():
+            if body not in scene.bodies:
+                what = f'the scene has no body "{body}"'
+                hint = did_you_mean(body, scene.bodies, "bodies")
+                loaded.problems.append(loaded.problem(("sensors", name, field), what, hint))

@@ -11,7 +11,7 @@ import numpy as np
 from tgdsl.compiler import passes
 from tgdsl.compiler.links import link_parts
 from tgdsl.compiler.lowered import LoweredSensor, lowered_sensors
-from tgdsl.compiler.observed import Observed, observed
+from tgdsl.compiler.observed import Observed, Wanted, observed, wanted
 from tgdsl.compiler.passes import Joined, Numbered, Pruned, Shared
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.compiler.sensed import contact_parts
@@ -42,7 +42,7 @@ Parts = Mapping[str, Any]
 FIELDS = (
     *("body_pos", "body_quat", "body_linvel", "body_angvel", "contact_found"),
     *("contact_pos", "contact_force", "contact_torque", "contact_normal", "contact_netforce", "variant", "object_size"),
-    *("object_temperature", "object_material"),
+    *("object_temperature", "object_material", "joint_pos", "joint_vel", "joint_effort", "last_action"),
 )
 """Fields of the state that quantities read, in the order in which a module wants them."""
 
@@ -61,7 +61,7 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
         SpecError: If a kind cannot be on its links, an observation does not fit its sensor, or a sensor can never feel what it
             should.
     """
-    sensors = lowered_sensors(loaded, resolved, kinds, progress)
+    sensors, read = lowered_sensors(loaded, resolved, kinds, progress), wanted(loaded, resolved)
     pruned = passes.prune(sensors, resolved.objects, resolved.link_bodies, resolved.scene)
     _report_hopeless(loaded, pruned)
     touched = _contact_parts(loaded, resolved, sensors, pruned)
@@ -69,17 +69,17 @@ def plan(loaded: Loaded, resolved: Resolved, kinds: tuple[Kind, ...], origin: Or
     shared = passes.share(sensors, joined, resolved.layout, quantities)
     numbered = passes.number(pruned, resolved.objects, shared.uses, quantities)
     asked = tuple(quantity for quantity in quantities if quantity.name in shared.uses)
-    parts = _quantities(loaded, resolved, pruned, numbered, shared, asked, progress)
+    parts = _quantities(loaded, resolved, pruned, numbered, shared, asked, read, progress)
     loaded.raise_problems()
     planned = tuple(_sensor(sensor, joined, shared, parts, asked) for sensor in sensors)
-    seen = observed(loaded, resolved, planned, {sensor.name: sensor.layout for sensor in sensors})
+    seen = observed(loaded, resolved, planned, {sensor.name: sensor.layout for sensor in sensors}, read)
     loaded.raise_problems()
     unfelt = unfelt_taxels(resolved, sensors, pruned)
     warn_of_unfelt(loaded.source.file, unfelt, resolved.layout.num_taxels)
     never = [(f"pair {pair.link} – {pair.object}", "they can never be in contact") for pair in pruned.dropped]
     made = Plan(
         origin=origin,
-        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, asked, touched, seen),
+        inputs=_inputs(resolved, sensors, pruned, numbered, shared, parts, asked, touched, seen, read),
         layout=resolved.layout,
         objects=numbered.objects,
         pairs=numbered.table,
@@ -164,6 +164,7 @@ def _quantities(
     numbered: Numbered,
     shared: Shared,
     asked: Sequence[Quantity],
+    read: Wanted,
     progress: Progress,
 ) -> Parts:
     """Return the part of the Plan of each quantity; mistakes are noted."""
@@ -181,6 +182,8 @@ def _quantities(
         geoms_of=resolved.geoms_of,
         report=report,
         progress=progress,
+        joints=read.joints,
+        anchors={name: resolved.anchor_of(name) for name in read.joints if name},
     )
     parts = {}
     for quantity in asked:
@@ -222,16 +225,19 @@ def _inputs(
     asked: Sequence[Quantity],
     touched: ContactParts,
     seen: Observed,
+    wanted: Wanted,
 ) -> Inputs:
     """Return what the module wants of a scene."""
-    read = {"body_pos", "body_quat"}.union(*(quantity.fields(parts[quantity.name]) for quantity in asked))
+    read = {reading.name for reading in seen.proprioception} | {"body_pos", "body_quat"}.union(
+        *(quantity.fields(parts[quantity.name]) for quantity in asked)
+    )
     varied = sorted((target for target in numbered.objects if target.varied >= 0), key=lambda target: target.varied)
     read |= {"variant"} if any(target.num_variants > 1 for target in varied) else set()
     read |= {"object_size"} if any(target.is_sized for target in varied) else set()
     heated = heated_objects(numbered.objects, resolved.objects) if {"object_temperature", "object_material"} & read else ()
     heats = [heat for name in heated if (heat := resolved.objects[name].heat) is not None]
     body_of = {target.name: target.body for target in numbered.objects}
-    fields = [name for name in FIELDS if name in read] + [reading.name for reading in seen.proprioception]
+    fields = [name for name in FIELDS if name in read]
     return Inputs(
         fields=(*fields, *(["dt"] if any(_is_timed(sensor) for sensor in sensors) else [])),
         bodies=numbered.bodies,
@@ -243,11 +249,12 @@ def _inputs(
         heated=heated,
         num_materials=tuple(len(heat.materials) for heat in heats),
         start_temperatures=tuple(heat.temperature if heat.is_per_env else None for heat in heats),
-        joints=seen.joints,
-        actuators=seen.actuators,
+        joints=wanted.joints,
+        actuators=wanted.actuators,
         contacts_of=touched.objects,
         link_parts=touched.links,
         substeps=max((sensor.lowered.substeps for sensor in sensors), default=0) or 1,
+        dt=max((sensor.lowered.timestep * max(sensor.lowered.substeps, 1) for sensor in sensors), default=0.0),
     )
 
 
@@ -287,6 +294,10 @@ def _sensor(
         notes=lowered.notes,
         is_timed=sensor.kind.is_timed,
         substeps=lowered.substeps,
+        upstream=sensor.upstream,
+        provides=tuple(sorted(lowered.provides)),
+        is_random=sensor.kind.is_random,
+        timestep=lowered.timestep,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +11,18 @@ import numpy as np
 from tgdsl.compiler.imperfections import imperfections, knobs_of, measured_spec
 from tgdsl.compiler.resolve import Resolved
 from tgdsl.console.progress import Progress
-from tgdsl.errors import LowerError, TgdslError
+from tgdsl.errors import LowerError, TgdslError, did_you_mean, listed
+from tgdsl.fields.accuracy import Bound
+from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Request
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.sensors import Kind
-from tgdsl.sensors.base import Axis, Lowered, SensorSpec, body_axis, taxel_axis
+from tgdsl.sensors.base import AnySensorSpec, Axis, Fitting, Lowered, ReadSensor, body_axis, taxel_axis
 from tgdsl.sensors.known import check_lowered
-from tgdsl.sensors.noise.lower import LoweredNoise
+from tgdsl.sensors.noise.lower import LoweredNoise, quantity
+from tgdsl.surfaces.surface import Surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +38,18 @@ class LoweredSensor:
         lowered: What its kind says of it.
         readings: Names of its readings, reports left out.
         noise: Its imperfections.
+        upstream: Names of the sensors whose planes it reads, in order.
     """
 
     name: str
     kind: Kind
-    spec: SensorSpec
+    spec: AnySensorSpec
     taxels: np.ndarray
     layout: Layout
     lowered: Lowered
     readings: tuple[str, ...]
     noise: LoweredNoise | None
+    upstream: tuple[str, ...] = ()
 
     @property
     def sensor(self) -> str:
@@ -67,7 +72,23 @@ class LoweredSensor:
         return rows_of(self.lowered, self.layout, self.spec)
 
 
-def rows_of(lowered: Lowered, layout: Layout, spec: SensorSpec) -> Axis:
+class Surfaces:
+    """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
+
+    def __init__(self, resolved: Resolved):
+        """Be those of a document."""
+        self._resolved = resolved
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
+        return self._resolved.surface_of(link, region)
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m]."""
+        return self._resolved.surface_of_object(name)
+
+
+def rows_of(lowered: Lowered, layout: Layout, spec: AnySensorSpec) -> Axis:
     """Return what a sensor's own reading has rows of: what its kind says, else its taxels, or its bodies if it has none."""
     if lowered.rows is not None:
         return lowered.rows
@@ -89,12 +110,84 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
         except LowerError as error:
             path: Path = ("sensors", name, *([error.field] if error.field else []))
             loaded.problems.append(loaded.problem(path, error.what, error.hint))
+    loaded.raise_problems()
+    sensors = fitted(loaded, sensors, resolved.scene.compiled.opt.timestep)
     _check_blocks(loaded, sensors)
     loaded.raise_problems()
     return tuple(sensors)
 
 
-def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: SensorSpec, resolved: Resolved) -> None:
+def fitted(loaded: Loaded, sensors: Sequence[LoweredSensor], timestep: float) -> list[LoweredSensor]:
+    """Return sensors, each fitted to the time step and to those that it reads; what these cannot be is noted.
+
+    Args:
+        loaded: The document.
+        sensors: All sensors.
+        timestep: Time of a physics step of the scene [s].
+    """
+    reading = {sensor.name: _upstream_of(loaded, sensor, sensors) for sensor in sensors}
+    loaded.raise_problems()
+    done: dict[str, LoweredSensor] = {}
+    while ready := [s for s in sensors if s.name not in done and all(name in done for name in reading[s.name])]:
+        for sensor in ready:
+            names = reading[sensor.name]
+            fitting = Fitting(timestep, {name: ReadSensor(done[name].lowered, done[name].rows) for name in names})
+            try:
+                done[sensor.name] = _fitted(sensor, fitting)
+            except LowerError as error:
+                path: Path = ("sensors", sensor.sensor, *([error.field] if error.field else []))
+                loaded.problems.append(loaded.problem(path, error.what, error.hint))
+                done[sensor.name] = sensor
+    if circle := [sensor for sensor in sensors if sensor.name not in done]:
+        names = " → ".join([*(sensor.sensor for sensor in circle), circle[0].sensor])
+        path = ("sensors", circle[0].sensor, circle[0].kind.reads)
+        loaded.problems.append(loaded.problem(path, "sensors read one another in a circle", names))
+    return [done.get(sensor.name, sensor) for sensor in sensors]
+
+
+def _fitted(sensor: LoweredSensor, fitting: Fitting) -> LoweredSensor:
+    """Return a sensor, fitted to those that it reads.
+
+    Raises:
+        TgdslError: If it is not advanced as often as they are.
+    """
+    lowered = sensor.lowered
+    if sensor.kind.fit is not None:
+        lowered = sensor.kind.fit(sensor.spec, lowered, fitting)
+        check_lowered(sensor.kind, lowered, sensor.spec)
+    for name, other in fitting.upstream.items():
+        if other.lowered.substeps != lowered.substeps:
+            own, read = lowered.substeps, other.lowered.substeps
+            what = f'it is advanced at {own} physics steps of a call, and reads "{name}", which is at {read}'
+            raise TgdslError(f'kind "{sensor.kind.name}": {what}; expected as many')
+    return dataclasses.replace(sensor, lowered=lowered, upstream=tuple(fitting.upstream))
+
+
+def _upstream_of(loaded: Loaded, sensor: LoweredSensor, sensors: Sequence[LoweredSensor]) -> tuple[str, ...]:
+    """Return the names of the sensors that one reads, the way without noise of each; what is wrong with them is noted."""
+    asked = sensor.lowered.upstream
+    if asked is None:
+        return ()
+    able = {own.sensor: own for own in sensors if asked.planes <= own.lowered.provides}  # of two ways the second is clean
+    if not asked.sensors:
+        if not able:
+            what = f"no sensor of the document makes {asked.what}, so there is none to read"
+            loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what))
+        return tuple(own.name for own in able.values())
+    for i, name in enumerate(asked.sensors):
+        path: Path = ("sensors", sensor.sensor, sensor.kind.reads, i)
+        kinds = {own.sensor: own.kind.name for own in sensors}
+        if name not in kinds:
+            loaded.problems.append(loaded.problem(path, f'unknown sensor "{name}"', did_you_mean(name, kinds, "sensors")))
+        elif name not in able:
+            what = f'"{name}" ({kinds[name]}) makes no {asked.what}, as it is written'
+            loaded.problems.append(loaded.problem(path, what, f"those that do: {', '.join(able) or 'none'}"))
+        elif name in asked.sensors[:i]:
+            loaded.problems.append(loaded.problem(path, f'sensor "{name}" is listed twice', "name it once"))
+    return tuple(able[name].name for name in asked.sensors if name in able)
+
+
+def _check_places(kind: Kind, lowered: Lowered, layout: Layout, spec: AnySensorSpec, resolved: Resolved) -> None:
     """Refuse requests of objects that are not there, and rows that are not where they say.
 
     Raises:
@@ -127,19 +220,29 @@ def _check_blocks(loaded: Loaded, sensors: Sequence[LoweredSensor]) -> None:
             loaded.problems.append(loaded.problem(("sensors", sensor.sensor), what, "expected as many of all"))
 
 
+def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
+    """Return a spec with the scene's time step, if it has a field `timestep` that is left out."""
+    field = "timestep"
+    if field not in type(spec).model_fields or getattr(spec, field) is not None:
+        return spec
+    return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
+
+
 def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
-    spec = loaded.spec.sensors[name]
+    spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)
-    clean = kind.lower(spec, layout, resolved.surface_of)
+    surfaces = Surfaces(resolved)
+    clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
+    _check_accuracy(loaded, name, clean)
     _check_places(kind, clean, layout, spec, resolved)
     if spec.readout == "clean":
         return [LoweredSensor(name, kind, spec, taxels, layout, clean, (name,), None)]
     knobs = knobs_of(loaded, resolved, name, layout, kind)
     loaded.raise_problems()
     noisy = measured_spec(spec, knobs)
-    lowered = clean if noisy is spec else kind.lower(noisy, layout, resolved.surface_of)
+    lowered = clean if noisy is spec else kind.lower(noisy, layout, surfaces)
     rows = rows_of(lowered, layout, spec)
     noise = imperfections(name, spec, kind, knobs, lowered, rows, layout, loaded.spec.noise)
     both = spec.readout == "both"
@@ -151,3 +254,39 @@ def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[Low
         without = dataclasses.replace(clean, reports={})
         ways.append(LoweredSensor(again, kind, spec, taxels, layout, without, (again,), None))
     return ways
+
+
+def _check_accuracy(loaded: Loaded, name: str, lowered: Lowered) -> None:
+    """Note a sensor's `accuracy` that is not of what it reads."""
+    own = loaded.spec.sensors[name].accuracy
+    if own is None:
+        return
+    units = {quantity(channel.name): channel.unit for channel in lowered.channels}
+    at: Path = ("sensors", name, "accuracy")
+    shown = listed([f"{found} [{unit}]" for found, unit in units.items()])
+    for key, bound in own.bounds:
+        path = (*at, key) if key else at
+        if key and key not in units:
+            what = f'the reading has no quantity "{key}"'
+            loaded.problems.append(loaded.problem(path, what, did_you_mean(key, units, "quantities"), on_key=True))
+        wrong = [found for found in ([key] if key in units else [] if key else units) if not _is_of(bound, units[found])]
+        if wrong:
+            what = f'"{bound.text}" is in {bound.unit}, and the reading has {shown}'
+            loaded.problems.append(loaded.problem(path, what, _hint(units)))
+    missing = [found for found in units if own.of(found) is None]
+    if missing:
+        what = f"nothing is said of {listed(missing)}, which the reading has too"
+        loaded.problems.append(loaded.problem(at, what, "expected a bound of each quantity"))
+
+
+def _is_of(bound: Bound, unit: str) -> bool:
+    return not bound.unit or bound.unit == unit
+
+
+def _hint(units: Mapping[str, str]) -> str:
+    fraction = 'expected a fraction of the largest change, such as "1 %"'
+    if len(units) == 1 or "1" in units.values():
+        amounts = {unit for unit in units.values() if unit != "1"}
+        return f"{fraction}, or an amount in {amounts.pop()}" if len(units) == 1 and amounts else fraction
+    each = ", ".join(f"{name}: {'1 %' if i else f'… {unit}'}" for i, (name, unit) in enumerate(units.items()))
+    return f"{fraction}, or one of each: {{{each}}}"

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tgdsl.compiler.links import joints_matching
 from tgdsl.compiler.resolve import Resolved
-from tgdsl.errors import did_you_mean
-from tgdsl.formats.joints import RobotJoints, robot_joints
+from tgdsl.errors import Problem, did_you_mean
+from tgdsl.formats.joints import RobotJoints
 from tgdsl.layout.layout import Layout
 from tgdsl.observations import observations
-from tgdsl.observations.observations import OfReading, ReadingObservation, ReadingSpec
+from tgdsl.observations.observations import ObservationSpec, OfReading, ReadingObservation, ReadingSpec
 from tgdsl.observations.proprioception import PROPRIOCEPTION, JointObservation, JointSpec
 from tgdsl.plan.sensors import PlannedObservation, PlannedReading, PlannedSensor
 from tgdsl.schema.loaded import Loaded
@@ -27,14 +28,47 @@ class Observed:
     Attributes:
         terms: The observation terms, in the document's order.
         proprioception: Readings of joints and actuators that some of them want.
-        joints: Names of the joints that are read.
-        actuators: Names of the actuators that are read.
     """
 
     terms: tuple[PlannedObservation, ...]
     proprioception: tuple[PlannedReading, ...]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The joints and actuators that a document reads.
+
+    Attributes:
+        rows: Those of each observation term of joints, by group and number, in its order.
+        joints: Names of all joints that are read, by observations and sensors, in the robot's order.
+        actuators: Names of all actuators that are read.
+        problems: What is wrong with the observations' own lists.
+    """
+
+    rows: Mapping[tuple[str, int], tuple[str, ...]]
     joints: tuple[str, ...]
     actuators: tuple[str, ...]
+    problems: tuple[Problem, ...]
+
+
+def wanted(loaded: Loaded, resolved: Resolved) -> Wanted:
+    """Return the joints and actuators that a document reads."""
+    own, chosen, before = resolved.joints, {}, len(loaded.problems)
+    asked: dict[str, set[str]] = {"joint": set().union(*resolved.on_joints.values()), "actuator": set()}
+    for group, i, spec in _terms(loaded):
+        if isinstance(spec, JointObservation):
+            chosen[group, i] = _rows(loaded, ("observations", group, i), spec, own)
+            asked[PROPRIOCEPTION[spec.type].rows].update(chosen[group, i])
+    joints = tuple(name for name in own.joints if name in asked["joint"])
+    actuators = tuple(actuator.name for actuator in own.actuators if actuator.name in asked["actuator"])
+    problems = tuple(loaded.problems[before:])
+    del loaded.problems[before:]
+    return Wanted(chosen, joints, actuators, problems)
+
+
+def _terms(loaded: Loaded) -> list[tuple[str, int, ObservationSpec]]:
+    """Return the observation terms of all groups, with their group and number in it."""
+    return [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
 
 
 def observed(
@@ -42,6 +76,7 @@ def observed(
     resolved: Resolved,
     sensors: Sequence[PlannedSensor],
     layouts: Mapping[str, Layout],
+    read: Wanted,
 ) -> Observed:
     """Return a document's observations; what is wrong with one is noted among the document's problems.
 
@@ -50,17 +85,10 @@ def observed(
         resolved: Its meaning on the robot.
         sensors: The planned sensors.
         layouts: The taxels of each, by its name.
+        read: The joints and actuators that are read.
     """
-    specs = [(group, i, spec) for group, terms in loaded.spec.observations.items() for i, spec in enumerate(terms)]
-    own = robot_joints(resolved.robot, resolved.scene)
-    chosen: dict[tuple[str, int], tuple[str, ...]] = {}
-    asked: dict[str, set[str]] = {"joint": set(), "actuator": set()}
-    for group, i, spec in specs:
-        if isinstance(spec, JointObservation):
-            chosen[group, i] = _rows(loaded, ("observations", group, i), spec, own)
-            asked[PROPRIOCEPTION[spec.type].rows].update(chosen[group, i])
-    joints = tuple(name for name in own.joints if name in asked["joint"])
-    actuators = tuple(actuator.name for actuator in own.actuators if actuator.name in asked["actuator"])
+    loaded.problems += read.problems
+    specs, own, joints, actuators = _terms(loaded), resolved.joints, read.joints, read.actuators
     found = {reading.name: (reading, layouts[sensor.name]) for sensor in sensors for reading in sensor.readings}
     terms: list[PlannedObservation] = []
     for group, i, spec in specs:
@@ -68,12 +96,12 @@ def observed(
             terms += _of_reading(loaded, group, i, spec, found)
         elif isinstance(spec, JointObservation):
             rows = joints if PROPRIOCEPTION[spec.type].rows == "joint" else actuators
-            terms.append(_of_joints(group, i, spec, chosen[group, i], rows))
+            terms.append(_of_joints(group, i, spec, read.rows[group, i], rows))
         else:
             count = observations.HAND_ONLY.get(spec.type, 0)
             terms.append(PlannedObservation(group, i, spec.type, None, (), count, {}))
     types = {spec.type for _, _, spec in specs}
-    return Observed(tuple(terms), _proprioception(types, joints, actuators, own), joints, actuators)
+    return Observed(tuple(terms), _proprioception(types, joints, actuators, own))
 
 
 def _of_reading(
@@ -132,7 +160,7 @@ def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tupl
             what = f"the robot has no actuated joints, so there is no {spec.type} of them"
             loaded.problems.append(loaded.problem(path, what, hint))
     for k, pattern in enumerate(spec.joints or ()):
-        hits = _matched(loaded, (*path, "joints", k), pattern, own)
+        hits = joints_matching(loaded, (*path, "joints", k), pattern, own)
         if not is_of_joints and hits:
             joints, hits = hits, [actuator.name for actuator in own.actuators if set(actuator.joints) & set(hits)]
             if not hits:
@@ -143,17 +171,6 @@ def _rows(loaded: Loaded, path: Path, spec: JointSpec, own: RobotJoints) -> tupl
         what = f"{'a joint' if is_of_joints else 'an actuator'} of the robot that this is of has no name"
         loaded.problems.append(loaded.problem(path, what, "name it in the robot's file"))
     return tuple(wanted)
-
-
-def _matched(loaded: Loaded, path: Path, pattern: str, own: RobotJoints) -> list[str]:
-    hits = matching(pattern, [name for name in own.joints if name])
-    if not hits:
-        known = [name for name in (*own.joints, *own.others) if name]
-        what, hint = f'no joint of the robot matches "{pattern}"', did_you_mean(pattern, known, "joints")
-        if matching(pattern, own.others):
-            what, hint = f'"{pattern}" is a ball or free joint', "it has no single position; expected hinges and slides"
-        loaded.problems.append(loaded.problem(path, what, hint))
-    return hits
 
 
 def _proprioception(

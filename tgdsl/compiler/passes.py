@@ -107,7 +107,8 @@ def _equation(sensor: LoweredSensor) -> Hashable | None:
     """Return what sensors that can be computed as one have in common; None of one that never can."""
     lowered, kind = sensor.lowered, sensor.kind
     has_own = lowered.state or lowered.reports or sensor.radius_noise or any(c.ndim for c in lowered.constants.values())
-    if not kind.is_pointwise or has_own or lowered.substeps or kind.is_timed or not _is_measuring(sensor):
+    others = lowered.provides or lowered.upstream or lowered.substeps
+    if not kind.is_pointwise or has_own or others or kind.is_timed or not _is_measuring(sensor):
         return None
     asked = tuple(request.join_key() for request in sensor.requests)
     return kind.name, sensor.name != sensor.sensor, asked, lowered.channels, tuple(sorted(lowered.constants))

@@ -1,27 +1,27 @@
-"""The whole way from a document to a module: load, resolve, lower, freeze the scene."""
+"""The whole way from a document to a Plan: load, resolve, lower, freeze the scene."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
+import warnings
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from os import PathLike
 from typing import Any, NamedTuple
 
 import mujoco
-import torch
 
 from tgdsl.compiler import lower
 from tgdsl.compiler.resolve import resolve
 from tgdsl.compiler.scene import scene_file
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import TgdslError, did_you_mean, listed
 from tgdsl.formats.mjcf import xml_files
 from tgdsl.layout.layout import Layout
 from tgdsl.layout.unfelt import Unfelt
-from tgdsl.module.module import TactileModule
 from tgdsl.placement.reach import unfelt
 from tgdsl.plan.plan import Origin, Plan
 from tgdsl.scene.scene import portable
@@ -29,9 +29,30 @@ from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
 from tgdsl.sensors import Kind
 from tgdsl.sensors.known import known_kinds
-from tgdsl.tensors.devices import device_of, dtype_of
 
 Document = str | PathLike[str] | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen.
+
+    Attributes:
+        changes: Fields that nobody wrote, by dotted path: `objects.mug.tolerance`.
+        notes: What an account of each sensor that has an `accuracy` says of it, line by line.
+    """
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def noted(self, plan: Plan) -> Plan:
+        """Return a Plan that says why its fields are what they are."""
+        sensors = [dataclasses.replace(own, notes=(*own.notes, *self.notes.get(own.name, ()))) for own in plan.sensors]
+        return dataclasses.replace(plan, sensors=tuple(sensors))
+
+
+UNCHOSEN = Choice()
+"""Of documents without an `accuracy`."""
 
 
 def compile_plan(
@@ -40,6 +61,7 @@ def compile_plan(
     kinds: Sequence[Kind] = (),
     progress: Progress | None = None,
     sensors: Collection[str] | None = None,
+    choice: Choice = UNCHOSEN,
 ) -> Plan:
     """Return the Plan of a document.
 
@@ -49,17 +71,43 @@ def compile_plan(
         kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
         progress: Is told in a line what is being done, each time that something begins.
         sensors: Names of the document's sensors that are wanted; default: all.
+        choice: What was chosen where sensors have an `accuracy`: see `tuning.compile`, which chooses.
 
     Raises:
         SpecError: All mistakes in the document and its layout, with file, line and column.
         RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        TgdslError: If a sensor has an `accuracy` and nothing was chosen.
     """
     known, tell = known_kinds(kinds), progress or silent
-    loaded = load(document, overrides, known, sensors=sensors)
+    loaded = load(document, {**(overrides or {}), **choice.changes}, known, sensors=sensors)
     resolved = resolve(loaded, tell)
-    plan = lower.plan(loaded, resolved, known, _origin(loaded), tell)
+    _check_chosen(loaded, choice)
+    written = _written(document, overrides, known, sensors) if choice.changes else loaded
+    plan = lower.plan(loaded, resolved, known, _origin(written), tell)
     tell("compiling the scene")
-    return dataclasses.replace(plan, scene=scene_file(resolved.scene, plan.inputs, resolved.own))
+    scene = scene_file(resolved.scene, plan.inputs, resolved.own, resolved.primitives)
+    return choice.noted(dataclasses.replace(plan, scene=scene))
+
+
+def _check_chosen(loaded: Loaded, choice: Choice) -> None:
+    """Refuse a document some `accuracy` of which nobody has looked at.
+
+    Raises:
+        TgdslError: With the sensors.
+    """
+    names = [name for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None and name not in choice.notes]
+    if names:
+        what = f"{listed(names)}: `accuracy` takes a run of the scene"
+        raise TgdslError(f"{loaded.source.file}: {what}; compile with `tgdsl.compile`, or set it to null")
+
+
+def _written(
+    document: Document, overrides: Mapping[str, Any] | None, kinds: tuple[Kind, ...], sensors: Collection[str] | None
+) -> Loaded:
+    """Return a document as it is written, what was chosen left out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
+        return load(document, overrides, kinds, sensors=sensors)
 
 
 class Placed(NamedTuple):
@@ -119,49 +167,6 @@ def placed(
     each = {name: resolve(load(document, text, known, needs_sensors=False)) for name, text in texts.items()}
     found = {name: unfelt(own.colliders, own.layout, own.reach) for name, own in each.items()}
     return Placed(each[wanted[0]].scene.compiled, {name: own.layout for name, own in each.items()}, found)
-
-
-def compile(
-    document: Document,
-    *,
-    resolution: str | None = None,
-    sensors: Collection[str] | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    kinds: Sequence[Kind] = (),
-    dtype: torch.dtype | str = torch.float32,
-    device: torch.device | str = "cpu",
-    progress: Progress | None = None,
-) -> TactileModule:
-    """Compile a document to a module.
-
-    Args:
-        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
-        resolution: Instead of the document's own.
-        sensors: Names of the document's sensors that are wanted: of the others nothing is computed; default: all.
-        overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
-        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
-        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
-            are refused, as their rounding of places is as large as the depths; cast the readings instead,
-            `readings["s"].to(torch.bfloat16)`.
-        device: Where the module lives.
-        progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
-            that are met for the first time take seconds.
-
-    Returns:
-        The module, not yet compiled by torch: call its `compile()` for fused kernels.
-
-    Raises:
-        SpecError: All mistakes in the document and its layout, with file, line and column.
-        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
-        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
-            no mapping.
-    """
-    dtype, device = dtype_of(dtype), device_of(device)
-    if not isinstance(overrides, Mapping | None):
-        raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
-    chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
-    plan = compile_plan(document, chosen, kinds, progress, sensors)
-    return TactileModule(plan, known_kinds(kinds), dtype).to(device)
 
 
 def _origin(loaded: Loaded) -> Origin:

@@ -6,23 +6,29 @@ from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
-from tgdsl.compiler.links import LinkBodies, link_bodies
+from tgdsl.compiler.links import LinkBodies, check_named_bodies, link_bodies, sensor_joints
 from tgdsl.compiler.objects import own_objects, sensed_objects
 from tgdsl.compiler.patches import Patch, check_groups, check_regions, matched, names_of, patches_of, reporter, sampled
 from tgdsl.compiler.variants import OwnObjects
 from tgdsl.console.progress import Progress, silent
-from tgdsl.errors import LowerError, Problem, RobotError, SampleError, did_you_mean, listed
+from tgdsl.errors import LowerError, Problem, RobotError, SampleError, SpecError, did_you_mean, listed
 from tgdsl.fields.models import Selection
 from tgdsl.fields.regions import RegionPart
-from tgdsl.files.find import is_file, robot_names
+from tgdsl.files.find import colliders_file, is_file, robot_names
+from tgdsl.formats.joints import RobotJoints, robot_joints
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
 from tgdsl.layout.layout import Layout, Link
 from tgdsl.placement.reach import Colliders, Reach, reach
+from tgdsl.plan.scene import Collider
+from tgdsl.scene.colliders import with_colliders
+from tgdsl.schema.colliders import load_colliders
 from tgdsl.schema.loaded import Loaded, LoadedLayout
 from tgdsl.schema.select import select
 from tgdsl.schema.yaml import Path
+from tgdsl.sensors.base import SensorSpec
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.region import clip
 from tgdsl.surfaces.sensed import SensedObject
@@ -46,6 +52,9 @@ class Resolved:
         reach: What that leaves of each taxel.
         on_links: The sensors that have a place on each link, whatever its taxels.
         link_bodies: The bodies of each link that carries taxels or is a sensor's.
+        joints: The robot's joints and actuators.
+        on_joints: Names of the joints of each sensor that is on joints.
+        primitives: What links collide with in the scene in place of their own geoms.
     """
 
     layout: Layout
@@ -60,6 +69,9 @@ class Resolved:
     reach: Reach
     on_links: frozenset[str]
     link_bodies: LinkBodies
+    joints: RobotJoints
+    on_joints: Mapping[str, tuple[str, ...]]
+    primitives: tuple[Collider, ...] = ()
 
     def surface_of(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame.
@@ -80,6 +92,31 @@ class Resolved:
         except SampleError as error:
             raise LowerError(error.what, hint=error.hint) from error
 
+    def moved_by(self, joint: str) -> str:
+        """Return the body that a joint moves."""
+        model = self.scene.compiled
+        return model.body(model.jnt_bodyid[model.joint(joint).id]).name
+
+    def anchor_of(self, joint: str) -> Float[np.ndarray, 3]:
+        """Return where a joint's anchor is in the frame of the body that it moves [m]."""
+        return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
+
+    def surface_of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms in its body's frame [m], meshes as they are, not their hulls.
+
+        Raises:
+            LowerError: If one of its geoms has no bounded surface.
+        """
+        parts = []
+        for own in self.objects[name].variants[0]:
+            mesh = own.surface if own.mesh is None else own.mesh
+            try:
+                placed = self.scene.surface((own.geom,)) if mesh is None else mesh.placed(own.geom.pos, own.geom.rotation)
+            except RobotError as error:
+                raise LowerError(str(error), field="feels") from error
+            parts.append(placed)
+        return Surface.joined(parts)
+
     def geoms_of(self, link: str) -> tuple[SurfaceGeom, ...]:
         """Return the geoms that a link's taxels sit on: meshes as they are, or their convex hulls if the layout says so."""
         triangles = self.robot.hull if self.patches[link].as_collided else self.robot.mesh
@@ -90,7 +127,8 @@ class Resolved:
         """Return the taxels of a sensor, and its layout; of one that is on links, no taxels and the links."""
         names = self.links[sensor]
         if sensor in self.on_links:
-            links = tuple(Link(name, name) for name in names)
+            joints = self.on_joints.get(sensor, ())
+            links = (*(Link(name, name) for name in names), *(Link(name, self.moved_by(name)) for name in joints))
             return np.zeros(0, dtype=np.int64), Layout.of_links(links, self.layout.groups)
         taxels = self.layout.taxels_of(names)
         return taxels, self.layout.take(taxels)
@@ -112,7 +150,8 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     patches: list[Patch] = []
     links: dict[str, tuple[str, ...]] = {}
     objects: dict[str, SensedObject] = {}
-    own = OwnObjects()
+    own, primitives = OwnObjects(), ()
+    joints, on_joints = RobotJoints((), 0, frozenset(), (), ()), {}
     on_links = frozenset(name for name, own in loaded.spec.sensors.items() if loaded.is_without_layout or not own.is_on_taxels)
     if robot is not None and loaded.is_without_layout:
         links = _sensor_links(loaded, {}, robot, [], on_links)
@@ -125,7 +164,12 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     if robot is not None and scene is not None:
         _check_bodies(loaded, robot, scene, patches)
         scene, own = own_objects(loaded, scene, {patch.link.body for patch in patches})
+        primitives = _primitives(loaded, scene)
+        scene = scene.changed(lambda spec: with_colliders(spec, primitives)) if primitives else scene
         objects = sensed_objects(loaded, scene, own)
+        check_named_bodies(loaded, scene)
+        joints = robot_joints(robot, scene)
+        on_joints = dict(sensor_joints(loaded, joints))
     loaded.raise_problems()
     assert robot is not None and scene is not None
     needed = {link for name, own in links.items() for link in own if name not in on_links}
@@ -144,7 +188,7 @@ def resolve(loaded: Loaded, progress: Progress = silent) -> Resolved:
     rigid = {i for bodies in (*(sensed.bodies for sensed in objects.values()), *parts_of.values()) for i in bodies}
     unused += [(f"body {body}", why) for body, why in _unlisted(robot, scene, listed_bodies, rigid)]
     by_link, within = {p.link.name: p for p in patches}, reach(colliders, layout, felt)
-    own_links = (on_links, parts_of)
+    own_links = (on_links, parts_of, joints, on_joints, primitives)
     return Resolved(layout, links, objects, own, scene, robot, tuple(unused), by_link, colliders, within, *own_links)
 
 
@@ -210,6 +254,29 @@ def _models(loaded: Loaded) -> tuple[Model | None, Model | None]:
     return robot, scene
 
 
+def _primitives(loaded: Loaded, scene: Model) -> tuple[Collider, ...]:
+    """Return the primitive colliders that the document asks for: those of a file beside the robot's."""
+    if loaded.spec.robot.collision != "primitive" or loaded.robot_file is None:
+        return ()
+    place, file = ("robot", "collision"), colliders_file(loaded.robot_file)
+    if file is None:
+        beside = loaded.robot_file.with_name("colliders.yaml")
+        what = f'"{loaded.spec.robot.model}" has no primitive colliders: there is no file {beside}'
+        loaded.problems.append(loaded.problem(place, what, "expected `collision: mesh`, or such a file"))
+        return ()
+    try:
+        found = load_colliders(file)
+    except SpecError as error:
+        loaded.problems += error.problems
+        return ()
+    unknown = [own.body for own in found if own.body not in scene.bodies]
+    if unknown:
+        what = f'{file.name} has colliders of "{unknown[0]}", which is no body of the scene'
+        loaded.problems.append(loaded.problem(place, what, did_you_mean(unknown[0], scene.bodies, "bodies")))
+        return ()
+    return found
+
+
 def _is_foreign(loaded: Loaded, layout: LoadedLayout, robot: Model) -> bool:
     """Return whether a layout is for another robot, which is then one mistake: none of its links is on this one."""
     keys = list(dict.fromkeys(key for placements in layout.spec.resolutions.values() for key in placements))
@@ -231,6 +298,9 @@ def _sensor_links(
     links: dict[str, tuple[str, ...]] = {}
     for name, sensor in loaded.spec.sensors.items():
         path: Path = ("sensors", name, "links")
+        if not isinstance(sensor, SensorSpec):
+            links[name] = ()
+            continue
         check_regions(loaded, sensor, path[:-1], robot, loaded.problems)
         if name in on_links:
             links[name] = _links_chosen(loaded, groups, robot, name)

@@ -14,7 +14,7 @@ from tgdsl.compiler.variants import OwnObjects, as_worldbody, start_qpos
 from tgdsl.errors import RobotError, listed
 from tgdsl.formats.model import Model
 from tgdsl.plan.inputs import ContactPart, Inputs, Touching, contact_sensor_names
-from tgdsl.plan.scene import Asset, SceneFile
+from tgdsl.plan.scene import Asset, Collider, SceneFile
 from tgdsl.scene.asset_paths import ENDINGS, FOLDER_ATTRIBUTES
 from tgdsl.scene.compare import differing_fields
 from tgdsl.scene.mujoco_warnings import muted_mujoco
@@ -129,7 +129,7 @@ def _below(body: mujoco.MjsBody) -> list[mujoco.MjsGeom]:
     return [*body.geoms, *(geom for child in body.bodies for geom in _below(child))]
 
 
-def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> SceneFile:
+def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None, colliders: tuple[Collider, ...] = ()) -> SceneFile:
     """Return a scene with the contact sensors that a module wants, as text, and the objects that have geoms of their own.
 
     The text is that of the scene's own files, to the letter but for file names: files and assets are named by content, so
@@ -163,6 +163,7 @@ def scene_file(model: Model, inputs: Inputs, own: OwnObjects | None = None) -> S
         parts=dict(sorted(kept.parts.items())),
         assets=tuple(sorted(kept.assets.values(), key=lambda asset: asset.key)),
         objects=own.objects,
+        colliders=colliders,
     )
     try:
         again = compiled(scene, kept.contents)

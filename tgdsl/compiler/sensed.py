@@ -18,6 +18,8 @@ from tgdsl.surfaces.sensed import DistanceOptions, ObjectHeat, SensedObject
 
 Report = Callable[[str, str], None]
 """Called with what is wrong with an object, and a hint."""
+LEAST_VOLUME = 1e-9
+"""Volume over area^3/2 up to which it is rounding, as where faces of an open surface do not agree which side is out."""
 
 
 def sensed_object(
@@ -83,7 +85,7 @@ def _heat(felt: Sequence[Sequence[SurfaceGeom]], body: str, target: ObjectSpec, 
             report(f'{own.geom.shown} of body "{body}" has no volume that could hold heat', hint)
             return None
     each = [bulk(geoms) for geoms in felt]
-    if not all(one.volume > 0 for one in each):
+    if not all(one.volume > LEAST_VOLUME * one.area**1.5 for one in each):
         report(f'the geoms of body "{body}" enclose no volume that could hold heat', "")
         return None
     start = target.temperature

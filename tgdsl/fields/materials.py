@@ -1,4 +1,4 @@
-"""Materials by name or by numbers: how they conduct, hold and radiate heat, and how stiff they are.
+"""Materials by name or by numbers: how they conduct, hold and radiate heat, how stiff they are, and how they ring.
 
 Numbers are those at room temperature. Where a source gives a range, the table has its middle. Sources:
 
@@ -10,13 +10,20 @@ Numbers are those at room temperature. Where a source gives a range, the table h
 - Crawford: *Plastics Engineering*, 3rd ed., table 1.8; FLIR: tables of emissivities in the manuals of its cameras;
 - Sylgard 184: Dow, its data sheet; Mark: *Polymer Data Handbook*; Johnston et al., J. Micromech. Microeng. 24, 2014;
 - USDA: *Wood Handbook*, tables 5-1 and 5-2;
-- IT'IS: Foundation for Research on Information Technologies in Society, database of tissue properties, v4.
+- IT'IS: Foundation for Research on Information Technologies in Society, database of tissue properties, v4;
+- Jin: Jin, Xu, Gao, Wu, Wang, Li, *DiffSound*, SIGGRAPH 2024, materials of its published code: Rayleigh's damping by ear, of
+  whole objects in air;
+- Cremer: Cremer, Heckl, *Structure-Borne Sound*, loss factors η in bending, of the material alone: air and supports take more;
+- Adams: Adams, Askenazi, *Building Better Products with Finite Element Analysis*, damping ratio η/2 of rubber.
+
+A loss factor stands as Rayleigh's damping that has it at 1 kHz, where that has its minimum.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from math import pi
 from types import MappingProxyType
 from typing import Annotated, Any
 
@@ -40,6 +47,8 @@ class Material:
         youngs_modulus: Young's modulus E [Pa]; None where it means little, as of a liquid.
         poissons_ratio: Poisson's ratio ν; None where it means little.
         source: Where the numbers are from.
+        mass_damping: Rayleigh's α [1/s]: a mode of angular frequency ω decays as e^(−dt), d = (α + β ω²)/2. None if unknown.
+        stiffness_damping: Rayleigh's β [s]; None if unknown.
     """
 
     name: str
@@ -50,11 +59,39 @@ class Material:
     youngs_modulus: Annotated[float | None, Usual("pressure", low=1e3, high=1.2e12)]
     poissons_ratio: float | None
     source: str
+    mass_damping: float | None = None
+    stiffness_damping: float | None = None
 
+    def damped(self, mass_damping: float, stiffness_damping: float, source: str) -> Material:
+        """Return the material with Rayleigh's damping α [1/s] and β [s], and where these are from."""
+        return replace(self, mass_damping=mass_damping, stiffness_damping=stiffness_damping, source=f"{self.source}; {source}")
+
+
+def rayleigh(loss_factor: float, frequency: float = 1000.0) -> tuple[float, float]:
+    """Return α [1/s] and β [s] whose loss factor 2d/ω has its minimum at a frequency [Hz], and is given there."""
+    omega = 2 * pi * frequency
+    return loss_factor * omega / 2, loss_factor / (2 * omega)
+
+
+_DAMPING = {
+    "glass": (1.0, 1e-7, "α, β: Jin"),
+    "steel": (5.0, 3e-8, "α, β: Jin"),
+    "stainless_steel": (5.0, 3e-8, "α, β: Jin, as steel"),
+    "aluminium": (*rayleigh(1e-4), "η 1e-4: Cremer"),
+    "anodized_aluminium": (*rayleigh(1e-4), "η 1e-4: Cremer"),
+    "copper": (*rayleigh(2e-3), "η 2e-3: Cremer"),
+    "brass": (*rayleigh(1e-3), "η 1e-3: Cremer, at most"),
+    "abs": (30.0, 1e-6, "α, β: Jin, as plastic"),
+    "pla": (30.0, 1e-6, "α, β: Jin, as plastic"),
+    "rubber": (*rayleigh(0.1), "η 0.1: Adams"),
+    "silicone": (*rayleigh(0.1), "η 0.1: Adams, as rubber"),
+    "wood": (60.0, 2e-6, "α, β: Jin"),
+}
+"""Rayleigh's damping of materials, α [1/s] and β [s], and its source."""
 
 MATERIALS: Mapping[str, Material] = MappingProxyType(
     {
-        material.name: material
+        material.name: material.damped(*_DAMPING[material.name]) if material.name in _DAMPING else material
         for material in (
             Material("glass", 1.4, 2500.0, 750.0, 0.925, 71.3e9, 0.22, "Incropera: plate, window; Kaye: crown glass"),
             Material(
@@ -121,6 +158,10 @@ class OwnMaterial(SpecModel):
     """Young's modulus [Pa]; default: unknown."""
     poissons_ratio: Annotated[float | None, Quantity("number", ge=0.0, le=0.5)] = None
     """Poisson's ratio, from 0 to 0.5; default: unknown."""
+    mass_damping: Annotated[float | None, Quantity("number", ge=0.0)] = None
+    """Rayleigh's damping α [1/s]: modes decay at (α + β ω²)/2; default: unknown."""
+    stiffness_damping: Annotated[float | None, Quantity("time", ge=0.0)] = None
+    """Rayleigh's damping β [s]; default: unknown."""
 
     @model_validator(mode="after")
     def _check(self) -> OwnMaterial:

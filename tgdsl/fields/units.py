@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -69,6 +69,23 @@ def parse(value: object, dimension: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{value} is not finite, expected {wanted}")
     return value
+
+
+def unit_of(value: str) -> str:
+    """Return the unit that stands behind a number in a text; empty: there is none, or the text is no quantity."""
+    match = _QUANTITY.match(value)
+    return (match[2] or "") if match else ""
+
+
+def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
+    """Return which of some dimensions a text's unit is of; None: of none of them.
+
+    Args:
+        value: Such as `"4 mm"`.
+        dimensions: Keys of `UNITS`.
+    """
+    unit = unit_of(value.translate(_SPELLINGS))
+    return next((dimension for dimension in dimensions if unit in UNITS[dimension]), None)
 
 
 def _example(known: Mapping[str, float]) -> str:

@@ -42,8 +42,17 @@ def robot_file(model: str, folder: Path) -> Path | None:
 
 def layout_file(model: Path) -> Path | None:
     """Return the layout beside a model file: of `hand_left.xml` in `hand/` it is `layout_left.yaml`, or else `layout.yaml`."""
+    return _beside(model, "layout")
+
+
+def colliders_file(model: Path) -> Path | None:
+    """Return the colliders beside a model file: of `hand_left.xml` it is `colliders_left.yaml`, or else `colliders.yaml`."""
+    return _beside(model, "colliders")
+
+
+def _beside(model: Path, name: str) -> Path | None:
     side = model.stem.removeprefix(f"{model.parent.name}_")
-    names = (f"layout_{side}.yaml", "layout.yaml")
+    names = (f"{name}_{side}.yaml", f"{name}.yaml")
     return next((model.parent / name for name in names if (model.parent / name).is_file()), None)
 
 

@@ -26,7 +26,8 @@ def read_mjcf(path: Path) -> Model:
     spec = mujoco.MjSpec.from_file(str(path))
     refuse_unreadable(path, spec)
     rewritten = rewrite_meshes(spec)
-    return Model(path, spec, spec.compile(), is_urdf=False, rewritten=rewritten)
+    compiled = spec.copy().compile()  # of which the spec remembers nothing, such as hulls that other geoms do not need
+    return Model(path, spec, compiled, is_urdf=False, rewritten=rewritten)
 
 
 def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:

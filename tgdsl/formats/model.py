@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from tgdsl.errors import RobotError
+from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.surfaces.geom import Geom
 from tgdsl.surfaces.surface import Surface
 
@@ -52,6 +53,20 @@ class Model:
     is_urdf: bool
     mjcf: str = ""
     rewritten: Mapping[str, Path] = field(default_factory=dict)
+
+    def changed(self, change: Callable[[mujoco.MjSpec], object]) -> Model:
+        """Return the model with a change of its spec, compiled anew.
+
+        Raises:
+            RobotError: If MuJoCo cannot compile it, or what the change raises.
+        """
+        spec = self.spec.copy()
+        change(spec)
+        try:
+            with muted_mujoco():
+                return replace(self, spec=spec, compiled=spec.compile())
+        except ValueError as error:
+            raise RobotError(f"{self.file}: {' '.join(str(error).split())}") from error
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import math
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any, no_type_check
@@ -99,6 +100,19 @@ class TriangleMesh:
             inputs += [wp.from_torch(out[0], dtype=wp.float64), wp.from_torch(out[1], dtype=wp.vec3d)]
             stream = wp.stream_from_torch(point.device) if point.is_cuda else None
             wp.launch(_kernel(wp), dim=len(point), inputs=inputs, device=mesh.device, stream=stream)
+
+
+_NODE_OPERATIONS, _FACE_OPERATIONS = 40, 100
+"""Of a box of the hierarchy that a search opens, and of a face whose nearest point is found, about."""
+
+
+def query_operations(point: Tensor, which: Tensor, keys: Sequence[int]) -> int:
+    """Return how many elementary operations `mesh_distance` takes, about: two descents of a hierarchy for each point.
+
+    One is for the nearest face, one for the winding number; of each level some two boxes are opened, and some eight faces.
+    """
+    num_faces = max(len(_MESHES[key].faces) for key in keys)
+    return 2 * len(point) * round(2 * math.log2(num_faces + 1) * _NODE_OPERATIONS + 8 * _FACE_OPERATIONS)
 
 
 _SCHEMA = "(Tensor point, Tensor which, int[] keys, float max_distance) -> (Tensor, Tensor)"

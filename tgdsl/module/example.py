@@ -48,7 +48,7 @@ def example_state(inputs: Inputs, num_envs: int, seed: int, dtype: torch.dtype, 
     if "contact_force" in values:
         values |= _contacts(values, inputs, spread)
     if "dt" in inputs.fields:
-        values["dt"] = 0.01
+        values["dt"] = inputs.dt or 0.01
     if inputs.substeps > 1:
         one = dataclasses.replace(inputs, substeps=1, fields=tuple(name for name in inputs.fields if name != "dt"))
         seeds = torch.randint(2**62, (inputs.substeps - 1,), generator=generator).tolist()

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Shaped
 
 from tgdsl.layout.unfelt import unfelt_ids
+from tgdsl.module.counting import OperationCounter
 from tgdsl.module.example import example_state
 from tgdsl.module.memory.memory import Memory
 from tgdsl.module.outputs import outputs_of
@@ -20,7 +21,6 @@ from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.quantities.base import Quantity
 from tgdsl.sensors.noise.lower import quantity
 from tgdsl.tensors.buffers import Constants
-from tgdsl.tensors.torch_internals import TorchDispatchMode
 
 Core = Callable[[dict[str, torch.Tensor], dict[str, torch.Tensor]], Any]
 """Computes readings and the new state: `TactileModule.core`."""
@@ -36,41 +36,8 @@ class Explained(NamedTuple):
     core: Core
 
 
-class _OperationCounter(TorchDispatchMode):
-    """Counts the elements that pointwise and matrix operations write: what an eager run computes."""
-
-    FREE = frozenset(
-        [
-            "view",
-            "select",
-            "slice",
-            "t",
-            "transpose",
-            "unsqueeze",
-            "squeeze",
-            "detach",
-            "alias",
-            "expand",
-            "clone",
-            "unbind",
-            "to_copy",
-        ]
-    )
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.elements = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        name = func.__name__.split(".")[0].lstrip("_")
-        if isinstance(result, torch.Tensor) and name not in self.FREE:
-            self.elements += result.numel()
-        return result
-
-
 def operations_per_env(touch: Explained) -> int:
-    """Return how many elementary operations one environment takes, counted in an eager run."""
+    """Return how many elementary operations one environment takes, counted in an eager run: see `OperationCounter`."""
     counts = []
     for num_envs in (2, 4):
         state = example_state(touch.plan.inputs, num_envs, 0, torch.float64, 0.03).to(touch.constants.device)
@@ -79,7 +46,7 @@ def operations_per_env(touch: Explained) -> int:
         tensors = {name: torch.as_tensor(getattr(state, name)) for name in touch.plan.inputs.fields}
         for i, part in enumerate(state.substeps):
             tensors |= {f"substep/{i}/{name}": getattr(part, name) for name in touch.plan.inputs.fields if name != "dt"}
-        with torch.no_grad(), _OperationCounter() as counter:
+        with torch.no_grad(), OperationCounter() as counter:
             touch.core(tensors, held)
         counts.append(counter.elements)
     return (counts[1] - counts[0]) // 2
@@ -132,7 +99,8 @@ def _links(touch: Explained) -> list[str]:
 
 
 def _sensor(touch: Explained, sensor: PlannedSensor) -> list[str]:
-    where = f"{len(sensor.taxels)} taxels" if len(sensor.taxels) else f"{len(sensor.links)} links"
+    what, rows = len(sensor.taxels) or len(sensor.links), sensor.readings[0].rows
+    where = f"{what} {'taxels' if len(sensor.taxels) else 'joints' if rows == 'joint' else 'links'}" if what else "on no link"
     lines = [f"{sensor.name}: {sensor.kind}, {where}, {_remembers(touch, sensor)}"]
     for reading in sensor.readings:
         channels = ", ".join(f"{name} [{unit}]" for name, unit in zip(reading.channels, reading.units, strict=True))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 
 import torch
 from jaxtyping import Bool
@@ -16,15 +17,27 @@ from tgdsl.errors import StateError
 from tgdsl.module.slot_watch import SlotWatch
 from tgdsl.module.state import SceneState
 from tgdsl.plan.plan import Plan
+from tgdsl.sensors.base import Kind
+from tgdsl.tensors.buffers import Constants
 from tgdsl.tensors.env_ids import EnvIds, env_mask
+
+SAME_TIME = 1e-9
+"""Relative difference up to which two times are one: what is left when a call's time is divided by its substeps."""
 
 
 class Incoming:
     """Takes states apart for a module, and warns once of what is odd about them."""
 
-    def __init__(self, plan: Plan):
-        """Begin; nothing has come in."""
-        self._plan = plan
+    def __init__(self, plan: Plan, kinds: Mapping[str, Kind], constants: Constants):
+        """Begin; nothing has come in.
+
+        Args:
+            plan: The plan.
+            kinds: The kind of each sensor, by the sensor's name.
+            constants: The module's constants, of which some may depend on the time between calls.
+        """
+        self._plan, self._kinds, self._constants = plan, kinds, constants
+        self._timesteps = {sensor.name: sensor.timestep for sensor in plan.sensors if sensor.timestep}
         self._dt: tuple[float, Tensor] | None = None
         self._warned: set[str] = set()
         self.slot_watch = SlotWatch(plan.inputs)
@@ -100,10 +113,27 @@ class Incoming:
             raise StateError(f"SceneState.dt is {dt}, expected a finite time above 0 s")
         if self._dt is None or self._dt[0] != dt:
             self._look_at_rates(dt)
+            self._retime(dt)
         if self._dt is None or self._dt[0] != dt or self._dt[1].device != device or self._dt[1].dtype != dtype:
             with torch.inference_mode(False):
                 self._dt = dt, torch.tensor(dt, dtype=dtype, device=device)
         return self._dt[1]
+
+    def _retime(self, dt: float) -> None:
+        """Make constants anew that are made for another time between the calls of a kind, and warn of it the first time."""
+        for sensor in (sensor for sensor in self._plan.sensors if sensor.name in self._timesteps):
+            own, retimed = dt / max(sensor.substeps, 1), self._kinds[sensor.name].retimed
+            if math.isclose(own, self._timesteps[sensor.name], rel_tol=SAME_TIME):
+                continue
+            if math.isclose(own, sensor.timestep, rel_tol=SAME_TIME):
+                own = sensor.timestep
+            elif sensor.sensor not in self._warned:
+                self._warned.add(sensor.sensor)
+                what = f'"{sensor.sensor}" is compiled for {sensor.substeps or 1} steps of {sensor.timestep:g} s per call'
+                warnings.warn(f"{what}, and the state's dt is {dt:g} s: it counts steps of {own:g} s", stacklevel=6)
+            self._timesteps[sensor.name] = own
+            for name, value in ({} if retimed is None else retimed(sensor.constants, own)).items():
+                self._constants.overwrite(f"sensors/{sensor.name}/{name}", value)
 
     def _look_at_rates(self, dt: float) -> None:
         """Warn of sensors that would take samples more often than they are called, the first time."""

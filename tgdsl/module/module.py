@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable, TaxelTables
@@ -22,11 +22,11 @@ from tgdsl.module.example import example_state
 from tgdsl.module.explain import Explained, explain, operations_per_env
 from tgdsl.module.gathering import bind, constant_arrays
 from tgdsl.module.incoming import Incoming
-from tgdsl.module.memory.memory import WINDOW, Memory, kept, store
-from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows
+from tgdsl.module.memory.memory import Memory, kept, store
+from tgdsl.module.memory.some_rows import chosen_rows, few_rows, read_rows, rows_of
 from tgdsl.module.observing import ObservationTerm, observation_terms, observe
 from tgdsl.module.outputs import Output, outputs_of
-from tgdsl.module.sensing import Sensing, sense
+from tgdsl.module.sensing import Sensing, in_order, sense
 from tgdsl.module.state import SceneState
 from tgdsl.module.taxels.identity import SavedTaxels
 from tgdsl.module.taxels.tables import images_of, row_tables, taxel_table
@@ -69,11 +69,11 @@ class TactileModule(HookedModule):
         self._kinds = kinds_by_sensor(kinds, {sensor.name: sensor.kind for sensor in plan.sensors})
         self._quantities = tuple(own for own in quantities_of(kinds) if own.name in plan.quantities)
         self.constants = Constants(constant_arrays(plan), dtype, partial(bind, plan))
-        self.memory = Memory(plan.sensors, plan.readings())
+        self.memory = Memory(plan.sensors, plan.readings(), self._kinds)
         state = [(f"{sensor.name}:{name}", part) for sensor in plan.sensors for name, part in sensor.state.items()]
         self._overwritten = [name for name, part in state if part.overwritten]
-        self.calls = Calls()
-        self.incoming = Incoming(plan)
+        self.calls, self._order = Calls(), in_order(plan.sensors)
+        self.incoming = Incoming(plan, self._kinds, self.constants)
 
     def __repr__(self) -> str:
         layout, origin = self.plan.layout, self.plan.origin
@@ -156,13 +156,24 @@ class TactileModule(HookedModule):
         tensors, num_envs = self._tensors(state)
         step = "advance"
         if mask is not None or env_ids is not None:
-            step, tensors["mask"] = "advance_some", self._chosen(mask, env_ids, num_envs)
+            step, tensors["mask"] = "advance_some", self.incoming.chosen(mask, env_ids, num_envs, self.device)
+            self.memory.keep_last(num_envs)
         else:
             self.memory.keep_no_other(num_envs)
         memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
         readings = self._run(step, tensors, memory)
         self.hand_out(readings)
-        return self._with_views(readings)
+        return self.memory.with_views(readings)
+
+    def read_few(self, state: SceneState, rows: Int[Tensor, " n"], num_envs: int) -> dict[str, Tensor]:
+        """Do what a call with a mask of so many environments does, from a state of some alone, which `few_rows` has named."""
+        self.constants.refresh()
+        tensors = self.incoming.tensors(state, self.dtype, self.device)
+        self.memory.keep_last(num_envs)
+        memory = self.memory.tensors(num_envs, state.dt, self.dtype, self.device)
+        readings = read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
+        self.hand_out(readings)
+        return self.memory.with_views(readings)
 
     def hand_out(self, readings: Mapping[str, Tensor]) -> None:
         """Note what a call has handed out; for who replays a captured graph of calls in their place."""
@@ -204,17 +215,11 @@ class TactileModule(HookedModule):
             raise StateError(f"{what}; `free()` lets go of it")
         return tensors, num_envs
 
-    def _chosen(self, mask: Tensor | None, env_ids: EnvIds | None, num_envs: int) -> Bool[Tensor, " env"]:
-        """Return which environments are read, and see to it that there is something to read of the others."""
-        chosen = self.incoming.chosen(mask, env_ids, num_envs, self.device)
-        self.memory.keep_last(num_envs)
-        return chosen
-
     def _run(self, name: str, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the readings that `advance`, `advance_some` or `look` makes, compiled or replayed if that is wanted."""
         rows = few_rows(tensors["mask"]) if name == "advance_some" else None
         if rows is not None:
-            return read_rows(self.calls.of(self.flat_core), rows, tensors, memory)
+            return read_rows(self.calls.of(self.flat_core), rows, rows_of(tensors, rows), memory)
         found = self.calls.of(getattr(self, name))(tensors, memory)
         return {name: found[name] for name in self.plan.readings()}
 
@@ -257,7 +262,7 @@ class TactileModule(HookedModule):
 
     def _read(self, tensors: dict[str, Tensor], memory: dict[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what `core` does; a kernel may write new state over the old, which is then not returned."""
-        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock)
+        sensing = Sensing(self.plan, self._kinds, self._quantities, self.memory.clock, self._order)
         return sense(sensing, self.constants.tree, tensors, memory, self.dtype)
 
     def observe(self, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
@@ -351,7 +356,7 @@ class TactileModule(HookedModule):
         self.calls.compile(graph, **{**defaults, **options})
         return self
 
-    def inductor_options(self) -> dict[str, bool]:
+    def inductor_options(self) -> dict[str, Any]:
         """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
         return inductor_options(self.plan, self._quantities)
 
@@ -378,11 +383,6 @@ class TactileModule(HookedModule):
 
     def _explained(self) -> Explained:
         return Explained(self.plan, self._quantities, self.constants, self.memory, self.core)
-
-    def _with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Put the memory itself in the place of stacks that are declared as views."""
-        views = {r.name for sensor in self.plan.sensors if sensor.history and sensor.history.view for r in sensor.windows}
-        return readings | {name: self.memory.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in views}
 
     def on_move(self, fn: Callable[[Tensor], Tensor], move: Callable[[], object]) -> None:
         """Move or cast all tensors; a captured graph has read the old ones.

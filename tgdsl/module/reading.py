@@ -54,8 +54,8 @@ def read(
     memory: Tensors,
     now: Now | None,
     joined: Float[Tensor, "env channel row"] | None = None,
-) -> tuple[Tensors, Tensors]:
-    """Return a sensor's readings by name (env, row, channel), and its new memory.
+) -> tuple[Tensors, Tensors, Tensors]:
+    """Return a sensor's readings by name (env, row, channel), its new memory, and what its kind's `forward` returned.
 
     Of a sensor with noise the clean signal is among the readings, as `<sensor>/signal` (env, channel, row): a compiler that
     fuses then has the equation write all channels side by side, and would else form them anew for each number of the noise.
@@ -102,7 +102,7 @@ def read(
         readings[reading.name] = _stacked(found, f"{report}/signal", reading.channels).transpose(1, 2)
     if now is not None and now.period is not None:
         new["sample/phase"] = _phase(memory["sample/phase"], now.period, now)
-    return readings, new
+    return readings, new, found
 
 
 def block(
@@ -112,8 +112,10 @@ def block(
     contexts: Sequence[Context],
     constants: Constants,
     memory: Tensors,
-) -> tuple[Tensors, Tensors]:
-    """Return the reading of a sensor that is advanced at each substep, (env, sample, row, channel), and its new memory.
+) -> tuple[Tensors, Tensors, list[Tensors]]:
+    """Return the reading of a sensor that is advanced at each substep, its new memory, and what its kind returned at each.
+
+    The reading is (env, sample, row, channel).
 
     Args:
         sensor: The sensor.
@@ -123,13 +125,15 @@ def block(
         constants: What its kind folded.
         memory: What it remembers, by name.
     """
-    samples, state = [], _own(memory)
+    samples, answers, state = [], [], _own(memory)
     for own, context in zip(gathered, contexts, strict=True):
         found, new = _answer(sensor, kind, own, context, constants, state)
         state = {**state, **new}
         made = _stacked(found, "signal", sensor.signal)
         samples.append(made if made.ndim == 4 else made[:, None])
-    return {sensor.name: torch.cat(samples, dim=1).transpose(2, 3)}, dict(state)
+        answers.append(found)
+    made = samples[0] if len(samples) == 1 else torch.cat(samples, dim=1)
+    return {sensor.name: made.transpose(2, 3)}, dict(state), answers
 
 
 def _answer(
@@ -152,6 +156,8 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
     if not (isinstance(answer, tuple) and len(answer) == 2 and all(isinstance(part, Mapping) for part in answer)):
         raise TgdslError(f"{where} {type(answer).__name__}, expected planes by channel, and the new state by name")
     found, new = answer
+    if missing := [name for name in sensor.provides if name not in found]:
+        raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without {missing[0]}, which the kind provides")
     if missing := [name for name in sensor.signal if name not in found and "signal" not in found]:
         raise TgdslError(f"{where} {listed(list(found)) or 'nothing'}, without the channel {missing[0]}")
     num_rows = sensor.readings[0].num_rows
@@ -168,7 +174,7 @@ def _check_answer(sensor: PlannedSensor, answer: object, state: Tensors) -> None
             raise TgdslError(f'{where} the state "{name}" of shape {shapes} as the old one')
 
 
-def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env channel row"]:
+def _stacked(found: Mapping[str, Tensor], name: str, channels: Sequence[str]) -> Float[Tensor, "env *sample channel row"]:
     """Return what a kind found as one tensor: by its name, or of the planes of its channels."""
     return found[name] if name in found else torch.stack([found[channel] for channel in channels], dim=1)
 

@@ -5,12 +5,13 @@ Shapes: `env` environments, `row` rows of a reading, `channel` numbers per row, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from tgdsl.errors import TgdslError
 from tgdsl.module.gathering import Tree, gather, gathered_of, scene_of
 from tgdsl.module.memory.clock import Clock
 from tgdsl.module.memory.history import pushed, reduced
@@ -22,6 +23,7 @@ from tgdsl.quantities.base import Gathered, Quantity
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.noise import stages
 from tgdsl.sensors.noise.instant import Now
+from tgdsl.sensors.upstream import Upstream
 
 Tensors = dict[str, Tensor]
 
@@ -34,12 +36,25 @@ class Sensing(NamedTuple):
         kinds: The kind of each sensor, by the sensor's name.
         quantities: The quantities that some sensor asks for.
         clock: Says when sensors are read.
+        order: The sensors, each after those that it reads.
     """
 
     plan: Plan
     kinds: Mapping[str, Kind]
     quantities: tuple[Quantity, ...]
     clock: Clock
+    order: tuple[PlannedSensor, ...]
+
+
+def in_order(sensors: Sequence[PlannedSensor]) -> tuple[PlannedSensor, ...]:
+    """Return sensors so that each is after those that it reads; else as they are given."""
+    ordered: dict[str, PlannedSensor] = {}
+    while len(ordered) < len(sensors):
+        ready = [s for s in sensors if s.name not in ordered and all(name in ordered for name in s.upstream)]
+        if not ready:
+            raise TgdslError("not a plan: sensors read one another in a circle, or read some that are not there")
+        ordered |= {sensor.name: sensor for sensor in ready}
+    return tuple(ordered.values())
 
 
 def sense(
@@ -65,28 +80,40 @@ def sense(
     earlier = [_gathered(sensing, own, part, nows, knobs, dtype) for part in _substeps(plan, tensors)]
     readings: Tensors = {}
     joined: dict[tuple[str, ...], Tensor] = {}
+    answers: dict[str, list[Tensors]] = {}
     updated = sensing.clock.after(memory, dt)
-    for sensor in plan.sensors:
+    for sensor in sensing.order:
         kind, constants = sensing.kinds[sensor.name], own["sensors"][sensor.name]
         state = {name: memory[f"{sensor.name}:{name}"] for name in sensor.state}
         if sensor.substeps:
             contexts = [sensing.clock.context(sensor, memory, dt, i) for i in range(sensor.substeps)]
             each = [*(part[sensor.name] for part in earlier), gathered[sensor.name]]
-            found, new = block(sensor, kind, each, contexts, constants, state)
+            each = [_with_upstream(sensor, part, answers, i) for i, part in enumerate(each)]
+            found, new, answered = block(sensor, kind, each, contexts, constants, state)
         else:
-            signal = None
+            signal, asked = None, _with_upstream(sensor, gathered[sensor.name], answers, -1)
             if sensor.joined:
                 if sensor.joined not in joined:
                     joined[sensor.joined] = _joined(sensing, own, sensor, gathered[sensor.name])
                 signal = joined[sensor.joined][:, :, slice(*sensor.rows)]
             context = sensing.clock.context(sensor, memory, dt)
             values = constants, knobs[sensor.name], state, nows.get(sensor.name)
-            found, new = read(sensor, kind, gathered[sensor.name], context, *values, signal)
+            found, new, answer = read(sensor, kind, asked, context, *values, signal)
+            answered = [answer]
+        if sensor.provides:
+            answers[sensor.name] = answered
         updated |= {f"{sensor.name}:{name}": value for name, value in new.items()}
         readings |= _with_history(sensor, found, memory, updated)
     for reading in plan.proprioception:  # a copy: who fills the state in place keeps the readings of before
         readings[reading.name] = tensors[reading.name].to(dtype, copy=True).unsqueeze(2)
     return readings, updated
+
+
+def _with_upstream(sensor: PlannedSensor, gathered: Gathered, answers: Mapping[str, list[Tensors]], substep: int) -> Gathered:
+    """Return what a sensor asked for, with the planes of the sensors that it reads."""
+    if not sensor.upstream:
+        return gathered
+    return gathered.replaced(Upstream, {name: answers[name][substep] for name in sensor.upstream})
 
 
 def _gathered(

@@ -48,6 +48,7 @@ class Inputs:
         contacts_of: Whose contacts are an object's, where they are not just those of its body: see `parts_of`.
         link_parts: Whose contacts are a link's, where they are not just those of its body: see `parts_of_link`.
         substeps: Physics steps of a call at each of which some sensor is advanced: see `SceneState.substeps`.
+        dt: Time between calls that some sensor's constants are made for [s]; 0: none are.
     """
 
     fields: tuple[str, ...]
@@ -65,6 +66,7 @@ class Inputs:
     contacts_of: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
     link_parts: Mapping[str, tuple[ContactPart, ...]] = dataclasses.field(default_factory=dict)
     substeps: int = 1
+    dt: float = 0.0
 
     @cached_property
     def sizes(self) -> Mapping[str, int]:

@@ -58,6 +58,27 @@ class SceneObject:
 
 
 @dataclass(frozen=True)
+class Collider:
+    """A primitive that a link of the robot collides with in place of the scene's own geoms.
+
+    Attributes:
+        body: The link's body in the scene.
+        type: MuJoCo's type.
+        size: Its size as MuJoCo defines it [m].
+        pos: Its frame's origin in the body's frame [m].
+        quat: Its orientation there, w, x, y, z.
+        is_core: Whether links that have colliders meet it too; the others meet what is no such link alone.
+    """
+
+    body: str
+    type: str
+    size: tuple[float, ...]
+    pos: tuple[float, float, float]
+    quat: tuple[float, float, float, float]
+    is_core: bool
+
+
+@dataclass(frozen=True)
 class SceneFile:
     """The instrumented scene, as text, for whoever simulates it.
 
@@ -66,9 +87,11 @@ class SceneFile:
         parts: The MJCF files that it includes or attaches, by the names it has for them.
         assets: The meshes, textures and other files that they or the objects name.
         objects: Objects that differ between environments.
+        colliders: What links collide with in place of their own geoms: see `scene.colliders`.
     """
 
     mjcf: str
     parts: Mapping[str, str]
     assets: tuple[Asset, ...]
     objects: tuple[SceneObject, ...] = ()
+    colliders: tuple[Collider, ...] = ()

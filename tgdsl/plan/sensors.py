@@ -114,6 +114,10 @@ class PlannedSensor(Generic[Array]):
         notes: What an account of it says of its parameters, line by line.
         is_timed: Whether its kind wants to know when it is called: see `sensors.base.Context`.
         substeps: Physics steps of a call that it is advanced at; 0: once per call.
+        upstream: Sensors whose planes it reads, see `sensors.upstream`: they are evaluated before it.
+        provides: Planes that it has for others.
+        is_random: Whether its kind draws random numbers of its own.
+        timestep: Time between the calls of its kind that its constants are made for [s]; 0: any will do.
     """
 
     name: str
@@ -135,11 +139,20 @@ class PlannedSensor(Generic[Array]):
     notes: tuple[str, ...] = ()
     is_timed: bool = False
     substeps: int = 0
+    upstream: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
+    is_random: bool = False
+    timestep: float = 0.0
 
     @property
     def wants_clock(self) -> bool:
         """Whether it wants to know when a reading is made: for chance, noise with memory, its rate or its kind."""
-        return self.is_timed or bool(self.noise and self.noise.streams) or any("/" in name for name in self.state)
+        return (
+            self.is_timed
+            or self.is_random
+            or bool(self.noise and self.noise.streams)
+            or any("/" in name for name in self.state)
+        )
 
     @property
     def own_readings(self) -> tuple[PlannedReading, ...]:

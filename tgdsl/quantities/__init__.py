@@ -3,9 +3,12 @@
 from tgdsl.quantities.base import Gathered, Planning, Quantity, Request, Scene, Use
 from tgdsl.quantities.contact_depth import ContactDepth
 from tgdsl.quantities.contacts import Contacts
+from tgdsl.quantities.joints import Joints
 from tgdsl.quantities.known import QUANTITIES, known_quantities
+from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.moments import MomentsRequest
 from tgdsl.quantities.motion import LinkMotion
+from tgdsl.quantities.places import Places
 from tgdsl.quantities.points import Points
 from tgdsl.quantities.reference import References, ReferenceScene
 
@@ -14,8 +17,11 @@ __all__ = [
     "ContactDepth",
     "Contacts",
     "Gathered",
+    "Joints",
     "LinkMotion",
+    "Loads",
     "MomentsRequest",
+    "Places",
     "Planning",
     "Points",
     "Quantity",

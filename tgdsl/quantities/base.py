@@ -15,7 +15,7 @@ Shapes: `env` environments, `taxel` taxels, `pair` (link, object) pairs, `row` r
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -115,6 +115,8 @@ class Planning:
         geoms_of: Returns the geoms that a link's taxels sit on, by its name: meshes as they are, not their convex hulls.
         report: Notes a mistake.
         progress: Is told what is done.
+        joints: The joints that are read, in the order of the state.
+        anchors: Where the anchor of each is in the frame of the body that it moves, by its name [m].
     """
 
     layout: Layout
@@ -126,6 +128,8 @@ class Planning:
     geoms_of: Callable[[str], tuple[SurfaceGeom, ...]]
     report: Report
     progress: Progress
+    joints: tuple[str, ...] = ()
+    anchors: Mapping[str, Float[np.ndarray, 3]] = field(default_factory=dict)
 
     def bodies_of(self, taxels: Int[np.ndarray, " taxel"]) -> list[str]:
         """Return the body of each taxel."""
@@ -232,6 +236,7 @@ class Quantity:
         num_rows: `(part, use) → rows` of memory with one per row of the value, for `Memory(rows=…)`.
         explain: `(part, use, objects of the Plan) → what an account of a sensor says of it`.
         is_light: `(part) → whether` little is found per taxel, so that kernels may be tiled over environments and taxels.
+        is_fused: Whether kernels are to be as large as can be: all that is computed is alike, and would be read again.
         account: `(part, objects of the Plan) → lines by headline`: what was measured of what is computed beforehand.
     """
 
@@ -246,6 +251,7 @@ class Quantity:
     num_rows: Callable[[Any, int], int] | None = None
     explain: Callable[[Any, int, Sequence[PairedObject]], list[str]] = _nothing_to_explain
     is_light: Callable[[Any], bool] = _not_light
+    is_fused: bool = False
     account: Callable[[Any, Sequence[PairedObject]], dict[str, list[str]]] = _nothing_measured
 
 

@@ -15,12 +15,18 @@ from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.contact_depth import CONTACT_DEPTH
 from tgdsl.quantities.contacts import CONTACTS
+from tgdsl.quantities.joints import JOINTS
+from tgdsl.quantities.loads import LOADS
 from tgdsl.quantities.moments import MOMENTS
 from tgdsl.quantities.motion import MOTION
 from tgdsl.quantities.patches import PATCHES
+from tgdsl.quantities.places import PLACES
 from tgdsl.quantities.points import POINTS
 
-QUANTITIES: tuple[Quantity, ...] = (CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION, PATCHES)
+QUANTITIES: tuple[Quantity, ...] = (
+    *(CONTACT_DEPTH, CONTACTS, MOMENTS, POINTS, MOTION, PATCHES),
+    *(LOADS, JOINTS, PLACES),
+)
 """The quantities that come with tgdsl, in the order in which they are planned and gathered."""
 GROUP = "tgdsl.quantities"
 """Group of the entry points by which packages bring quantities."""

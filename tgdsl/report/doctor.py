@@ -35,6 +35,7 @@ WITHOUT: Mapping[str, tuple[Level, str]] = {
     "pyserial": ("missing", "a real hand cannot be connected; its emulator and logs remain"),
     "ray": ("missing", "`tgdsl sweep` is refused; single runs remain"),
     "rsl-rl-lib": ("missing", "`tgdsl train` is refused; environments remain"),
+    "soundfile": ("missing", "`tgdsl listen` is refused"),
     "tensordict": ("missing", "`tgdsl train` and the adapter for rsl_rl are refused"),
     "triton": ("slower", "on a GPU, torch's operations stand in for the kernels written in Triton; a CPU needs none"),
     "warp-lang": ("missing", "`query: raycast` is refused; analytic shapes and distance grids remain"),

@@ -44,7 +44,8 @@ from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
 from tgdsl.fields.models import NonNegative, PositiveLength, Quantity, Range, RangeOf, SpecModel
-from tgdsl.rl.draws import Draws
+from tgdsl.rl.draws import Draws, within
+from tgdsl.tensors.env_ids import put
 
 BREAKAWAY_SPEED = 0.05
 """Below this a joint counts as at rest, where its drive has to break away [rad/s]."""
@@ -205,6 +206,7 @@ class Actuation:
         action: ActionSpec,
         drive: DriveSpec,
         draws: Draws,
+        substeps: int = 1,
     ):
         """Begin with all drives ideal, at their joints' present positions; `reset` draws.
 
@@ -214,11 +216,12 @@ class Actuation:
             action: How actions are understood.
             drive: What drives do that ideal ones do not.
             draws: Where random numbers are from.
+            substeps: Physics steps per control step, for which noise is drawn at once on a CPU.
 
         Raises:
             SimulationError: If a drive's noise, kick or speed limit needs a largest torque that a joint does not have.
         """
-        self._arrays, self._draws, self.spec, self.action = arrays, draws, drive, action
+        self._arrays, self._draws, self.spec, self.action, self._ahead = arrays, draws, drive, action, substeps
         qpos = arrays["qpos"]
         device, dtype, num_envs, num = qpos.device, qpos.dtype, len(qpos), len(actuators.names)
         unlimited = [name for name, limit in zip(actuators.names, actuators.limit, strict=True) if not np.isfinite(limit)]
@@ -264,17 +267,16 @@ class Actuation:
             new = self._low + self._span * share
             if self._random[-1] == "delay":
                 new = torch.cat([new[:, :-1], new[:, -1:].floor().clamp(max=int(self.spec.delay[1]))], dim=1)
-            self._drawn.copy_(torch.where(chosen[:, None], new.transpose(0, 1).to(self._drawn.dtype), self._drawn))
-        self._count.copy_(torch.where(chosen, episode << 32, self._count))
+            put(self._drawn, chosen[:, None], new.to(self._drawn.dtype).transpose(0, 1))
+        put(self._count, chosen, episode << 32)
         self.place(chosen, at_controls)
 
     def place(self, chosen: Bool[Tensor, " env"], at_controls: bool = False) -> None:
         """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
         name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
-        now = self._arrays[name][:, self._index[which]]
-        for held, new in ((self.target, now), (self._past, now), (self._play, now + self.drawn["bias"])):
-            held.copy_(torch.where(chosen[:, None], new, held))
-        self.torque.masked_fill_(chosen[:, None], 0.0)
+        now, mask = self._arrays[name].index_select(1, self._index[which]), chosen[:, None]
+        for held, new in ((self.target, now), (self._past, now), (self._play, now + self.drawn["bias"]), (self.torque, 0.0)):
+            put(held, mask, new)
 
     def command(self, action: Float[Tensor, "env joint"]) -> None:
         """Take an action of each environment: new targets, of which the drives know once they arrive.
@@ -295,7 +297,7 @@ class Actuation:
     def drive(self) -> None:
         """Make a torque of each target, before a physics step: see the top of this page."""
         arrays, own, drawn = self._arrays, self._values, self.drawn
-        pos, speed = arrays["qpos"][:, self._index["qpos"]], arrays["qvel"][:, self._index["dof"]]
+        pos, speed = (arrays[name].index_select(1, self._index[which]) for name, which in (("qpos", "qpos"), ("qvel", "dof")))
         wanted, half = self._arrived() + drawn["bias"], 0.5 * drawn["backlash"]
         self._play.copy_(torch.minimum(torch.maximum(self._play, wanted - half), wanted + half))
         error = self._play - pos
@@ -310,7 +312,8 @@ class Actuation:
             share = (1.0 - speed.abs() / self._top_speed).clamp(min=0.0)
             torque = torch.where(torque * speed > 0, _within(torque, share * own["limit"]), torque)
         if self.spec.torque_noise:
-            noise = self._draws.uniform("torque_noise", self._count, torque.shape[1], -1.0, 1.0)
+            share = self._draws.shares_ahead("torque_noise", self._count, torque.shape[1], self._ahead)
+            noise = within(share, -1.0, 1.0)
             torque = torque + self.spec.torque_noise * own["limit"] * noise.to(torque.dtype)
         self._count += 1
         self.torque.copy_(torque)

@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt
 from torch import Tensor
 
-from tgdsl.sensors.noise.random import mix, mix_on_host, normal_pair, sensor_key, uniform
+from tgdsl.sensors.noise.random import mix, mix_on_host, normal_pair, sensor_key, uniform, uniform_on_host
 from tgdsl.tensors.env_ids import few_ids
 from tgdsl.tensors.fused import FusedCall
 
@@ -29,6 +29,13 @@ class _Streams(NamedTuple):
     begun: Int[Tensor, "env purpose half"]
     purpose: Int[Tensor, " num"]
     index: Int[Tensor, " num"]
+
+
+class _Ahead(NamedTuple):
+    """Shares that were made ahead: the counter at which the first of them is due, and those that are left."""
+
+    counter: Int[Tensor, " env"]
+    left: list[Float[Tensor, "env num"]]
 
 
 class Draws:
@@ -60,11 +67,13 @@ class Draws:
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled
         self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
+        self._ahead: dict[tuple[str, int], _Ahead] = {}
         self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
         """Choose another seed, in place: graphs that were captured draw its numbers."""
         self.seed = seed
+        self._ahead.clear()
         for sizes, streams in self._known.items():
             streams.begun.copy_(self._begun([what for what, _ in sizes]))
 
@@ -85,12 +94,32 @@ class Draws:
             chosen: The environments whose numbers are wanted; those of the others mean nothing. Default: all.
         """
         streams = self._streams(sizes)
-        rows = None if chosen is None or not self._is_on_host else few_ids(chosen)
-        if rows is None:
+        if not self._is_on_host:
             return self._shares(*streams, counter)
-        found = torch.zeros((len(counter), len(streams.index)), device=self._device)
-        found[rows] = self._share(streams.begun[rows], streams.purpose, streams.index, counter[rows])
-        return found
+        begun, purpose, index, counts = (own.numpy() for own in (*streams, counter))
+        rows = None if chosen is None else few_ids(chosen)
+        if rows is None:
+            return torch.from_numpy(uniform_on_host(_hash_on_host(begun, purpose, index, counts)))
+        found, ids = np.zeros((len(counts), len(index)), dtype=np.float32), rows.numpy()
+        found[ids] = uniform_on_host(_hash_on_host(begun[ids], purpose, index, counts[ids]))
+        return torch.from_numpy(found)
+
+    def shares_ahead(self, what: str, counter: Int[Tensor, " env"], num: int, ahead: int) -> Float[Tensor, "env num"]:
+        """Return `shares` for a purpose that is asked for again and again, its counter one higher each time.
+
+        On a host those of so many counts are hashed at once, and handed out as long as the counter is what they were made for.
+        """
+        if not self._is_on_host:
+            return self.shares({what: num}, counter)[what]
+        made = self._ahead.get((what, num))
+        if made is None or not made.left or not torch.equal(counter, made.counter):
+            begun, purpose, index, counts = (own.numpy() for own in (*self._streams({what: num}), counter))
+            each = (counts[:, None] + np.arange(ahead)).ravel()
+            found = uniform_on_host(_hash_on_host(begun.repeat(ahead, axis=0), purpose, index, each))
+            found = found.reshape(len(counts), ahead, num).transpose(1, 0, 2)
+            made = _Ahead(counter, list(torch.from_numpy(np.ascontiguousarray(found)).unbind()))
+        self._ahead[what, num] = _Ahead(counter + 1, made.left[1:])
+        return made.left[0]
 
     def uniform(
         self, what: str, counter: Int[Tensor, " env"], num: int, low: float = 0.0, high: float = 1.0
@@ -145,7 +174,7 @@ class Draws:
         counter: Int[Tensor, " env"],
     ) -> Int[Tensor, "env num"]:
         if self._is_on_host:
-            return torch.from_numpy(_hash_on_host(*(own.numpy() for own in (begun, purpose, index, counter))))
+            return torch.from_numpy(_hash_on_host(*(own.numpy() for own in (begun, purpose, index, counter))).view(np.int32))
         low, high = (half.to(torch.int32)[:, None, None] for half in (counter, counter >> 32))
         mixed = mix(torch.cat([begun ^ low, high.expand(-1, 1, 2)], dim=1))  # both at once
         first, second = mix(mixed[:, :-1] ^ mixed[:, -1:])[:, purpose].unbind(-1)
@@ -157,14 +186,14 @@ def _hash_on_host(
     purpose: Int[np.ndarray, " num"],
     index: Int[np.ndarray, " num"],
     counter: Int[np.ndarray, " env"],
-) -> Int[np.ndarray, "env num"]:
-    """Return the same words, by NumPy."""
+) -> UInt[np.ndarray, "env num"]:
+    """Return the same words, uint32, by NumPy."""
     low, high = counter.astype(np.uint32)[:, None, None], (counter >> 32).astype(np.uint32)[:, None, None]
     keys = mix_on_host(mix_on_host(begun.view(np.uint32) ^ low) ^ mix_on_host(high))
     own = keys if keys.shape[1] == 1 else keys[:, purpose]
     word = mix_on_host(index.view(np.uint32) ^ own[:, :, 0])
     word ^= own[:, :, 1]
-    return word.view(np.int32)
+    return word
 
 
 def within(share: Float[Tensor, "env num"], low: float, high: float) -> Float[Tensor, "env num"]:

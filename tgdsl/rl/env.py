@@ -11,6 +11,7 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_
 from tgdsl.rl.task import Now
 from tgdsl.tensors.env_ids import may_hold
 from tgdsl.tensors.fused import FusedCall
+from tgdsl.tensors.torch_internals import below_autograd
 
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
@@ -154,7 +156,7 @@ class TouchEnv:
         self._draws, self._first_env = draws, first_env
         random = self.spec.randomise
         arrays = self.sim.arrays
-        self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws)
+        self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         body = int(setup.model.body(setup.object).id)
         self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
@@ -166,6 +168,7 @@ class TouchEnv:
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
+        self._dispatch = nullcontext if is_compiled or is_cuda else below_autograd
         self._readings: dict[str, Tensor] = {}
         self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
@@ -240,7 +243,7 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.inference_mode(False), torch.no_grad():  # what is remembered is written outside of inference mode too
+        with torch.inference_mode(False), torch.no_grad(), self._dispatch():  # memory is written outside of inference mode too
             self._action.copy_(action)
             made = self._call()
             made = _copied(made) if self.device.type == "cuda" else made
@@ -354,8 +357,7 @@ class TouchEnv:
     def _now(self, readings: dict[str, Tensor]) -> Now:
         """Return the instant that readings are of."""
         self._readings, sim, num = readings, self.sim, self.num_actions
-        watched = sim.watched()
-        none = self._used[:, :0]
+        watched, none = sim.watched(), self._used[:, :0]
         contact, distance = self._sensed.contact, self._sensed.distance
         force, normal_force = none[:, :, None].expand(-1, -1, 3), none
         if contact:

@@ -22,10 +22,12 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl.draws import Draws, whole
-from tgdsl.tensors.env_ids import may_hold
+from tgdsl.tensors.env_ids import may_hold, put_rows
 
 ZERO: Range = (0.0, 0.0)
 Force = Annotated[Range, RangeOf("force")]
+_DRAWN = {"push": 3, "push interval": 1}
+"""Numbers of each push by what they are for; drawn together by all, so that they are known before anything is compiled."""
 
 
 class PushSpec(SpecModel):
@@ -89,10 +91,10 @@ class Pushes:
             chosen: The environments.
             episode: How often each was reset.
         """
-        self._count.copy_(torch.where(chosen, episode << 32, self._count))
-        _, interval = self._next(chosen)
-        self._left.copy_(torch.where(chosen, interval, self._left))
-        self._exert(torch.where(chosen[:, None], 0.0, self.force))
+        put_rows(self._count, chosen, episode << 32)
+        put_rows(self._left, chosen, self._interval(self._draws.shares(_DRAWN, self._count, chosen)["push interval"]))
+        for exerted in (self.force, self._applied[:, self._body, :3]):
+            put_rows(exerted, chosen, 0.0)
 
     def advance(self) -> None:
         """Begin and end pushes: once per control step, before its physics."""
@@ -101,20 +103,16 @@ class Pushes:
         if not may_hold(changes := begins | ends):
             return
         self._count += ends
-        force, interval = self._next(changes)
-        self._left.copy_(torch.where(ends, interval, self._left))
-        self._exert(torch.where(ends[:, None], 0.0, torch.where(begins[:, None], force, self.force)))
+        found = self._draws.shares(_DRAWN, self._count, changes)
+        put_rows(self._left, ends, self._interval(found["push interval"]))
+        put_rows(self.force, begins, self._low + found["push"].to(self.force.dtype) * (self._high - self._low))
+        put_rows(self.force, ends, 0.0)
+        self._applied[:, self._body, :3] = self.force
 
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
         return {"force": self.force, "left": self._left, "count": self._count}
 
-    def _next(self, chosen: Bool[Tensor, " env"]) -> tuple[Float[Tensor, "env 3"], Int[Tensor, " env"]]:
-        """Return the force of some environments' next push, or the present one, and how many control steps before it begins."""
-        found = self._draws.shares({"push": 3, "push interval": 1}, self._count, chosen)
-        force = self._low + found["push"].to(self.force.dtype) * (self._high - self._low)
-        return force, whole(found["push interval"], self._first, self._last)[:, 0]
-
-    def _exert(self, force: Float[Tensor, "env 3"]) -> None:
-        self.force.copy_(force)
-        self._applied[:, self._body, :3] = force
+    def _interval(self, share: Float[Tensor, "env 1"]) -> Int[Tensor, " env"]:
+        """Return how many control steps there are before the next push begins."""
+        return whole(share, self._first, self._last)[:, 0]

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.compiler.pipeline import compile as compile_document
 from tgdsl.console.progress import Progress
 from tgdsl.errors import listed
 from tgdsl.layout.layout import Layout
@@ -22,6 +21,7 @@ from tgdsl.schema.load import load
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.select import matching
 from tgdsl.sensors.known import known_kinds
+from tgdsl.tuning.compile import compile as compile_document
 
 GROUP = "tactile_sensors"
 """The observation group of what a policy feels."""
@@ -126,6 +126,8 @@ def compile_sensed(
         overrides["resolution"] = spec.resolution
     if spec.variants is not None:
         overrides[f"objects.{spec.object}.variants"] = _variants(loaded, document)
+    if spec.physics.collision is not None:
+        overrides["robot.collision"] = spec.physics.collision
     felt, felts = None, {}
     if feels is not None:
         felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}

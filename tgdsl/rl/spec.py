@@ -39,6 +39,9 @@ Weight = Number
 class PhysicsSpec(SpecModel):
     """How physics is stepped; what is left out is the scene's."""
 
+    collision: Literal["mesh", "primitive"] | None = None
+    """What the robot's links collide with, in place of what the sensors' document says: see `robot.collision` there."""
+
     timestep: Time = 0.005
     """Duration of a physics step [s]."""
     substeps: Whole = 5
@@ -55,6 +58,8 @@ class PhysicsSpec(SpecModel):
     """Most iterations of its line search."""
     tolerance: NonNegative | None = None
     """Where the solver stops."""
+    ls_tolerance: NonNegative | None = None
+    """Where its line search stops."""
     impratio: Positive | None = None
     """Ratio of friction's impedance to that of the normal force."""
     nconmax: Whole | None = None
@@ -65,7 +70,7 @@ class PhysicsSpec(SpecModel):
     @property
     def options(self) -> dict[str, Any]:
         """MuJoCo's options that differ from the scene's."""
-        given = self.model_dump(exclude={"substeps", "nconmax", "njmax"}, exclude_none=True)
+        given = self.model_dump(exclude={"collision", "substeps", "nconmax", "njmax"}, exclude_none=True)
         return {name: value.lower() if isinstance(value, str) else value for name, value in given.items()}
 
     @property

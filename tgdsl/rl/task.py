@@ -143,6 +143,7 @@ class Task(ABC, Generic[S]):
         senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels.
         wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
         score_unit: Unit of its score.
+        is_less_better: Whether its score is an error.
         spec: Its document.
         setup: What it is made for.
         memory: Its own state, (env, …) each, kept by `state_dict`.
@@ -152,6 +153,7 @@ class Task(ABC, Generic[S]):
     senses: ClassVar[tuple[str, ...]] = ("link_contact", "surface_distance")
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]
+    is_less_better: ClassVar[bool] = False
     spec: S
     setup: Setup
     memory: dict[str, Tensor]

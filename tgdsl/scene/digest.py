@@ -9,7 +9,7 @@ from tgdsl.plan.scene import SceneFile
 
 
 def scene_digest(scene: SceneFile) -> str:
-    """Return a hash of a scene: its files, assets and objects, without the contact sensors that a module wants.
+    """Return a hash of a scene: its files, assets, objects and colliders, without the contact sensors that a module wants.
 
     Comments in its files do not count.
     """
@@ -20,6 +20,7 @@ def scene_digest(scene: SceneFile) -> str:
         if not len(sensors):
             root.remove(sensors)
     texts = [ET.tostring(root, encoding="unicode"), *scene.parts.values(), repr(scene.objects)]
+    texts += [repr(scene.colliders)] if scene.colliders else []
     found = hashlib.sha256(b"tgdsl scene 1")
     for part in [*texts, *sorted(asset.sha256 for asset in scene.assets)]:
         found.update(f"{len(part)} {part}".encode())

@@ -11,19 +11,16 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from tgdsl.errors import ArtifactError, RobotError, TgdslError
+from tgdsl.errors import ArtifactError, RobotError
 from tgdsl.files.find import robots_folder
 from tgdsl.plan.scene import Asset, SceneFile, SceneGeom, SceneObject
 from tgdsl.scene.asset_paths import ROBOTS, resolve_asset
+from tgdsl.scene.colliders import with_colliders
+from tgdsl.scene.contact_bits import INHERITED, free_bit
 from tgdsl.scene.masses import freeze, weigh
 from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.options import Options, set_options
 
-INHERITED = (
-    *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
-    *("group", "rgba", "material"),
-)
-"""What a variant's geoms have of the body's first geom."""
 _STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 OFF_CENTER = 2e-6
 """Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
@@ -37,9 +34,8 @@ def compiled(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjModel:
 
 def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
     parts = {name: text.encode() for name, text in scene.parts.items()}
-    return mujoco.MjSpec.from_string(
-        scene.mjcf, include=parts, assets={key: readable(key, content) for key, content in assets.items()}
-    )
+    contents = {key: readable(key, content) for key, content in assets.items()}
+    return with_colliders(mujoco.MjSpec.from_string(scene.mjcf, include=parts, assets=contents), scene.colliders)
 
 
 def readable(name: str, content: bytes) -> bytes:
@@ -142,15 +138,6 @@ def is_absent(model: mujoco.MjModel, geom: int) -> bool:
 def _absence(name: str) -> str:
     """Return the name of the custom number that says whether a geom is lacking."""
     return f"{name}/is_absent"
-
-
-def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError]) -> int:
-    """Return a bit that no geom collides with; if there is none, an error says who needs it."""
-    used = int(np.bitwise_or.reduce([int(geom.conaffinity) for geom in spec.geoms]))
-    free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
-    if free is None:
-        raise error(f"the scene's geoms use all bits of `conaffinity`; {who} need a free one")
-    return free
 
 
 def _add_geom(spec: mujoco.MjSpec, target: SceneObject, i: int, variant: int, template: mujoco.MjsGeom) -> None:

@@ -28,6 +28,10 @@ class RobotSpec(SpecModel):
     layout: Annotated[Text | Annotated[LayoutSpec, Tag("other")], TEXT_OR_OTHER] | None = None
     """Layout file, relative to this document, or the same mapping in line; default: the layout of a robot given by name.
     Not needed where no sensor reads taxels, such as `link_contact`: these are then on any of the robot's bodies."""
+    collision: Literal["mesh", "primitive"] = "mesh"
+    """What links collide with, in the scene too: `mesh`: the model's own geoms, meshes by their convex hulls; `primitive`: the
+    capsules, spheres and boxes of `colliders.yaml` beside the model in their place, which are faster. Taxels stay where they
+    are."""
 
 
 class SceneSpec(SpecModel):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -38,7 +38,7 @@ def load(
         overrides: Values to set first by dotted path, as YAML text or plain, such as `{"resolution": "high"}`.
         kinds: The sensor kinds that the document may use.
         needs_sensors: Whether it is a mistake to have none.
-        sensors: Names of those that are wanted, the others being left out; default: all.
+        sensors: Names of those that are wanted, the others being left out but for those that they read; default: all.
 
     Returns:
         The document with the problems found so far: call `raise_problems` when all stages have added theirs.
@@ -58,7 +58,7 @@ def load(
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     if sensors is not None:
-        source.keep("sensors", sensors)
+        source.keep("sensors", _with_upstream(source.value.get("sensors"), sensors, kinds))
     model = document_model(kinds, needs_sensors)
     problems = list(source.problems)
     required = ("tgdsl", "robot", "sensors") if needs_sensors else ("tgdsl", "robot")
@@ -72,6 +72,24 @@ def load(
     if loaded.layout is not None and loaded.layout.source is not source:
         warn_of_unusual(loaded.layout.source, loaded.layout.spec)
     return loaded
+
+
+def _with_upstream(written: Any, wanted: Collection[str], kinds: Sequence[Kind]) -> Collection[str]:
+    """Return the names of sensors that are wanted and of all that they read, as the document has it, right or wrong."""
+    by_name, found, waiting = {kind.name: kind for kind in kinds}, dict.fromkeys(wanted), list(wanted)
+    own = written if isinstance(written, dict) else {}
+    kind_of = {name: by_name.get(str(s.get("kind"))) if isinstance(s, dict) else None for name, s in own.items()}
+    while waiting:
+        name = waiting.pop()
+        kind = kind_of.get(name)
+        if kind is None or not kind.reads:
+            continue
+        named = own[name].get(kind.reads)
+        every = [other for other, k in kind_of.items() if k is not None and k.provides]
+        read = [other for other in (named if isinstance(named, list) else every) if other in own and other not in found]
+        found |= dict.fromkeys(read)
+        waiting += read
+    return list(found)
 
 
 def load_layout(path: Path) -> LoadedLayout:

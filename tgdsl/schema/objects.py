@@ -200,4 +200,4 @@ def query_alternatives() -> list[Alternative]:
     grids = [
         Alternative(f"grid, {1e3 * error:g} mm", {"query": "sdf", "tolerance": error}) for error in (1e-3, 2e-4, 5e-5, 1e-5)
     ]
-    return [*grids, Alternative("raycast", {"query": "raycast"})]
+    return [*grids, Alternative("raycast", {"query": "raycast"}, unused=("tolerance", "max_bytes"), is_exact=True)]

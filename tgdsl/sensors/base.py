@@ -10,51 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
-from pydantic import BeforeValidator, Field, StrictBool, StrictInt, WithJsonSchema, model_validator
+from jaxtyping import Float, Int, UInt64
+from pydantic import Field
 from torch import Tensor
 
+from tgdsl.fields.accuracy import AccuracyField
+from tgdsl.fields.history import History
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
 from tgdsl.fields.regions import RegionPart
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered, Quantity, Request
 from tgdsl.sensors.noise import BASE, NoiseField
+from tgdsl.sensors.noise.random import Stream
+from tgdsl.sensors.upstream import Upstream
 from tgdsl.surfaces.surface import Surface
 
 
-class HistorySpec(SpecModel):
-    """What is read of the last calls."""
+class AnySensorSpec(SpecModel):
+    """What every kind of sensor has, wherever it is. A kind's own spec adds `kind: Literal["its_name"]` and its parameters."""
 
-    length: Annotated[StrictInt, Field(ge=1), Usual("number", high=1000.0)]
-    """Calls that count, this one included; before there are so many since a reset, the first one stands for the missing."""
-    reduce: Literal["stack", "last", "median", "mean"] = "stack"
-    """`stack`: all of them, oldest first, as a further dimension; or one reading made of them."""
-    view: StrictBool = False
-    """Whether a stack is handed out as a view of the module's own memory, which the next call overwrites and which
-    carries no gradient; default: a copy."""
-
-    @model_validator(mode="after")
-    def _is_used(self) -> HistorySpec:
-        if self.view and self.reduce != "stack":
-            raise ValueError("`view` is used by `reduce: stack` alone, expected it to be left out")
-        return self
-
-
-History = Annotated[
-    HistorySpec,
-    BeforeValidator(lambda found: {"length": found} if isinstance(found, int) else found),
-    WithJsonSchema({"anyOf": [{"type": "integer", "minimum": 1}, HistorySpec.model_json_schema()]}),
-]
-
-
-class SensorSpec(SpecModel):
-    """What every kind of sensor has. A kind's own spec adds `kind: Literal["its_name"]` and its parameters."""
-
-    links: Selector
-    """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
     noise: NoiseField = "clean"
     """A noise profile's name, or the knobs in line."""
     readout: Literal["clean", "measured", "both"] = "measured"
@@ -63,6 +40,10 @@ class SensorSpec(SpecModel):
     """How often the sensor takes a sample, which it reads until the next one [Hz]; default: at every call."""
     history: History | None = None
     """How many calls are read, `stack`ed or reduced: `history: 5`, or `history: {length: 5, reduce: mean}`."""
+    accuracy: AccuracyField = None
+    """RMS error that its reading may have on states of the scene, before noise: a fraction of the largest change, `1 %`, an
+    amount, `0.02 mm`, or one of each quantity, `{force: 5 mN, torque: 1 %}`. The cheapest fields that hold it are then chosen
+    among those that nobody wrote, here and in the objects that it feels."""
     is_on_taxels: ClassVar[bool] = True
     """Whether `links` chooses among the links that the layout gives taxels; else among all bodies of the robot."""
     needs_taxels: ClassVar[bool] = True
@@ -74,9 +55,30 @@ class SensorSpec(SpecModel):
         return ()
 
     @property
+    def named_bodies(self) -> Mapping[str, str]:
+        """Bodies of the scene that the spec names, by the field that does; none by default."""
+        return {}
+
+    @property
     def is_gated(self) -> bool:
         """Whether an object is felt only while the simulator has it in contact with the taxel's link."""
         return False
+
+
+class SensorSpec(AnySensorSpec):
+    """A sensor that some links carry."""
+
+    links: Selector
+    """Links that carry the sensor: a link group, names, shell wildcards, or include/exclude."""
+
+
+class OnJointsSpec(AnySensorSpec):
+    """A sensor that has a place on each of some joints; its layout's links are called as these are, on the bodies they move."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    """Names or shell wildcards of hinges and slides; default: the robot's actuated joints, in the order of the actuators."""
+    is_on_taxels: ClassVar[bool] = False
+    needs_taxels: ClassVar[bool] = False
 
 
 class LinkSpec(SensorSpec):
@@ -179,6 +181,11 @@ class Lowered:
         substeps: Physics steps of a call at each of which `forward` is called; the reading is then a block of so many samples,
             or of so many times `samples`. 0: it is called once per call, with the state of the last one.
         samples: Samples of a block that `forward` returns at once, as "signal" (env, sample, channel, row); 0: it is none.
+        provides: Planes that `forward` returns for other sensors to read, of those of `Kind.provides`.
+        sound: Samples of sound that it provides at each call of `forward`; 0: none, see `sensors.upstream`.
+        upstream: What it asks of other sensors: `forward` gets it as `gathered[Upstream]`, see `sensors.upstream`.
+        timestep: Time between the calls of `forward` that its constants are made for [s]; 0: any will do. Where the time
+            between calls is another one, a warning says so.
     """
 
     channels: tuple[Channel, ...]
@@ -192,6 +199,29 @@ class Lowered:
     signal: tuple[Channel, ...] | None = None
     substeps: int = 0
     samples: int = 0
+    timestep: float = 0.0
+    provides: frozenset[str] = frozenset()
+    sound: int = 0
+    upstream: Upstream | None = None
+
+
+class ReadSensor(NamedTuple):
+    """A sensor that another one reads: what its kind made of it, and what it has rows of."""
+
+    lowered: Lowered
+    rows: Axis
+
+
+class Fitting(NamedTuple):
+    """What is known once all that a sensor reads is lowered.
+
+    Attributes:
+        timestep: Time of a physics step of the scene [s].
+        upstream: The sensors that it reads, by their names, in order.
+    """
+
+    timestep: float
+    upstream: Mapping[str, ReadSensor]
 
 
 class Context(NamedTuple):
@@ -203,6 +233,7 @@ class Context(NamedTuple):
         substep: Which substep of the call this is, from 0.
         time: Time since each environment's reset [s], (env, 1); 0 at the first call after it.
         is_first: Whether it is the first call after each environment's reset, (env, 1).
+        stream: Random words of this call, or this substep, of a kind that `is_random`: see `noise.random`.
     """
 
     dt: Tensor
@@ -210,6 +241,7 @@ class Context(NamedTuple):
     substep: int
     time: Tensor
     is_first: Tensor
+    stream: Stream | None = None
 
 
 UNTIMED = Context(*[None] * 5)  # type: ignore[arg-type]
@@ -224,15 +256,30 @@ class ReferenceContext(NamedTuple):
     substep: int
     time: float
     is_first: bool
+    words: Callable[[UInt64[np.ndarray, "*word"]], UInt64[np.ndarray, "*word"]]
+    """Returns the random words of this call, or this substep, by their numbers: those of `Context.stream`."""
 
 
-SurfaceOf = Callable[[str, Sequence[RegionPart]], Surface]
-"""Returns the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+@runtime_checkable
+class SurfaceOf(Protocol):
+    """Triangles of links and objects."""
+
+    def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
+        """Return the triangles of a link, by its name, or of a region of it, in its body's frame [m]."""
+        ...
+
+    def of_object(self, name: str) -> Surface:
+        """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
+        ...
+
+
 Constants = Mapping[str, Tensor]
 State = Mapping[str, Tensor]
 ReferenceState = Mapping[str, np.ndarray]
 Planes = Mapping[str, Tensor]
-Reading = Float[np.ndarray, "row channel"]
+Kept = dict[str, np.ndarray]
+ReferenceAnswer = tuple[np.ndarray, Kept] | tuple[np.ndarray, Kept, Mapping[str, np.ndarray]]
+"""A reading (row, channel), or (sample, row, channel) of a block, and what is kept; and planes, where a kind provides them."""
 
 
 class Alternative(NamedTuple):
@@ -241,10 +288,18 @@ class Alternative(NamedTuple):
     Attributes:
         label: What to call it: `svd, 0.1 %`.
         changes: Fields and what they are then, as a document has them; None: left out.
+        unused: Fields that mean nothing then: who wrote one of them does not want this choice.
+        is_exact: Whether it is exact but for rounding, so that errors of others may be measured against it and it may be chosen
+            without one.
     """
 
     label: str
     changes: Mapping[str, Any]
+    unused: tuple[str, ...] = ()
+    is_exact: bool = False
+
+
+Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]
 
 
 def no_alternatives(spec: Any) -> Sequence[Alternative]:
@@ -278,25 +333,40 @@ class Kind:
         is_pointwise: Whether each row of what `forward` returns is of one taxel alone. Sensors on different taxels may then be
             computed as one, where they have no state, and parameters that are scalars are given as (taxel,).
         is_timed: Whether it wants to know when it is called: a clock is kept, and the state's `dt` is wanted.
+        is_random: Whether it draws random numbers of its own, from `Context.stream`.
+        retimed: `(constants, dt) → constants`: those of its constants that depend on the time between calls of `forward` [s],
+            anew. The module calls it whenever that time is another one than `Lowered.timestep`, or was at the last call.
         quantities: Quantities of its own that it asks for, which no installed package brings.
         indices: `(constants, number of taxels) → {name: count}` of those constants that are indices, of so many things.
         alternatives: `(spec) → choices` of fields that trade speed for error, from coarse to fine: errors of all of them are
             measured against the last that can be had. One that the spec does not allow, or its links do not, is left out.
+        provides: Planes that `forward` can return beside its channels for other sensors to read, see `sensors.upstream`:
+            it does so for those of `Lowered.provides`, and `reference` returns them too, by name, as a third value.
+        reads: The field of its spec that names sensors that it reads, if it does so.
+        warns: Names of its state, and `(sensor's name, constants, rows of the sensors that it reads, largest numbers of all
+            environments) → messages`: what users are to be warned of, each once.
+        fit: `(spec, lowered, fitting) → Lowered`, if sizes follow from the scene's time step, or from sensors that it reads.
     """
 
-    spec: type[SensorSpec]
+    spec: type[AnySensorSpec]
     lower: Callable[[Any, Layout, SurfaceOf], Lowered]
     forward: Callable[[Gathered, Context, Constants, State], tuple[Planes, State]]
-    reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], tuple[Reading, dict[str, np.ndarray]]]
+    reference: Callable[[Any, Layout, Any, ReferenceContext, ReferenceState], ReferenceAnswer]
     decide: Callable[[Planes, Constants, State], tuple[Planes, State]] | None = None
     knobs: frozenset[str] = BASE
     gains_depth: bool = False
     idle_knobs: frozenset[str] = frozenset()
     is_pointwise: bool = False
     is_timed: bool = False
+    is_random: bool = False
+    retimed: Callable[[Mapping[str, np.ndarray], float], Mapping[str, np.ndarray]] | None = None
     quantities: tuple[Quantity, ...] = ()
     indices: Callable[[Mapping[str, np.ndarray], int], Mapping[str, int]] = no_indices
     alternatives: Callable[[Any], Sequence[Alternative]] = no_alternatives
+    provides: frozenset[str] = frozenset()
+    reads: str = ""
+    warns: tuple[tuple[str, Warn], ...] = ()
+    fit: Callable[[Any, Lowered, Fitting], Lowered] | None = None
 
     @property
     def name(self) -> str:

@@ -19,7 +19,8 @@ from tgdsl.files.plugins import known
 from tgdsl.quantities.base import Quantity, Request
 from tgdsl.quantities.known import known_quantities
 from tgdsl.sensors import KINDS
-from tgdsl.sensors.base import Axis, Kind, Lowered, Memory, SensorSpec
+from tgdsl.sensors.base import AnySensorSpec, Axis, Kind, Lowered, Memory
+from tgdsl.sensors.upstream import SOUND
 
 GROUP = "tgdsl.kinds"
 """Group of the entry points by which packages bring kinds."""
@@ -76,7 +77,7 @@ def quantities_of(kinds: Sequence[Kind]) -> tuple[Quantity, ...]:
     return known_quantities(tuple(own.values()))
 
 
-def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
+def check_lowered(kind: Kind, lowered: Lowered, spec: AnySensorSpec) -> None:
     """Refuse what a kind may not say of a sensor: names that readings need for something else, requests that contradict.
 
     Raises:
@@ -102,6 +103,9 @@ def check_lowered(kind: Kind, lowered: Lowered, spec: SensorSpec) -> None:
         raise LowerError("this sensor reads a block of samples at each call", field, f"leave `{field}` out")
     if lowered.substeps and spec.readout == "both":
         raise LowerError("this sensor reads a block of samples, which has no noise", "readout", "leave `readout` out")
+    if lowered.provides - kind.provides or bool(lowered.sound) != (lowered.provides >= SOUND):
+        what = f"it provides {', '.join(sorted(lowered.provides)) or 'nothing'}, {lowered.sound} samples of sound"
+        raise TgdslError(f'kind "{kind.name}": {what}; expected planes of `Kind.provides`, and samples if these are of sound')
     if lowered.substeps and lowered.reports:
         raise TgdslError(f'kind "{kind.name}" has reports and reads blocks; a block has none')
 

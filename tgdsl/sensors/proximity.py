@@ -173,10 +173,13 @@ def _slip(felt: SurfaceMoments, name: str, is_absolute: Tensor) -> Vec:
 
 def alternatives(spec: ProximitySpec) -> list[Alternative]:
     """Return sums over points, and fields of several tolerances."""
-    clouds = [Alternative(f"{num} points", {"backend": "points", "points": num}) for num in (1000, 5000)]
-    fields = [Alternative(f"field, {100 * e:g} %", {"backend": "field", "tolerance": e}) for e in (0.05, 0.02, 0.005)]
+    of_fields, of_points = ("tolerance", "gradient_tolerance"), ("points",)
+    clouds = [Alternative(f"{num} points", {"backend": "points", "points": num}, of_fields) for num in (1000, 5000)]
+    fields = [
+        Alternative(f"field, {100 * e:g} %", {"backend": "field", "tolerance": e}, of_points) for e in (0.05, 0.02, 0.005)
+    ]
     finest = {"backend": "field", "tolerance": 0.002, "max_bytes": 2**28}
-    return [*clouds, *fields, Alternative("field, 0.2 %", finest)]
+    return [*clouds, *fields, Alternative("field, 0.2 %", finest, of_points)]
 
 
 PROXIMITY = Kind(ProximitySpec, lower, forward, reference, knobs=FORCE, alternatives=alternatives)

@@ -54,6 +54,10 @@ class Surface:
         """Return the surface of some of the faces; vertices and geoms stay."""
         return Surface(self.vertices, self.faces[faces], self.face_geom[faces], self.geoms)
 
+    def placed(self, pos: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> Surface:
+        """Return the surface rotated about the origin and then shifted [m]."""
+        return Surface(self.vertices @ rotation.T + pos, self.faces, self.face_geom, self.geoms)
+
     @staticmethod
     def joined(parts: Sequence[Surface]) -> Surface:
         """Return one surface that holds all faces of the parts, in order."""

@@ -63,6 +63,12 @@ class Constants(HookedModule):
         """Return whether there is an array of a path."""
         return name in buffers_of(self)
 
+    def overwrite(self, name: str, value: np.ndarray) -> None:
+        """Put other numbers in the place of an array, of its shape: captured graphs go on with them."""
+        with torch.inference_mode(False), torch.no_grad():
+            self._exact[name] = torch.from_numpy(np.array(value))
+            self[name].copy_(self._exact[name])
+
     def refresh(self) -> None:
         """Bind again if some buffer is another tensor than before, as under `torch.func.functional_call`."""
         if not all(map(operator.is_, buffers_of(self).values(), self._bound.values())):  # at each call, so in C

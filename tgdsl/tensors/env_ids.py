@@ -102,8 +102,8 @@ def few_ids(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
     """
     if mask.is_cuda or torch.compiler.is_compiling():
         return None
-    ids = mask.nonzero()[:, 0]
-    return ids if len(ids) <= FEW * len(mask) else None
+    ids = np.flatnonzero(mask.numpy())  # for few environments in half of torch's time
+    return torch.from_numpy(ids) if len(ids) <= FEW * len(mask) else None
 
 
 def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) -> None:
@@ -114,11 +114,17 @@ def put_rows(target: Tensor, chosen: Bool[Tensor, " env"], new: Tensor | float) 
         chosen: The environments.
         new: One number, or values that broadcast to the tensor, of its dtype.
     """
-    mask = broadcast_over(chosen, target)
-    if isinstance(new, Tensor):
-        torch.where(mask, new, target, out=target)
+    put(target, broadcast_over(chosen, target), new)
+
+
+def put(target: Tensor, where: Bool[Tensor, "*mask"], new: Tensor | float) -> None:
+    """Write new values where a mask holds that broadcasts to the target: see `put_rows`."""
+    if not isinstance(new, Tensor):
+        target.masked_fill_(where, new)
+    elif torch.compiler.is_compiling():
+        target.copy_(torch.where(where, new, target))
     else:
-        target.masked_fill_(mask, new)
+        torch.where(where, new, target, out=target)
 
 
 def may_look(values: Tensor) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import FunctionType, MethodType
 from typing import Any
@@ -89,6 +90,16 @@ def num_writes(tensor: Tensor) -> int:
     return -1 if tensor.is_inference() else tensor._version
 
 
+def below_autograd() -> AbstractContextManager[object]:
+    """Return a context in which operations skip autograd's layer of the dispatcher: small ones take four fifths of their time.
+
+    For use where derivatives are off. Tensors stay ordinary ones, and writes are counted, unlike under `inference_mode`, whose
+    tensors cannot be used outside of it. torch's own Python layer of custom operations enters it so.
+    """
+    context: Any = torch._C._AutoDispatchBelowAutograd()
+    return context
+
+
 def copy_each(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
     """Copy tensors of one dtype into others by one kernel on a GPU. `copy_` launches one for each."""
     torch._foreach_copy_(list(targets), list(sources))  # pyright: ignore[reportPrivateImportUsage]
@@ -118,14 +129,20 @@ def with_own_code(method: Callable[..., Any]) -> Callable[..., Any]:
     return MethodType(own, method.__self__)
 
 
-def inductor_options(checks_indices: bool, has_tiles: bool) -> dict[str, bool]:
+MOST_FUSED = 1024
+"""Operations of a kernel that is to be as large as can be."""
+
+
+def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> dict[str, Any]:
     """Return options for torch.compile, which are names of Inductor's private configuration.
 
     Args:
         checks_indices: Whether kernels assert that indices read from tensors are in range.
         has_tiles: Whether kernels on a GPU prefer blocks of two axes to one flat axis.
+        is_fused: Whether kernels have as many operations as can be, instead of 64 at most.
     """
-    return {"assert_indirect_indexing": checks_indices, "triton.prefer_nd_tiling": has_tiles}
+    options: dict[str, Any] = {"assert_indirect_indexing": checks_indices, "triton.prefer_nd_tiling": has_tiles}
+    return options | {"max_fusion_size": MOST_FUSED} if is_fused else options
 
 
 def expect_size(size: torch.SymInt, value: int) -> torch.SymInt:

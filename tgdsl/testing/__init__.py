@@ -8,6 +8,7 @@ gives a kind all the tests below for its float64 `reference`. Its author adds th
 `test_compiled_equals_eager`, compiles kernels and takes long: `pytest -k "not compiled_equals_eager"` leaves it out.
 """
 
+from tgdsl.module.accuracy.changed import moved, only
 from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.testing.conformance import (
     FAR_TOLERANCE,
@@ -19,7 +20,6 @@ from tgdsl.testing.conformance import (
     conformance_points,
 )
 from tgdsl.testing.reference import assert_agrees, full_scale_error
-from tgdsl.testing.states import moved, only
 
 __all__ = [
     "FAR_TOLERANCE",

@@ -22,7 +22,10 @@ MORE = {
 """Classes of the public names, a page each, and what stands on the same page."""
 WRITING = {
     "Kinds": ("tgdsl.sensors.base", ("Kind", "Lowered", "Channel", "Memory", "Axis", "Context", "ReferenceContext")),
-    "Specs of kinds": ("tgdsl.sensors.base", ("SensorSpec", "LinkSpec", "ProbeSpec", "ContactProbeSpec")),
+    "Specs of kinds": (
+        "tgdsl.sensors.base",
+        ("AnySensorSpec", "SensorSpec", "OnJointsSpec", "LinkSpec", "ProbeSpec", "ContactProbeSpec"),
+    ),
     "Quantities": ("tgdsl.quantities.base", ("Quantity", "Request", "Planning", "Scene", "Gathered", "Use")),
     "Sources": ("tgdsl.runtime.source_kind", ("SourceKind",)),
 }

@@ -11,6 +11,7 @@ from typing import Any
 
 from sphinx.application import Sphinx
 
+from tgdsl_docs.accuracy import Accuracy
 from tgdsl_docs.api import api_pages, escape_docstring, is_external
 from tgdsl_docs.commands import command_pages
 from tgdsl_docs.grammar import grammar_pages
@@ -25,8 +26,9 @@ FOLDER = "generated"
 def generate(app: Sphinx) -> None:
     """Write all generated pages."""
     source = Path(app.srcdir)
-    pages: dict[str, str] = {}
-    for made in (kind_pages(source), grammar_pages(), command_pages(), api_pages(), {"overview.md": overview()}):
+    accuracy = Accuracy()
+    pages: dict[str, str] = {"accuracy.md": accuracy.page()}
+    for made in (kind_pages(source, accuracy), grammar_pages(), command_pages(), api_pages(), {"overview.md": overview()}):
         pages |= made
     shutil.rmtree(source / FOLDER, ignore_errors=True)
     for name, text in pages.items():

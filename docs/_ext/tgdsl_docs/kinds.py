@@ -13,6 +13,7 @@ import tgdsl
 from tgdsl.sensors import KINDS
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.noise import Knobs
+from tgdsl_docs.accuracy import Accuracy
 from tgdsl_docs.links import ROOT
 from tgdsl_docs.tables import fields_table, inline, split_unit, table
 
@@ -24,8 +25,12 @@ ENVS, TAXELS = 16384, 100
 """Size of the rows that the cost is taken from; of kinds per body, one body."""
 
 
-def kind_pages(source: Path) -> dict[str, str]:
-    """Return a page per kind, and an index with what each measures and costs.
+def kind_pages(source: Path, accuracy: Accuracy) -> dict[str, str]:
+    """Return a page per kind with its plot, and an index with what each measures and costs.
+
+    Args:
+        source: Folder of the pages.
+        accuracy: Comparisons with closed forms.
 
     Raises:
         ValueError: If the example lacks a kind.
@@ -34,7 +39,12 @@ def kind_pages(source: Path) -> dict[str, str]:
     if lacking := [kind.name for kind in KINDS if kind.name not in blocks]:
         raise ValueError(f"{EXAMPLE}: found no sensor of kind {', '.join(lacking)}, expected one of each kind")
     measured = json.loads((ROOT / MEASURED).read_text(encoding="utf-8"))
-    pages = {f"kinds/{kind.name}.md": _page(kind, blocks[kind.name], outputs, measured, source) for kind in KINDS}
+    pages = {
+        f"kinds/{kind.name}.md": _page(kind, blocks[kind.name], outputs, measured, source)
+        + f"\n## Accuracy\n\n{accuracy.section(kind.name)}"
+        for kind in KINDS
+    }
+    pages |= {f"kinds/accuracy_{kind.name}.svg": accuracy.plot(kind.name) for kind in KINDS if accuracy.of(kind.name)}
     return {"kinds/index.md": _index(outputs, measured)} | pages
 
 

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from held import assert_holds
 
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.module.state import SceneState
+from tgdsl.report.oracles import geometry
 
 R = 0.01
 HALF = 0.02
@@ -49,39 +51,16 @@ def compiled(folder, mesh, probes, *, kind="contact_depth", dtype=torch.float64,
     return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
 
 
-MODES = {"exact": None, "sdf": {"query": "sdf"}, "raycast": {"query": "raycast"}}
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_4_cm_cube_at_every_clearance_of_a_10_mm_probe(tmp_path, mode):
-    clearances = np.array([1.0, 2.0, 3.5, 5.0, 6.5, 8.0, 9.0, 9.9]) * 1e-3
-    spots = [(x, y) for x in (-0.012, 0.0, 0.007) for y in (-0.009, 0.003)]
-    probes = [(x, y, HALF + c) for c in clearances for x, y in spots]
-    if MODES[mode] is None:
-        touch, scene = compiled(tmp_path, None, probes, geoms='<geom name="item" type="box" size=".02 .02 .02"/>')
-    else:
-        touch, scene = compiled(tmp_path, trimesh.creation.box((0.04, 0.04, 0.04)), probes, **MODES[mode])
-    found = touch(scene)["s"][0, :, 0].numpy()
-    expected = np.repeat(R - clearances, len(spots))
-    np.testing.assert_allclose(found, expected, atol={"exact": 1e-15, "sdf": TOLERANCE, "raycast": 1e-6}[mode])
+@pytest.mark.parametrize("way", geometry.WAYS)
+def test_a_4_cm_cube_at_every_clearance_of_a_10_mm_probe(way):
+    assert_holds(geometry.cube_of_any_making(way))
 
 
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 @pytest.mark.parametrize("scale", [1.0, 0.001])
-def test_distance_to_a_ball_inside_and_out(tmp_path, query, scale):
+def test_distance_to_a_ball_inside_and_out(query, scale):
     """A fine ball, also one in millimetres with a scale: distance and direction are the sphere's to its tessellation."""
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(300, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    radius = rng.uniform(0.012, 0.029, 300)
-    ball = trimesh.creation.icosphere(subdivisions=5, radius=HALF)
-    touch, scene = compiled(
-        tmp_path, ball, direction * radius[:, None], kind="surface_distance", scale=scale, query=query, surface="visual"
-    )
-    found = touch(scene)["s"][0, :, 0].numpy()
-    error = np.abs(found - (radius - HALF))
-    tessellation = HALF * (1 - np.cos(np.deg2rad(2.5) / 2)) + 1e-6
-    assert np.percentile(error, 99) < tessellation + (TOLERANCE if query == "sdf" else 0)
+    assert_holds(geometry.ball_of_triangles(query, scale))
 
 
 L_SHAPE = trimesh.util.concatenate(

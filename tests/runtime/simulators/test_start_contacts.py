@@ -1,5 +1,7 @@
 """Starts without a look for contacts, on both simulators: poses by MuJoCo's kinematics, no forces, and the others untouched."""
 
+import copy
+
 import mujoco
 import numpy as np
 import pytest
@@ -53,6 +55,32 @@ def test_poses_and_velocities_are_those_of_mujocos_kinematics_and_no_force_acts(
         assert torch.equal(value[[0, 2]], before[name][[0, 2]]), name
         if name in FIELDS:
             assert not value[[1, 3]].any(), name
+
+
+@BOTH
+@pytest.mark.parametrize("which", [[1], [3, 0], [0, 1, 2]], ids=["one", "few", "most"])
+@pytest.mark.parametrize("stored", ["none", "stored", "evaluate"])
+def test_some_environments_are_read_as_the_module_reads_them_of_the_whole_state(tmp_path, simulator, which, stored):
+    """After a reset, with and without stored contacts: `sim.read(mask)` is `touch(sim.state(), mask)` to the last bit."""
+    touch, sim = started(simulator, tmp_path)
+    force = torch.arange(12.0, dtype=torch.float64).view(4, 1, 3).expand(-1, len(touch.inputs.pairs), -1)
+    values = {"contact_found": torch.ones((4, len(touch.inputs.pairs))), "contact_netforce": force}
+    slots = torch.zeros((4, len(touch.inputs.pairs), touch.inputs.slots, 3), dtype=torch.float64)
+    slots[:, :, 0] = force  # all that acts is shown
+    contacts = values | {"contact_force": slots} if stored == "stored" else stored
+    touch.memory.keeps_last = True
+    with torch.no_grad():
+        sim.read()
+        mask = torch.zeros(4, dtype=torch.bool)
+        mask[which] = True
+        sim.reset(mask, contacts=contacts, qpos=DEEP)
+        other = copy.deepcopy(touch)
+        expected = other(sim.state(), mask)
+        read = sim.read(mask)
+        again = sim.read(which)  # by indices, and a second time
+    for name, reading in expected.items():
+        assert torch.equal(read[name], reading) and torch.equal(again[name], reading), name
+    assert any(reading[mask].any() for reading in read.values()) == (stored != "none")
 
 
 @BOTH

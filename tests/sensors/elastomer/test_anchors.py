@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from held import assert_holds
 from scipy.spatial.transform import Rotation
 
 from tgdsl.geometry.planes import rot, vec
 from tgdsl.quantities.contact_depth import Distance, Penetration
 from tgdsl.quantities.contact_depth.reference import ReferencePenetration
 from tgdsl.quantities.geoms.distance import Frame
+from tgdsl.report.oracles.contact_mechanics import friction
 from tgdsl.sensors.elastomer.anchors import PLANES, StickSlip, advance, advance_reference
 
 STICK_SLIP = StickSlip(0.0, 1e-5, 1e-4, None)
@@ -166,44 +168,19 @@ def test_below_the_cap_nothing_slides():
     np.testing.assert_array_equal([skin.memory[name] for name in PLANES], anchor)
 
 
-def test_a_tangential_cycle_is_the_winkler_coulomb_loop():
-    """A sphere held in a pad and moved to and fro.
+@pytest.mark.parametrize("part", ["out", "back", "again"])
+def test_a_tangential_cycle_is_the_winkler_coulomb_loop(part):
+    """A sphere held in a pad and moved to and fro: Winkler's curve, and back and forth by Masing's rule."""
+    assert_holds(friction.cycle(part))
 
-    Winkler: h = δ − r²/2R, dA = 2πR dh, each taxel sticks up to κ h.
-    Q = 2πR K_t ∫ min(s, κh) dh = 2πR K_t (s δ − s²/2κ), full slip at s* = κδ with μP = πR K_t κ δ²: Q/μP = 1 − (1 − s/s*)².
-    Back and forth by Masing's rule: the same curve twice as large from the turning point. The elastic half-space (Cattaneo,
-    Mindlin) has 1 − (1 − s/s*)^1.5: at most 27/256 less, at s/s* = 7/16, where √(1 − s/s*) = 3/4.
-    """
-    radius, depth, slip = 0.02, 1e-3, 0.4
-    line = np.linspace(-7e-3, 7e-3, 121)
-    x, y = (part.reshape(-1) for part in np.meshgrid(line, line))
-    h = depth - (x * x + y * y) / (2 * radius)
-    skin = Skin(np.stack([x, y, 0 * x], axis=1), stick_slip=StickSlip(0.0, 0.0, 1e-2, slip))
-    limit, full = slip * depth, slip * np.maximum(h, 0).sum()
 
-    def pull(s):
-        return skin.step((-h, [s, 0, 0], [0.0, 0, 0]))[:, 0].sum() / full
-
-    def curve(ratio):
-        return 1 - (1 - np.clip(ratio, 0, 1)) ** 2
-
-    assert pull(0.0) == 0
-    way = np.linspace(0, 0.8, 9)
-    loading = np.array([pull(w * limit) for w in way])
-    np.testing.assert_allclose(loading, curve(way), atol=2e-3)
-    down = np.linspace(0.8, -0.8, 9)
-    unloading = np.array([pull(w * limit) for w in down])
-    np.testing.assert_allclose(unloading, curve(np.array(0.8)) - 2 * curve((0.8 - down) / 2), atol=3e-3)
-    again = np.array([pull(w * limit) for w in -down])
-    np.testing.assert_allclose(again, -curve(np.array(0.8)) + 2 * curve((0.8 - down) / 2), atol=3e-3)
-    assert again[-1] == pytest.approx(loading[-1], abs=1e-3)  # the loop closes
-    assert pull(1.5 * limit) == pytest.approx(1.0, abs=1e-9)  # and slides at μP
+def test_the_loop_closes_and_slides_and_is_stiffer_than_mindlins():
+    for compare in (friction.loop_closes, friction.full_slip, friction.off_mindlin):
+        assert_holds(compare())
     fine = np.linspace(0, 1, 4001)
-    difference = curve(fine) - (1 - (1 - fine) ** 1.5)
-    assert difference.max() == pytest.approx(27 / 256, abs=1e-6) and fine[difference.argmax()] == pytest.approx(
-        7 / 16, abs=1e-3
-    )
-    print("loop", loading.round(4), "Mindlin", (1 - (1 - way) ** 1.5).round(4))
+    difference = friction.loading(fine) - friction.mindlin(fine)
+    assert difference.max() == pytest.approx(27 / 256, abs=1e-6)
+    assert fine[difference.argmax()] == pytest.approx(7 / 16, abs=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 from cube_on_pad import FOOTPRINT, TAXELS, pad, settled
+from held import assert_holds
 
 import tgdsl
 from tgdsl.errors import LowerError
 from tgdsl.layout.layout import Layout, Link
-from tgdsl.module.state import SceneState
+from tgdsl.report.oracles.forces import around_an_edge, made_up, shared_by_depth, torque_carried
 from tgdsl.sensors.force_taxel.kind import FORCE_TAXEL, ForceTaxelSpec, lower, reference_reports
 from tgdsl.testing import KindConformance
 from tgdsl.testing.reference import assert_agrees
@@ -60,26 +61,6 @@ class TestForceTaxelWithPressure(KindConformance):
 # Contacts made by hand
 
 
-def state_of(touch, pos, force, torque=None, net=None, depth=0.001, normal=(0, 0, -1)):
-    """Return a state with given contacts on the pad [m], [N]; the cube is `depth` above its surface."""
-    num, slots = len(pos), touch.inputs.slots
-    fields = {name: torch.zeros(1, 1, slots, 3, dtype=torch.float64) for name in ("pos", "force", "torque", "normal")}
-    fields["pos"][0, 0, :num] = torch.tensor(np.array(pos))
-    fields["force"][0, 0, :num] = torch.tensor(np.array(force))
-    fields["normal"][0, 0, :num] = torch.tensor(np.array(normal, dtype=float))
-    if torque is not None:
-        fields["torque"][0, 0, :num] = torch.tensor(np.array(torque))
-    net = np.sum(force, axis=0) if net is None else net
-    rows = [[0.0, 0, 0.03 + depth] if body == "cube" else [0.0, 0, 0] for body in touch.inputs.bodies]
-    return SceneState(
-        body_pos=torch.tensor([rows], dtype=torch.float64),
-        body_quat=torch.tensor([[[1.0, 0, 0, 0]] * len(rows)], dtype=torch.float64),
-        contact_found=torch.ones(1, 1),
-        contact_netforce=torch.tensor(np.array([[net]])),
-        **{f"contact_{name}": value for name, value in fields.items()},
-    )
-
-
 @pytest.mark.filterwarnings("ignore:contacts of pad – cube are more than `slots")
 def test_every_newton_is_somewhere(tmp_path):
     """Random contacts on, beside and far from the pad, more of them than slots, in float32: Σ f + missed = net to rounding."""
@@ -88,14 +69,14 @@ def test_every_newton_is_somewhere(tmp_path):
     for _ in range(50):
         pos, force = rng.normal(size=(3, 3)) * [0.03, 0.03, 0.005] + [0, 0, 0.01], rng.normal(size=(3, 3))
         net = force.sum(axis=0) + rng.normal(size=3)
-        readings = touch(state_of(touch, pos, force, net=net))
+        readings = touch(made_up(touch, pos, force, net=net))
         total = readings["s"][0].double().sum(dim=0) + readings["s/missed"][0, 0].double()
         np.testing.assert_allclose(total, net, atol=1e-6 * max(1.0, np.abs(force).sum()))
 
 
 def test_a_contact_far_from_all_taxels_is_missed(tmp_path):
     touch = pad(tmp_path)
-    readings = touch(state_of(touch, [[0.0, 0.055, 0.01]], [[0.3, 0.1, -2.0]]))
+    readings = touch(made_up(touch, [[0.0, 0.055, 0.01]], [[0.3, 0.1, -2.0]]))
     assert not readings["s"].any()
     np.testing.assert_array_equal(readings["s/missed"][0, 0], [0.3, 0.1, -2.0])
     np.testing.assert_array_equal(readings["s/residual"][0, 0], [0, 0, 0])
@@ -121,7 +102,7 @@ def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
     force = np.array([0.4, 0.0, -1.0])
     captured = []
     for y in np.linspace(0.0, 0.045, 151):
-        readings = touch(state_of(touch, [[0.002, y, 0.01]], [force]))
+        readings = touch(made_up(touch, [[0.002, y, 0.01]], [force]))
         total = readings["s"][0].sum(dim=0).numpy()
         np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), force, atol=1e-15)
         captured.append(total[2])
@@ -139,13 +120,12 @@ def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
     forces = []
     for angle in np.linspace(0, np.pi / 2, 151):
         normal = np.array([-np.sin(angle), 0, -np.cos(angle)])
-        readings = touch(state_of(touch, [[0.025, 0.005, 0.01]], [normal], normal=normal))
+        readings = touch(made_up(touch, [[0.025, 0.005, 0.01]], [normal], normal=normal))
         forces.append(readings["s"][0].numpy())
         total = forces[-1].sum(axis=0)
         np.testing.assert_allclose(total + readings["s/missed"][0, 0].numpy(), normal, atol=1e-15)
         assert (forces[-1] @ normal >= 0).all()
-        t = min(1, 2 * np.cos(angle) / 0.75)
-        np.testing.assert_allclose(total @ normal, t**2 * (3 - 2 * t), atol=1e-12)
+    assert_holds(around_an_edge())
     # Slope of the smooth step at most 3/2 · 2/0.75, that of the force's direction 1.
     assert np.abs(np.diff(forces, axis=0)).max() <= 5 * np.pi / 2 / 150
 
@@ -225,7 +205,7 @@ def test_no_taxel_leaves_the_contacts_cone(tmp_path):
         pos = np.column_stack([rng.uniform(-0.03, 0.03, (5, 2)), rng.uniform(0.008, 0.012, 5)])
         load, angle, part = rng.uniform(0.1, 2, 5), rng.uniform(0, 2 * np.pi, 5), rng.uniform(0, 1, 5)
         shear = friction * load * part * np.array([np.cos(angle), np.sin(angle)])
-        readings = touch(state_of(touch, pos, np.column_stack([*shear, -load]), 1e-3 * rng.normal(size=(5, 3))))
+        readings = touch(made_up(touch, pos, np.column_stack([*shear, -load]), 1e-3 * rng.normal(size=(5, 3))))
         x, y, z = readings["s"][0].numpy().T
         assert (z <= 0).all()
         assert (np.hypot(x, y) <= -friction * z + 1e-14).all()
@@ -236,8 +216,8 @@ def test_no_taxel_leaves_the_contacts_cone(tmp_path):
 def test_splitting_a_contact_changes_nothing(tmp_path):
     touch = pad(tmp_path)
     pos, force = [[0.004, 0.003, 0.01], [-0.012, 0.008, 0.01]], [[0.2, -0.1, -1.0], [0.0, 0.3, -0.7]]
-    whole = touch(state_of(touch, pos, force))
-    split = touch(state_of(touch, [pos[0], *pos], [0.35 * np.array(force[0]), 0.65 * np.array(force[0]), force[1]]))
+    whole = touch(made_up(touch, pos, force))
+    split = touch(made_up(touch, [pos[0], *pos], [0.35 * np.array(force[0]), 0.65 * np.array(force[0]), force[1]]))
     for name, reading in whole.items():
         torch.testing.assert_close(split[name], reading, rtol=0, atol=ROUNDING)
 
@@ -246,19 +226,15 @@ def test_contacts_come_in_any_order(tmp_path):
     touch, rng = pad(tmp_path), np.random.default_rng(4)
     pos = np.column_stack([rng.uniform(-0.03, 0.03, (6, 2)), np.full(6, 0.01)])
     force, order = rng.normal(size=(6, 3)), rng.permutation(6)
-    expected = touch(state_of(touch, pos, force))
-    found = touch(state_of(touch, pos[order], force[order]))
+    expected = touch(made_up(touch, pos, force))
+    found = touch(made_up(touch, pos[order], force[order]))
     for name, reading in expected.items():
         torch.testing.assert_close(found[name], reading, rtol=0, atol=ROUNDING)
 
 
-def test_a_torque_is_carried_as_far_as_the_footprint_reaches(tmp_path):
+def test_a_torque_is_carried_as_far_as_the_footprint_reaches():
     """A torsional torque of a contact without shear cannot be carried by pushing and is left whole; a tilting one can."""
-    touch = pad(tmp_path, moment_iterations=12)
-    readings = touch(state_of(touch, [[0.0, 0.0, 0.01]], [[0, 0, -1.0]], [[1e-3, -5e-4, 2e-3]]))
-    moment = np.cross(np.array(TAXELS), readings["s"][0].numpy()).sum(axis=0)
-    np.testing.assert_allclose(moment, [1e-3, -5e-4, 0], atol=1e-9)
-    np.testing.assert_allclose(readings["s/residual"][0, 0], [0, 0, 2e-3], atol=1e-9)
+    assert_holds(torque_carried())
 
 
 def test_the_two_bodies_of_a_sensor_are_told_apart(tmp_path):
@@ -297,12 +273,22 @@ def test_pressure_is_the_force_inwards_over_the_area(tmp_path):
     """π R² for a taxel that is given no area; what pulls has no pressure."""
     touch = pad(tmp_path, outputs=["pressure", "force"])
     for sign in (1, -1):
-        reading = touch(state_of(touch, [[0.003, 0.002, 0.01]], [[0.1, 0.2, -sign * 1.5]]))["s"][0].numpy()
+        reading = touch(made_up(touch, [[0.003, 0.002, 0.01]], [[0.1, 0.2, -sign * 1.5]]))["s"][0].numpy()
         expected = np.maximum(0, -reading[:, 2]) / (np.pi * 0.004**2)
         np.testing.assert_allclose(reading[:, 3], expected, rtol=1e-12)
         assert reading[:, 3].any() == (sign > 0)
     assert touch.outputs[0].channels == ("force_x", "force_y", "force_z", "pressure")
     assert touch.outputs[0].units == ("N", "N", "N", "Pa")
+
+
+class NoSurfaces:
+    """No surface is needed."""
+
+    def __call__(self, link, region):
+        pytest.fail(f"the surface of {link} was asked for")
+
+    def of_object(self, name):
+        pytest.fail(f"the surface of {name} was asked for")
 
 
 def test_a_taxel_without_area_has_no_pressure():
@@ -320,8 +306,8 @@ def test_a_taxel_without_area_has_no_pressure():
     )
     spec = ForceTaxelSpec(kind="force_taxel", links={"include": ("pad",)}, feels=("cube",), outputs=("pressure",))
     with pytest.raises(LowerError, match=r"^a taxel of no area has no pressure; leave pressure out, or give its area$"):
-        lower(spec, layout, lambda name, parts: pytest.fail("no surface is needed"))
-    lowered = lower(spec, dataclasses.replace(layout, area=np.ones(1)), lambda name, parts: pytest.fail("none"))
+        lower(spec, layout, NoSurfaces())
+    lowered = lower(spec, dataclasses.replace(layout, area=np.ones(1)), NoSurfaces())
     assert max(request.num_slots for request in lowered.requests) == 8
 
 
@@ -377,10 +363,6 @@ def test_one_environment_is_read_by_one_thread(tmp_path):
     assert reads == 0
 
 
-def test_deeper_taxels_carry_more(tmp_path):
+def test_deeper_taxels_carry_more():
     """Two taxels at the same distance from a contact, one three times as deep: three times the share, without the moment."""
-    pair = [(-0.004, 0, 0.01), (0.004, 0, 0.012)]
-    touch = pad(tmp_path, taxels=pair, moment_iterations=0)
-    forces = touch(state_of(touch, [[0.0, 0.0, 0.011]], [[0, 0, -1.0]], depth=0.003))["s"][0, :, 2]
-    # The cube's face is at 13 mm: spheres of 4 mm reach into it by 1 and 3 mm, a quarter and three quarters of their radius.
-    np.testing.assert_allclose(forces, [-0.251 / 1.002, -0.751 / 1.002], rtol=1e-12)
+    assert_holds(shared_by_depth())

@@ -41,10 +41,13 @@ KNOBS_OF = {
     "force_taxel": BASE | {"radius_noise", "gain", "dead_probability", "dead_range", "hysteresis", "crosstalk"},
     "link_contact": BASE,
     "temperature_grid": BASE,
+    "contact_audio": set(),
+    "actuation_audio": set(),
+    "microphone": set(),
 }
 """The paper's table "Imperfection knobs available per sensor type", the Schmitt threshold that its values give to `bool`, and
 the kinds that the paper has not: `force_taxel` like its taxels of force, `link_contact` and
-`temperature_grid` with what every sensor has."""
+`temperature_grid` with what every sensor has, `contact_audio`, which reads blocks, with none."""
 VALUES = {
     "read_delay": 0.01,
     "jitter": 0.01,

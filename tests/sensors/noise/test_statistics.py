@@ -6,35 +6,37 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from noise_cases import KOLMOGOROV, MM, Noise, correlation, normal_distance, one, standard_errors, uniform_distance
+from held import assert_holds
+from noise_cases import KOLMOGOROV, MM, Noise, correlation, standard_errors, uniform_distance
 from torch import Tensor
 
+from tgdsl.report.oracles import filters
+from tgdsl.report.oracles import noise as noise_oracles
+from tgdsl.report.oracles.noise import DT, SIDE, million, reading, variance_error
+from tgdsl.report.oracles.noise import NUM as N
 from tgdsl.sensors.noise import random, stages
 
-N, SIDE = 10**6, 1000
-"""Samples: of 1000 environments with 1000 rows."""
-DT = 2e-3
+
+@pytest.mark.parametrize(
+    "compare",
+    [noise_oracles.white_noise, noise_oracles.drift, noise_oracles.drift_distribution, noise_oracles.quantiser,
+     noise_oracles.dead_share, noise_oracles.gains, noise_oracles.radii],
+)  # fmt: skip
+def test_a_million_samples(compare):
+    """Means, variances and distributions, by theory."""
+    assert_holds(compare())
 
 
-def million(knobs: dict[str, Any], **more: Any) -> Noise:
-    return Noise(knobs, SIDE, num_envs=SIDE, **{"dtype": torch.float32, **more})
+@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
+def test_ages_are_uniform(parts):
+    assert_holds(noise_oracles.ages(parts))
 
 
-def reading(noise: Noise, signal: Any = 0.0) -> np.ndarray:
-    return noise.read(signal, DT)[..., 0].double().numpy()
-
-
-def variance_error(sample: np.ndarray, expected: float, kurtosis: float = 3.0) -> float:
-    """Return how many standard errors the variance of a sample of mean 0 is off."""
-    return standard_errors((sample**2).mean(), expected, expected * np.sqrt((kurtosis - 1) / sample.size))
-
-
-def test_white_noise_is_normal():
-    sigma = 5e-3
-    found = reading(million({"white_noise": sigma}), 1.0) - 1
-    assert standard_errors(found.mean(), 0, sigma / np.sqrt(N)) < 5
-    assert variance_error(found, sigma**2) < 5
-    assert normal_distance(found, sigma) < KOLMOGOROV
+@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
+@pytest.mark.parametrize("late", [0.0, 0.5e-3, 4e-3, 5.3e-3])
+def test_a_reading_is_exactly_as_old_as_its_delay(late, parts):
+    """A clock that is read late: also with calls further apart than the delay."""
+    assert_holds(filters.delay(late, parts))
 
 
 def test_white_noise_is_white():
@@ -54,20 +56,15 @@ def test_white_noise_is_white():
 
 
 def test_drift_is_a_random_walk():
-    """Its variance grows by σ² at each reading, its steps are normal, independent of one another, and of the white noise."""
+    """Its steps are independent of one another, and of the white noise; a reset starts some anew."""
     sigma = 1e-3
     noise, white = million({"drift": sigma}), million({"white_noise": 1.0})
     walk, steps, noises = np.zeros((SIDE, SIDE)), [], []
-    for n in range(1, 17):
+    for _ in range(16):
         found = reading(noise)
         steps.append(found - walk)
         noises.append(reading(white))
         walk = found
-        if n in (1, 2, 4, 8, 16):
-            assert variance_error(walk, n * sigma**2) < 5
-            assert standard_errors(walk.mean(), 0, sigma * np.sqrt(n / N)) < 5
-    assert normal_distance(walk, 4 * sigma) < KOLMOGOROV
-    assert normal_distance(steps[-1], sigma) < KOLMOGOROV
     for apart in (1, 2, 15):
         assert abs(correlation(steps[0], steps[apart])) < 5
     assert abs(correlation(steps[-1], walk - steps[-1])) < 5
@@ -78,19 +75,6 @@ def test_drift_is_a_random_walk():
     found = reading(noise)
     assert variance_error(found[::2], sigma**2) < 5
     assert variance_error(found[1::2], 17 * sigma**2) < 5
-
-
-def test_the_quantisers_error_is_uniform():
-    step = 0.01
-    t = np.linspace(0, 1, N).reshape(SIDE, SIDE, 1)
-    signal = 3 * np.sin(7 * t) + t
-    noise = million({"quantization": step}, dtype=torch.float64)
-    found = reading(noise, signal)
-    error = found - signal[..., 0]
-    assert np.abs(error).max() <= step / 2 * (1 + 1e-12)
-    np.testing.assert_allclose(found / step, np.round(found / step), atol=1e-9)
-    assert standard_errors(error.mean(), 0, step / np.sqrt(12 * N)) < 5
-    assert variance_error(error, step**2 / 12, kurtosis=1.8) < 5
 
 
 def test_dead_taxels():
@@ -149,19 +133,8 @@ def test_radii_are_uniform_at_each_step():
     assert abs(correlation(found[0][:, 1:], found[0][:, :-1])) < 5
 
 
-@pytest.mark.parametrize("parts", [0.1, 1, 2, 10])
-@pytest.mark.parametrize("delay", [0.0, 0.5e-3, 4e-3, 5.3e-3])
-def test_a_reading_is_exactly_as_old_as_its_delay(delay, parts):
-    """A clock that is read late: also with calls further apart than the delay."""
-    dt = DT / parts
-    noise = Noise({"read_delay": delay, "bias": 1.0}, 2, dt=dt)
-    clock = dt * np.arange(200)
-    found = one(noise, clock, dt) - 1
-    np.testing.assert_allclose(found, np.maximum(clock - delay, 0)[:, None].repeat(2, 1), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("parts", [0.1, 1, 2, 10])
-def test_ages_are_uniform(parts):
+@pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
+def test_ages_are_independent(parts):
     dt, low, high, num_envs = DT / parts, 10e-3, 18e-3, 5000
     noise = Noise({"read_delay": low, "jitter": high - low}, 2, num_envs=num_envs, dt=dt)
     ages, first = [], int(np.ceil(high / dt))
@@ -171,8 +144,6 @@ def test_ages_are_uniform(parts):
             assert torch.equal(found[:, 0], found[:, 1])
             ages.append(call * dt - found[:, 0, 0].numpy())
     sample = np.stack(ages)
-    assert sample.min() > low - 1e-12 and sample.max() < high + 1e-12
-    assert uniform_distance(sample, low, high) < KOLMOGOROV
     assert abs(correlation(sample[1:], sample[:-1])) < 5
     assert abs(correlation(sample[:, 1:], sample[:, :-1])) < 5
 

@@ -74,7 +74,7 @@ class TestSemiImplicit(TestTemperatureGrid):
 
 
 class TestLinksThatTouch(TestTemperatureGrid):
-    objects = HEAT | {"other": {"body": "tip", "material": "skin"}}
+    objects = HEAT | {"other": {"body": "tip", "material": "rubber"}}
     parameters = {"cells": [2, 2, 2], "material": "skin", "materials": {"tip": "copper"}, "temperature": 30.0}
     rest = 30.0
 

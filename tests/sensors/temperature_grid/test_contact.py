@@ -5,89 +5,32 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from heat_scenes import begin, cells_of, face_contacts, heat_module, heat_state
-from scipy.special import erfc
+from heat_scenes import begin, cells_of, heat_module, heat_state
+from held import assert_holds
 
-from tgdsl.fields.materials import MATERIALS
-
-ALLOY = {"like": "aluminium", "conductivity": 167.0, "density": 2700.0, "specific_heat": 896.0}
-HARD_RUBBER = {"like": "rubber", "conductivity": 0.16, "density": 1190.0, "specific_heat": 2010.0}
-"""Incropera, tables A.1 and A.3: aluminium 6061, hard rubber."""
+from tgdsl.report.oracles import heat
 
 
-def diffusivity(material):
-    return material["conductivity"] / (material["density"] * material["specific_heat"])
-
-
-def effusivity(material):
-    return np.sqrt(material["conductivity"] * material["density"] * material["specific_heat"])
-
-
-def test_aluminium_on_warm_rubber_warms_as_two_solids_do(tmp_path):
+@pytest.mark.parametrize("steps", [500, 1000])
+def test_aluminium_on_warm_rubber_warms_as_two_solids_do(steps):
     """Carslaw and Jaeger, 2.14: both surfaces go to (e₁T₁ + e₂T₂)/(e₁ + e₂) at once and stay there, √(kρc) being e.
 
     Aluminium at 22 °C on rubber at 45 °C: its surface rises by 0.69 K, and erfc(x/√4αt) of it at depth x.
     """
-    rise = 23.0 * effusivity(HARD_RUBBER) / (effusivity(ALLOY) + effusivity(HARD_RUBBER))
-    assert rise == pytest.approx(0.69, rel=0.01)
-    dt, sides, thick = 0.0005, [0.01, 0.01, 0.12], [0.01, 0.01, 0.002]
-    ball = {"material": HARD_RUBBER, "temperature": 45.0, "cells": [1, 1, 80]}
-    module = heat_module(tmp_path, {"tip": sides}, {"cells": [1, 1, 120], "material": ALLOY}, {"slab": (thick, ball)})
-    state = heat_state(module, dt, {("tip", "slab"): face_contacts(sides, -0.06)})
-    state.body_pos[:, module.inputs.bodies.index("slab"), 2] = -0.061
-    begin(module, state)
-    x = (np.arange(120) + 0.5) * 0.001
-    for step in range(1, 1001):
-        readings = module(state)
-        if step in (500, 1000):
-            expected = rise * erfc(x / np.sqrt(4 * diffusivity(ALLOY) * step * dt))
-            np.testing.assert_allclose(readings["heat"][0, :, 0].numpy() - 22.0, expected, atol=0.01 * rise)
+    found = heat.two_bodies(steps)
+    assert_holds(found)
+    assert found.atol == pytest.approx(0.01 * 0.69, rel=0.01)
 
 
-def half_space(count):
-    """Return the Green's function of the surface layer of a half-space of unit cubes that conduct 1 [1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(300)
-    u, w = 0.5 * (nodes + 1), 0.5 * weights
-    k, dk = np.pi * u**3, 3 * np.pi * u**2 * w
-    less = 2 * np.sin(k[:, None] / 2) ** 2 + 2 * np.sin(k[None, :] / 2) ** 2
-    root = np.sqrt(less * (less + 2))
-    value = np.outer(dk, dk) * (2 + less - root) / (2 * root) / np.pi**2
-    waves = np.cos(np.outer(np.arange(count), k))
-    return waves @ value @ waves.T
-
-
-def test_the_lattices_green_function_is_known():
-    """At the origin of the whole lattice it is Watson's integral, 0.2527; of a half-space 2 · 0.2527 − 1/6. Far off 1/2πr."""
-    green = half_space(21)
-    assert green[0, 0] == pytest.approx(2 * 0.2527310098586 - 1 / 6, rel=1e-6)
-    assert green[20, 0] * 2 * np.pi * 20 == pytest.approx(1.0, rel=1e-3)
+@pytest.mark.parametrize("is_far", [False, True])
+def test_the_lattices_green_function_is_known(is_far):
+    assert_holds(heat.greens_function(is_far))
 
 
 @pytest.mark.parametrize("cell", [0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0])
 def test_a_circular_spot_has_its_resistance(cell):
-    """An isothermal disc on a half-space: 1/4ka (Carslaw and Jaeger, 8.2), whatever the size of cells over a, and wherever it is.
-
-    The half-space is a lattice of cells known by its Green's function: what the spot's conductances leave to it is solved.
-    """
-    from tgdsl.sensors.temperature_grid.shares import Boxes, conductances
-
-    count = 2 * int(np.ceil(1 / cell)) + 7
-    green, size = half_space(count), torch.tensor([float(count)], dtype=torch.float64)
-    one = torch.ones(1, dtype=torch.float64)
-    depth = one * 3
-    boxes = Boxes((0 * one, 0 * one, 0 * one), (size, size, depth), (one, one, one), (size, size, depth))
-    area, middle = torch.full((1, 1, 1), np.pi / cell**2, dtype=torch.float64), 0.5 * count
-    rng = np.random.default_rng(0)
-    for x, y in [(0, 0), (0.5, 0.5), (0.5, 0), *rng.uniform(0, 0.5, size=(8, 2))]:
-        pos = tuple(torch.full((1, 1, 1), v, dtype=torch.float64) for v in (middle + x, middle + y, 3.0))
-        normal = tuple(torch.full((1, 1, 1), v, dtype=torch.float64) for v in (0.0, 0.0, -1.0))
-        found = conductances(area, pos, normal, one[None], boxes, (count, count, 3))[0, 0, 0].numpy()
-        assert (found[..., :2] == 0).all()
-        at = np.argwhere(found[..., 2] > 0)
-        apart = np.abs(at[:, None] - at[None])
-        matrix = np.diag(1 / found[..., 2][found[..., 2] > 0]) + green[apart[..., 0], apart[..., 1]]
-        conductance = np.linalg.solve(matrix, np.ones(len(at))).sum()
-        assert conductance == pytest.approx(4 / cell, rel=0.02)
+    """An isothermal disc on a half-space: 1/4ka (Carslaw and Jaeger, 8.2), whatever the size of cells over a, and wherever it is."""
+    assert_holds(heat.circular_spot(cell))
 
 
 def test_a_patch_that_covers_the_face_is_not_constricted():
@@ -112,26 +55,9 @@ def test_a_patch_that_covers_the_face_is_not_constricted():
     np.testing.assert_allclose(of(0.01, 0.01, 0.01), whole, rtol=1e-12, atol=1e-15)
 
 
-def test_two_lumps_in_contact_find_their_mean(tmp_path):
+def test_two_lumps_in_contact_find_their_mean():
     """In the end, by their heat capacities; and the film between them says how fast at first."""
-    ball = {"material": "copper", "temperature": 45.0}
-    parameters = {"cells": [1, 1, 1], "material": "copper", "contact_area": "1 cm2", "contact_conductance": "200 W/(m2*K)"}
-    module = heat_module(tmp_path, {"tip": [0.01, 0.01, 0.01]}, parameters, {"ball": ([0.01, 0.01, 0.02], ball)})
-    state = heat_state(module, 0.01, {("tip", "ball"): [((0, 0, 0.005), (0, 0, -1), 2.0)]})
-    begin(module, state)
-    first = module(state)["heat"].item() - 22.0
-    copper = MATERIALS["copper"]
-    heat = copper.density * copper.specific_heat * 1e-6
-    width = 2e-6 ** (1 / 3)
-    radius = np.sqrt(1e-4 / np.pi)
-    inside = copper.conductivity * (2e-4 / width + 4 * radius * (1 - 0.01 / width) / (1 + 0.5 * radius / width))
-    flow = 1 / (1 / (2 * copper.conductivity * 0.01) + 1 / (200 * 1e-4) + 1 / inside)
-    assert first == pytest.approx(23.0 * (1 - np.exp(-0.01 * flow * 1.5 / heat)) / 1.5, rel=1e-3)
-    state.dt = 100.0
-    for _ in range(50):
-        readings = module(state)
-    assert readings["heat"].item() == pytest.approx(22 + 23 * 2 / 3, rel=1e-9)
-    assert readings["heat/objects"][0, 0, 0].item() == pytest.approx(22 + 23 * 2 / 3, rel=1e-9)
+    assert_holds(heat.two_lumps())
 
 
 def test_an_object_between_two_links_is_told_by_both_alike(tmp_path):

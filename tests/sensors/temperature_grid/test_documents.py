@@ -55,6 +55,36 @@ def test_a_link_that_is_a_plane_is_a_located_mistake(tmp_path):
         tgdsl.compile(tmp_path / "heat.yaml")
 
 
+def test_an_object_that_encloses_nothing_is_a_located_mistake(tmp_path):
+    """Of an open mesh whose faces do not agree which side is out only rounding is left as volume: it held 4e-16 J."""
+    (tmp_path / "shell.xml").write_text(
+        '<mujoco><asset><mesh name="shell" inertia="shell" vertex="0 0 0 .02 0 0 0 .02 0 0 0 .02" face="0 1 2 0 1 3"/></asset>'
+        '<worldbody><body name="tip"><freejoint/><geom type="box" size=".01 .01 .01"/></body>'
+        '<body name="shell"><freejoint/><geom type="mesh" mesh="shell" mass="1"/></body></worldbody></mujoco>'
+    )
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "shell.xml")},
+        "objects": {"shell": {"body": "shell", "material": "wood"}},
+        "sensors": {
+            "heat": {
+                "kind": "temperature_grid", "links": "tip", "feels": ["shell"], "cells": [1, 1, 1], "material": "steel"
+            }
+        },
+    }  # fmt: skip
+    with pytest.raises(tgdsl.SpecError, match=r'objects\.shell.*: the geoms of body "shell" enclose no volume'):
+        tgdsl.compile(document)
+
+
+def test_an_area_by_hertz_needs_a_stiffness(tmp_path):
+    """Without one of both sides a point contact had no area, and passed no heat."""
+    material = {"conductivity": 200.0, "density": 2700.0, "specific_heat": 900.0, "emissivity": 0.1}
+    ball = {"ball": ([0.02] * 3, {"material": material, "temperature": 45.0})}
+    with pytest.raises(tgdsl.SpecError, match=r"objects\.ball\.material: neither .* has a `youngs_modulus`.*`contact_area`"):
+        heat_module(tmp_path, {"tip": [0.01] * 3}, {"cells": [1, 1, 1], "material": material}, ball)
+    heat_module(tmp_path, {"tip": [0.01] * 3}, {"cells": [1, 1, 1], "material": material, "contact_area": "1 mm2"}, ball)
+
+
 def test_rows_of_one_number_of_each_link_name_links(tmp_path):
     for outputs in ("cells", "max", "mean"):
         module = heat_module(

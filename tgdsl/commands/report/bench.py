@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from tgdsl.commands.arguments import Document, OptionalFile, Overrides, parsed_overrides
+from tgdsl.commands.arguments import FILE, OptionalFile, Overrides, parsed_overrides
 
 if TYPE_CHECKING:
     from tgdsl.report.bench.bench import Bench as Work
@@ -31,8 +31,12 @@ class Bench:
     Errors are of states of the document's own scene, run as by `tgdsl run`, against the finest variant in float64.
     """
 
-    document: Document
-    """The YAML document."""
+    document: Annotated[tyro.conf.Positional[Path | None], FILE] = None
+    """The YAML document; not for `--oracles` and `--hard`."""
+    oracles: bool = False
+    """Compare the package with all closed forms instead: ours, exact, and the paper's formula where it differs."""
+    hard: bool = False
+    """Run the numerical hard cases of all kinds instead."""
     device: str = "cpu"
     """Where sensors are computed: cpu, cuda or cuda:1."""
     envs: Annotated[str, tyro.conf.arg(metavar="N,N…")] = "256"
@@ -61,6 +65,9 @@ class Bench:
 
     def run(self) -> None:
         """Measure, print a table, write the files."""
+        if self.document is None or self.oracles or self.hard:
+            self._run_without_document()
+            return
         from tgdsl.files.write import check_writable
         from tgdsl.report.bench.bench import Bench as Work
         from tgdsl.report.bench.files import check_files, write_files
@@ -85,6 +92,17 @@ class Bench:
         report = _measured(work)
         print(_text(report))
         print("\n".join(["", *map(str, write_files(report, self.out))]))
+
+    def _run_without_document(self) -> None:
+        """Run `--oracles` and `--hard`."""
+        from tgdsl.commands.report.sheets import report
+        from tgdsl.errors import TgdslError
+
+        if not (self.oracles or self.hard):
+            raise TgdslError("bench: found no document, expected one, --oracles or --hard")
+        if self.document is not None:
+            raise TgdslError(f"bench {self.document}: --oracles and --hard need no document, expected one or the other")
+        report(self.oracles, self.hard, self.out)
 
 
 def _measured(work: Work) -> Report:
@@ -112,7 +130,11 @@ def _text(report: Report) -> str:
         header, *rows = cells_of(subject)
         marks = [("now" if p.is_own else "") + (" ●" if p.is_on_front else "") for p in subject.points]
         table = text_table((*header, ""), [(*row, mark.strip()) for row, mark in zip(rows, marks, strict=True)])
-        lines = [f"{subject.name} ({subject.kind}), against {subject.reference}", *([subject.check] if subject.check else [])]
+        lines = [
+            f"{subject.name} ({subject.kind}), against {subject.reference}",
+            *([subject.check] if subject.check else []),
+            *subject.chosen,
+        ]
         lines += [table, *(f"not to be had: {label}: {why}" for label, why in subject.left_out)]
         parts.append("\n".join(lines))
     parts.append("now: what the compiler takes; ●: on the front of time and RMS error, overlapping intervals being equal")

@@ -42,6 +42,10 @@ class Magnitude(NamedTuple):
     scale: Float[np.ndarray, " channel"]
     active: Bool[np.ndarray, "step env row channel"]
 
+    def of(self, envs: slice, channels: Sequence[int]) -> Magnitude:
+        """Return that of some channels, in some environments."""
+        return Magnitude(self.rest[channels], self.scale[channels], self.active[:, envs][..., channels])
+
 
 class Errors(NamedTuple):
     """Errors of a reading.
@@ -57,6 +61,15 @@ class Errors(NamedTuple):
     largest: Interval
     p99: float
     is_finite: bool
+
+
+def halves(num_envs: int) -> tuple[slice, slice]:
+    """Return the environments on which variants are compared, and those that take no part in it and verify.
+
+    Objects that differ between environments do so by `env % number`, so that a half has all of them, and every second one not.
+    """
+    half = (num_envs + 1) // 2
+    return slice(0, half), slice(half, num_envs)
 
 
 def magnitude_of(expected: Readings, quantities: Sequence[str]) -> Magnitude:

@@ -8,9 +8,9 @@ from typing import Any
 
 from tgdsl.plan.plan import Plan
 from tgdsl.quantities.geoms.tables import GeomTable
-from tgdsl.sensors.base import Alternative, Kind, SensorSpec
+from tgdsl.sensors.base import Alternative, AnySensorSpec, Kind
 
-BARE: Mapping[str, Any] = {"readout": "clean", "rate": None, "history": None}
+BARE: Mapping[str, Any] = {"readout": "clean", "rate": None, "history": None, "accuracy": None}
 """Fields of a sensor without imperfections, so that two variants can be compared reading by reading."""
 
 
@@ -22,15 +22,20 @@ class Variant:
         label: What to call it.
         changes: What is other than in the document, by dotted path: `sensors.skin.operator`.
         is_own: Whether it is what the document says.
+        is_free: Whether it changes nothing that somebody wrote.
+        is_exact: Whether it is exact but for rounding.
     """
 
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict)
     is_own: bool = False
+    is_free: bool = True
+    is_exact: bool = False
 
     def joined(self, other: Variant) -> Variant:
         """Return the variant that has the changes of both."""
-        return Variant(f"{self.label}, {other.label}", {**self.changes, **other.changes})
+        changes, is_exact = {**self.changes, **other.changes}, self.is_exact and other.is_exact
+        return Variant(f"{self.label}, {other.label}", changes, is_free=self.is_free and other.is_free, is_exact=is_exact)
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ def bare(name: str) -> dict[str, Any]:
 
 
 def variants_of(
-    kind: Kind, name: str, spec: SensorSpec, queries: Mapping[str, Any], alternatives: Sequence[Alternative]
+    kind: Kind, name: str, spec: AnySensorSpec, queries: Mapping[str, Any], alternatives: Sequence[Alternative]
 ) -> Variants:
     """Return the variants of a sensor.
 
@@ -73,10 +78,29 @@ def variants_of(
 
 def _variants(paths: Sequence[str], specs: Sequence[Any], alternatives: Sequence[Alternative]) -> tuple[Variant, ...]:
     found = []
-    for label, changes in alternatives:
-        is_own = all(_is_same(getattr(spec, key), value) for spec in specs for key, value in changes.items())
-        found.append(Variant(label, {f"{path}.{key}": value for path in paths for key, value in changes.items()}, is_own))
+    for own in alternatives:
+        is_own = all(is_taken(spec, own) for spec in specs)
+        changes = {f"{path}.{key}": value for path in paths for key, value in own.changes.items()}
+        found.append(Variant(own.label, changes, is_own, all(is_free(spec, own) for spec in specs), own.is_exact))
     return tuple(found)
+
+
+def is_taken(spec: Any, alternative: Alternative) -> bool:
+    """Return whether a sensor's or an object's fields are those of an alternative already."""
+    return all(_is_same(getattr(spec, key), value) for key, value in alternative.changes.items())
+
+
+def is_free(spec: Any, alternative: Alternative) -> bool:
+    """Return whether an alternative changes nothing that somebody wrote, and uses all of it."""
+    changes = alternative.changes
+    written = [key for key in spec.model_fields_set if key in changes or key in alternative.unused]
+    return all(key in changes and _is_same(getattr(spec, key), changes[key]) for key in written)
+
+
+def written_of(spec: Any, alternatives: Sequence[Alternative]) -> list[str]:
+    """Return the fields of a spec that somebody wrote and some alternative would change."""
+    changed = {key for own in alternatives for key in (*own.changes, *own.unused)}
+    return sorted(key for key in spec.model_fields_set & changed if getattr(spec, key) is not None)
 
 
 def _is_same(own: Any, value: Any) -> bool:

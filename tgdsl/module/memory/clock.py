@@ -16,7 +16,7 @@ from tgdsl.errors import TgdslError
 from tgdsl.plan.sensors import PlannedSensor
 from tgdsl.sensors.base import UNTIMED, Context
 from tgdsl.sensors.noise.instant import Now
-from tgdsl.sensors.noise.random import Stream, sensor_key, streams
+from tgdsl.sensors.noise.random import Stream, kind_stream, sensor_key, streams
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers
 
 ENV = "clock/env"
@@ -44,7 +44,9 @@ class Clock(HookedModule):
         super().__init__()
         self._sensors = [sensor for sensor in sensors if sensor.wants_clock]
         self._has_history = any(sensor.windows for sensor in sensors)
-        self._drawing = list(dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams))
+        noisy = dict.fromkeys(own.sensor for own in self._sensors if own.noise is not None and own.noise.streams)
+        self._drawing = list(noisy)
+        self._keyed = list(noisy | dict.fromkeys(own.sensor for own in self._sensors if own.is_random))
         self._seed, self._first_env = 0, None
         self.home = torch.empty(0)
 
@@ -83,8 +85,8 @@ class Clock(HookedModule):
         # No number of a plan is read in `nows`: compiled code would be made twice, as it may be another at the next call.
         periods = torch.tensor([sensor.period for sensor in self._sensors], dtype=like.dtype, device=like.device)
         self.register_buffer("periods", periods, persistent=False)
-        if self._drawing:
-            keys = torch.zeros(len(self._drawing), 2, dtype=torch.int32, device=like.device)
+        if self._keyed:
+            keys = torch.zeros(len(self._keyed), 2, dtype=torch.int32, device=like.device)
             self.register_buffer("keys", keys, persistent=False)
         self._count_anew()
 
@@ -132,9 +134,7 @@ class Clock(HookedModule):
         ages = memory["clock/ages"] + dt if "clock/ages" in memory and dt is not None else None
         drawn: dict[str, Mapping[int, Stream]] = {}
         if self._drawing:
-            env = memory[ENV] if ENV in memory else torch.arange(len(age), device=age.device)
-            env = env + memory["clock/first_env"]
-            found = streams(memory["clock/keys"], env, step[:, 0], memory["clock/episode"])
+            found = streams(memory["clock/keys"][: len(self._drawing)], _env(memory), step[:, 0], memory["clock/episode"])
             drawn = dict(zip(self._drawing, found, strict=True))
         nows = {}
         for i, sensor in enumerate(self._sensors):
@@ -145,8 +145,7 @@ class Clock(HookedModule):
             nows[sensor.name] = Now(dt, step, age, ages, is_due, period, drawn.get(sensor.sensor, {}))
         return nows
 
-    @staticmethod
-    def context(sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
+    def context(self, sensor: PlannedSensor, memory: Mapping[str, Tensor], dt: Tensor | None, substep: int = 0) -> Context:
         """Return when a sensor's kind is called; nothing of it if the kind does not want to know.
 
         Args:
@@ -159,10 +158,14 @@ class Clock(HookedModule):
             return UNTIMED
         assert dt is not None
         count = max(sensor.substeps, 1)
-        age, own = memory["clock/age"][:, None], dt / count
+        age, own = memory["clock/age"][:, None], dt / count if count > 1 else dt
         time = torch.where(age == 0, 0.0, memory["clock/time"][:, None] + (substep + 1) * own)
         is_first = (age == 0) & (substep == 0)
-        return Context(own, memory["clock/step"][:, None], substep, time, is_first)
+        stream = None
+        if sensor.is_random:
+            key = memory["clock/keys"][self._keyed.index(sensor.sensor)]
+            stream = kind_stream(key, _env(memory), memory["clock/step"] * count + substep)
+        return Context(own, memory["clock/step"][:, None], substep, time, is_first, stream)
 
     @staticmethod
     def after(clock: Mapping[str, Tensor], dt: Tensor | None) -> dict[str, Tensor]:
@@ -187,8 +190,8 @@ class Clock(HookedModule):
         self._set_keys()
 
     def _set_keys(self) -> None:
-        if self._drawing:
-            keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._drawing]
+        if self._keyed:
+            keys = [sensor_key(int(self.get_buffer("seed")), sensor) for sensor in self._keyed]
             self.get_buffer("keys").copy_(torch.tensor(keys, dtype=torch.int32))
 
     def on_load(self, state_dict: dict[str, Any], prefix: str, errors: list[str], load: Callable[[], object]) -> None:
@@ -206,6 +209,12 @@ class Clock(HookedModule):
         if self.num_envs is not None:
             self._seed, self._first_env = int(self.get_buffer("seed")), int(self.get_buffer("first_env"))
             self._set_keys()
+
+
+def _env(memory: Mapping[str, Tensor]) -> Tensor:
+    """Return the numbers of the environments that are read, (env,), counted over all processes."""
+    age = memory["clock/age"]
+    return (memory[ENV] if ENV in memory else torch.arange(len(age), device=age.device)) + memory["clock/first_env"]
 
 
 def _rank() -> int:

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.memory.clock import Clock
+from tgdsl.module.memory.watch import StateWatch
 from tgdsl.plan.sensors import PlannedMemory, PlannedReading, PlannedSensor
+from tgdsl.sensors.base import Kind
 from tgdsl.tensors.env_ids import broadcast_over
 from tgdsl.tensors.fusion import materialised
 from tgdsl.tensors.torch_internals import HookedModule, held_buffers, num_writes
@@ -33,9 +35,21 @@ class Memory(HookedModule):
             alone, which needs them: code that is compiled for the first call then serves all later ones.
     """
 
-    def __init__(self, sensors: Sequence[PlannedSensor], readings: Mapping[str, PlannedReading]):
-        """Note what sensors carry, and what all readings are."""
+    def __init__(
+        self,
+        sensors: Sequence[PlannedSensor],
+        readings: Mapping[str, PlannedReading],
+        kinds: Mapping[str, Kind] | None = None,
+    ):
+        """Note what sensors carry, and what all readings are.
+
+        Args:
+            sensors: The sensors.
+            readings: All readings, by name.
+            kinds: The kind of each sensor, by its name, where what kinds warn of is to be watched.
+        """
         super().__init__()
+        self._watch = StateWatch(sensors, kinds or {})
         self._planned = {f"{s.name}:{name}": part for s in sensors for name, part in s.state.items()}
         for s in sensors:
             for reading in s.windows:
@@ -49,6 +63,7 @@ class Memory(HookedModule):
             for name, reading in readings.items()
             if name not in stacks
         }
+        self._views = [reading.name for s in sensors if s.history and s.history.view for reading in s.windows]
         self._last: dict[str, tuple[Tensor, int]] = {}
         self._is_filled = False  # whether what is kept was handed out
         self.keeps_last = False
@@ -98,6 +113,7 @@ class Memory(HookedModule):
             if _calls(planned, dt)[0] > held[path].shape[1]:
                 what = f'SceneState.dt is {dt:g} s, shorter than at first: the ring of "{sensor}" does not hold'
                 raise StateError(f"{what} {planned.past:g} s of so many calls; begin with the shortest dt")
+        self._watch.look(held)
         return held | self.clock.tensors()
 
     @property
@@ -111,6 +127,10 @@ class Memory(HookedModule):
         self._last = {}
         if not self._is_filled:
             self._last = {name: (reading.detach(), num_writes(reading)) for name, reading in readings.items()}
+
+    def with_views(self, readings: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Put the memory itself in the place of stacks that are declared as views."""
+        return readings | {name: self.get_buffer(f"{WINDOW}{name}").transpose(2, 3) for name in self._views}
 
     def keep_last(self, num_envs: int) -> None:
         """From now on keep what is handed out, for the environments that a masked call leaves out.

@@ -52,6 +52,11 @@ def few_rows(mask: Bool[Tensor, " env"]) -> Int[Tensor, " n"] | None:
     return rows if len(rows) > 1 else rows.repeat(2)
 
 
+def rows_of(tensors: Mapping[str, Tensor], rows: Int[Tensor, " n"]) -> Tensors:
+    """Return some environments' rows of a state's fields."""
+    return {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
+
+
 def read_rows(
     core: Callable[[Tensors, Tensors], Tensors],
     rows: Int[Tensor, " n"],
@@ -63,12 +68,11 @@ def read_rows(
     Args:
         core: Returns readings as `reading/<name>`, and new state as `state/<name>`.
         rows: The environments.
-        tensors: The fields of a state, of all environments.
+        tensors: The fields of their state.
         memory: State of all environments, and what was handed out before, by name.
     """
-    own = {name: value[rows] if value.ndim else value for name, value in tensors.items() if name != "mask"}
     held = {name: value if name in SHARED else value[rows] for name, value in memory.items()}
-    made = core(own, held | {ENV: rows})
+    made = core(dict(tensors), held | {ENV: rows})
     for path, value in made.items():
         part, _, name = path.partition("/")
         if part == "state" and value.ndim < memory[name].ndim:

@@ -7,6 +7,7 @@ after the other, `all_bodies` bodies of the state, `pair` pairs of the state, `s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Int
@@ -15,7 +16,7 @@ from torch import Tensor
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Scene
-from tgdsl.quantities.contacts.part import ContactsPart
+from tgdsl.quantities.contacts.part import SLOT_FIELDS, ContactsPart
 from tgdsl.quantities.contacts.request import ContactPoints
 
 
@@ -42,7 +43,7 @@ def contacts_of(
     rotation = planes.rotation(state["body_quat"][:, bodies])
     whole = _of_pairs(state["contact_netforce"], index)
     net = planes.rotate_back(rotation, planes.split(whole.sum(dim=2)))
-    if "contact_force" not in state:
+    if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         own = [(none, none, none)] * 4
     else:
@@ -57,6 +58,36 @@ def contacts_of(
         own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
     pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
     return ContactPoints(pos, force, torque, normal, net)
+
+
+class PairContacts(NamedTuple):
+    """The contacts of each body and object, in world axes; planes (env, body, object, slot).
+
+    Attributes:
+        pos: Contact points [m].
+        force: Force on the body at each [N], what the slots lack of each pair's whole force shared out.
+        normal: Unit normal out of the object; not-a-number where the state has none beside a force.
+        is_used: Which slots are contacts.
+    """
+
+    pos: Vec
+    force: Vec
+    normal: Vec
+    is_used: Bool[Tensor, "env body object slot"]
+
+
+def pair_contacts(state: Mapping[str, Tensor], index: Int[Tensor, "body object"]) -> PairContacts:
+    """Return the contacts of bodies and objects where they are, without torques.
+
+    Args:
+        state: Fields of `SceneState`: contact_netforce, contact_pos, contact_force and contact_normal.
+        index: Pair of each body and object; their number where there is none.
+    """
+    names = ("contact_pos", "contact_force", "contact_normal")
+    pos, force, normal = (planes.split(_of_pairs(state[name], index)) for name in names)
+    is_used = _is_any((*force, *normal))
+    whole = planes.split(_of_pairs(state["contact_netforce"], index))
+    return PairContacts(pos, _completed(whole, force, is_used), _told(normal, is_used), is_used)
 
 
 def _is_any(parts: Sequence[Tensor]) -> Bool[Tensor, "env body object slot"]:
@@ -86,4 +117,4 @@ def _completed(whole: Vec, force: Vec, is_used: Bool[Tensor, "env body object sl
 def _of_pairs(field: Tensor, index: Int[Tensor, "body object"]) -> Tensor:
     """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
     padding = field.new_zeros((field.shape[0], 1, *field.shape[2:]))
-    return torch.cat([field, padding], dim=1)[:, index]
+    return torch.cat([field, padding], dim=1).index_select(1, index.flatten()).unflatten(1, index.shape)

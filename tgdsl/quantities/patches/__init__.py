@@ -54,4 +54,5 @@ PATCHES = Quantity(
     bodies=_bodies,
     num_rows=_num_cells,
     explain=_explain,
+    is_fused=True,
 )

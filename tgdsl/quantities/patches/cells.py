@@ -18,7 +18,7 @@ FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 def tables(
     count: Int[np.ndarray, "row 3"], size: Float[np.ndarray, "row 3"], faces: Sequence[str] = FACES
 ) -> dict[str, np.ndarray]:
-    """Return what a step needs: `count`, `outer` areas of exposed faces; `square`, `smooth` and `cosine` by axis.
+    """Return what a step needs: `count`, `number` and `volume` of cells, `outer` areas; `square`, `smooth`, `cosine` by axis.
 
     Args:
         count: Cells of each box along each axis.
@@ -26,6 +26,7 @@ def tables(
         faces: Its exposed faces.
     """
     found = {"count": count.astype(np.float64), "outer": outer_areas(count, size, faces)}
+    found |= {"number": found["count"].prod(axis=1), "volume": (size / count).prod(axis=1)}
     for axis, name in enumerate("xyz"):
         own = count[:, axis]
         k = np.arange(1, int(own.max(initial=1)))[None, :]

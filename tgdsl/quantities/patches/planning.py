@@ -30,6 +30,7 @@ def plan(planning: Planning, uses: Sequence[Use]) -> PatchesPart[np.ndarray]:
 
 def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
     """Return whether the objects of a use have heat that is this use's alone; note what is wrong."""
+    assert isinstance(use.request, ContactPatches)
     is_well = True
     for name in use.request.objects:
         heat, others = planning.sensed[name].heat, [*([held[name]] if name in held else []), *use.sensors]
@@ -43,6 +44,9 @@ def _check(planning: Planning, use: Use, held: dict[str, str]) -> bool:
             which = "cells" if heat.cells else "temperature"
             what = f"it is a link of the sensor, whose own {which} counts; its `material` says how stiff it is to touch"
             planning.report(("objects", name, which), what, f"leave `{which}` out")
+        elif use.request.needs_stiffness and any(own.youngs_modulus is None for own in heat.materials):
+            what = "neither it nor a link that feels it has a `youngs_modulus`, from which the area of a contact follows"
+            planning.report(("objects", name, "material"), what, "give one, or the sensor's `contact_area`")
         elif heat.cells and len(heat.volume) > 1:
             planning.report(("objects", name, "cells"), "an object with variants has one temperature", "leave `cells` out")
         elif is_counted(planning, name, use.request.objects):

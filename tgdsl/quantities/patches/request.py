@@ -90,10 +90,12 @@ class ContactPatches(Request[ContactPatch]):
     Attributes:
         slots: Contacts per body and object that make a patch.
         boxes: Lowest and highest corner of each body's box in its frame, handed on (body, 2, 3) [m].
+        needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
     """
 
     slots: int = 4
     boxes: Float[np.ndarray, "body 2 3"] = field(default_factory=lambda: np.zeros((0, 2, 3)))
+    needs_stiffness: bool = False
 
     @property
     def wants_contacts(self) -> bool:  # type: ignore[override]

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from tgdsl.compiler.pipeline import Document, compile
+from tgdsl.compiler.pipeline import Document, compile_plan
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.module.accuracy.variants import bare
 from tgdsl.module.module import TactileModule
 from tgdsl.report.bench.physics import measure_physics
-from tgdsl.report.bench.recording import Recording, load_recording, record, save_recording
 from tgdsl.report.bench.results import Report, Subject
-from tgdsl.report.bench.sensors import Options, Sensor, measure
+from tgdsl.report.bench.sensors import Options, measure
 from tgdsl.runtime.scripted import script_of
+from tgdsl.sensors.known import known_kinds
+from tgdsl.tuning.choose import choose
+from tgdsl.tuning.recording import Recording, load_recording, record, save_recording
+from tgdsl.tuning.trials import Sensor
 
 PHYSICS = "physics"
 """What the physics is called among the sensors."""
@@ -68,7 +71,9 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
     """
     _check(what.options)
     progress("compiling")
-    touch = compile(what.document, overrides=what.overrides, progress=progress)
+    choice = choose(what.document, what.overrides, progress=progress)
+    touch = TactileModule(compile_plan(what.document, what.overrides, progress=progress, choice=choice), known_kinds())
+    what = replace(what, overrides={**what.overrides, **choice.changes})
     names = tuple(dict.fromkeys(sensor.sensor for sensor in touch.plan.sensors))
     wanted = _wanted(what.sensors, names)
     recording = _recording(what, names, progress)
@@ -76,7 +81,8 @@ def bench(what: Bench, progress: Progress = silent, begun: Callable[[int, int], 
     for name in wanted:
         if begun is not None:
             begun(len(subjects), len(wanted))
-        subjects.append(_subject(what, name, touch, recording, progress))
+        found = _subject(what, name, touch, recording, progress)
+        subjects.append(replace(found, chosen=choice.notes.get(name, ())))
     if begun is not None:
         begun(len(wanted), len(wanted))
     title = str(what.document) if not isinstance(what.document, Mapping) else "<mapping>"
@@ -95,7 +101,7 @@ def _recording(what: Bench, names: Sequence[str], progress: Progress) -> Recordi
     if what.states is not None:
         return load_recording(what.states)
     changes = {key: value for name in names for key, value in bare(name).items()}
-    touch = compile(what.document, overrides={**what.overrides, **changes})
+    touch = TactileModule(compile_plan(what.document, {**what.overrides, **changes}), known_kinds())
     recording = record(
         touch, what.state_envs, steps=what.steps, substeps=what.substeps, seed=what.options.seed, progress=progress
     )

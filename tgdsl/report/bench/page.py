@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 
 import matplotlib
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from tgdsl.module.accuracy.errors import Interval
 from tgdsl.report.bench.results import Measured, Report, Subject
@@ -41,7 +43,8 @@ def page(report: Report) -> str:
             f"<h1>{escape(report.document)}: speed against error</h1>",
             f'<p class="note">{escape(report.states)}.<br>{escape(report.machine)}.</p>',
             "<p>● on the front: nothing else is better in time or error and worse in neither; where 95 % intervals overlap, "
-            "two count as equal. Red: what the compiler takes now. Errors: relative to the largest change of a quantity.</p>",
+            "two count as equal. Red: what the compiler takes now. Errors: relative to the largest change of a quantity; those "
+            f"below {FLOOR:g} are drawn there.</p>",
             f"<nav>{links}</nav>",
             *(_section(subject, i) for i, subject in enumerate(report.subjects)),
             "</body></html>",
@@ -54,6 +57,7 @@ def _section(subject: Subject, index: int) -> str:
     lines = [
         f'<section id="{escape(subject.name)}"><h2>{escape(subject.name)} <small>{escape(subject.kind)}</small></h2>',
         f"<p>Errors are against: {escape(subject.reference)}. Magnitudes: {escape(scales)}. {escape(subject.check)}</p>",
+        *([f'<p class="chosen">{"<br>".join(map(escape, subject.chosen))}</p>'] if subject.chosen else []),
         plot(subject, f"tgdsl{index}"),
         _table(subject),
     ]
@@ -112,16 +116,29 @@ def plot(subject: Subject, salt: str) -> str:
     """
     figure = Figure(figsize=(9.5, 4.2))
     axes = figure.add_subplot()
-    for i, point in enumerate(subject.points):
-        _draw(axes, point, i)
     axes.set_xscale("log")
     axes.set_yscale("log")
+    for point in subject.points:
+        _draw(axes, point)
+    for formatted in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        formatted(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlabel(f"time of a call, {max(subject.points[0].times)} environments [ms]")
     axes.set_ylabel("RMS error, of the magnitude")
     axes.grid(True, which="major", color="#e3e5e8", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.margins(0.12)
     figure.tight_layout()
+    _label(axes, subject.points)
+    return svg_of(figure, salt)
+
+
+def svg_of(figure: Figure, salt: str) -> str:
+    """Return a figure as SVG, to stand in HTML; the same bytes each time.
+
+    Args:
+        figure: What is drawn.
+        salt: What makes the identifiers in it differ from those of other plots.
+    """
     text = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "none"}):
         FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -130,7 +147,7 @@ def plot(subject: Subject, salt: str) -> str:
     return re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", drawn[drawn.index("<svg") :]).replace("xlink:href", "href")
 
 
-def _draw(axes: Axes, point: Measured, index: int) -> None:
+def _draw(axes: Axes, point: Measured) -> None:
     times, errors = ([factor * part for part in own] for factor, own in ((1e3, point.time), (1.0, point.chosen.rms)))
     x, (y, low, high) = times, (max(part, FLOOR) for part in errors)
     color = OWN if point.is_own else FRONT if point.is_on_front else FAINT
@@ -145,6 +162,22 @@ def _draw(axes: Axes, point: Measured, index: int) -> None:
         markersize=7 if is_marked else 5,
         elinewidth=0.9,
     )
-    label = f"{point.label}, {point.precision}" + (" (now)" if point.is_own else "")
-    offset = (6, 5 if index % 2 else -11)
-    axes.annotate(label, (x[0], y), textcoords="offset points", xytext=offset, fontsize=7.5, color=INK)
+
+
+def _label(axes: Axes, points: Sequence[Measured]) -> None:
+    """Write beside each point what it is, where no other label stands: to its right or left, and further up or down."""
+    figure = axes.get_figure()
+    assert isinstance(figure, Figure)
+    renderer, taken = FigureCanvasAgg(figure).get_renderer(), []
+    sides = [(x, step) for step in (5, -11, 16, -22, 27, -33, 38, -44, 49) for x in (6, -6)]
+    for point in sorted(points, key=lambda own: not own.is_own):
+        label = f"{point.label}, {point.precision}" + (" (now)" if point.is_own else "")
+        at = (1e3 * point.time.value, max(point.chosen.rms.value, FLOOR))
+        text = axes.annotate(label, at, textcoords="offset points", xytext=sides[0], fontsize=7.5, color=INK)
+        for x, y in sides:
+            text.set_position((x, y))
+            text.set_horizontalalignment("left" if x > 0 else "right")
+            box = text.get_window_extent(renderer)
+            if axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1) and not any(box.overlaps(own) for own in taken):
+                break
+        taken.append(text.get_window_extent(renderer))

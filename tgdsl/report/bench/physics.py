@@ -15,16 +15,17 @@ from jaxtyping import Float
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import SimulationError
-from tgdsl.module.accuracy.errors import errors_of, magnitude_of
+from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
 from tgdsl.report.bench.front import front_of
-from tgdsl.report.bench.recording import varied
-from tgdsl.report.bench.results import Cost, Measured, Subject
+from tgdsl.report.bench.results import Measured, Subject
 from tgdsl.report.bench.timing import median_of
 from tgdsl.runtime.scripted import Script
 from tgdsl.scene.scene import scene_model
 from tgdsl.sensors.known import known_kinds
+from tgdsl.tuning.recording import varied
+from tgdsl.tuning.trials import Cost
 
 FINE = 4
 """How many times smaller the time step of the fine run is."""
@@ -134,8 +135,8 @@ def _subject(
         if k in faults:
             continue
         chosen, verified = (
-            errors_of(paths[k][:, i::2], exact[:, i::2], magnitude._replace(active=magnitude.active[:, i::2]), seed=seed)
-            for i in (0, 1)
+            errors_of(paths[k][:, half], exact[:, half], magnitude.of(half, range(len(quantities))), seed=seed)
+            for half in halves(num_envs)
         )
         time_of_step = {num_envs: median_of(np.array(times[k]))}
         points.append(Measured(setting.label, "float64", setting.is_own, chosen, verified, time_of_step, cost))

@@ -7,23 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tgdsl.module.accuracy.errors import Errors, Interval
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What a variant takes, counted.
-
-    Attributes:
-        operations: Elementary operations of one environment's call; None: not counted.
-        constants: Of all environments together [bytes].
-        state: What each environment carries from call to call [bytes].
-        output: What each environment's call returns [bytes].
-    """
-
-    operations: int | None
-    constants: int
-    state: int
-    output: int
+from tgdsl.tuning.trials import Cost
 
 
 @dataclass(frozen=True)
@@ -68,6 +52,7 @@ class Subject:
         magnitudes: What each quantity's errors are relative to, with its unit.
         points: The variants.
         left_out: Variants that cannot be had, and why.
+        chosen: What `accuracy` chose and why, line by line; empty: there is none.
     """
 
     name: str
@@ -77,6 +62,7 @@ class Subject:
     magnitudes: Mapping[str, str]
     points: tuple[Measured, ...]
     left_out: tuple[tuple[str, str], ...]
+    chosen: tuple[str, ...] = ()
 
     @property
     def own(self) -> Measured:

@@ -6,8 +6,7 @@ Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` num
 from __future__ import annotations
 
 import dataclasses
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -16,25 +15,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.compiler.pipeline import Document, compile_plan
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
-from tgdsl.module.accuracy.errors import Magnitude, errors_of, magnitude_of
+from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.accuracy.reference import ReferenceModule
 from tgdsl.module.accuracy.states import readings_of, rows_at, taken
-from tgdsl.module.accuracy.variants import Variant, Variants, bare, queried_objects, variants_of
+from tgdsl.module.accuracy.variants import Variant, queried_objects
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.plan import Plan
 from tgdsl.report.bench.front import front_of
-from tgdsl.report.bench.recording import Recording
-from tgdsl.report.bench.results import Cost, Measured, Subject
+from tgdsl.report.bench.results import Measured, Subject
 from tgdsl.report.bench.timing import times_of
-from tgdsl.schema.load import load
-from tgdsl.schema.objects import query_alternatives
-from tgdsl.sensors.base import Kind, SensorSpec
 from tgdsl.sensors.known import known_kinds
 from tgdsl.sensors.noise.lower import quantity
+from tgdsl.tuning.recording import Recording
+from tgdsl.tuning.trials import Exact, Sensor, cost_of, exact_of, finest_of
 
 CHECKED_STEPS, CHECKED_ENVS = 6, 2
 """States on which the finest variant is compared with the kind's float64 definition: the last of the recording."""
@@ -72,54 +68,11 @@ class Way(NamedTuple):
         return f"{self.variant.label}, {self.precision}"
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """A sensor of a document, without imperfections, and how its variants are compiled."""
-
-    document: Document
-    overrides: Mapping[str, Any]
-    name: str
-    kind: Kind
-    spec: SensorSpec
-    own: Plan
-    variants: Variants
-
-    @staticmethod
-    def of(document: Document, overrides: Mapping[str, Any], name: str) -> Sensor:
-        """Return a sensor of a document.
-
-        Raises:
-            SpecError: What is wrong with the document.
-        """
-        changed = {**overrides, **bare(name)}
-        loaded = load(document, changed, known_kinds())
-        kind = next(kind for kind in known_kinds() if kind.name == loaded.spec.sensors[name].kind)  # type: ignore[attr-defined]
-        spec = loaded.spec.sensors[name]
-        own = _plan(document, changed, name)
-        queried = {target: loaded.spec.objects[target] for target in queried_objects(own)}
-        variants = variants_of(kind, name, spec, queried, query_alternatives())
-        return Sensor(document, changed, name, kind, spec, own, variants)
-
-    def plan(self, variant: Variant) -> Plan:
-        """Return the Plan of a variant.
-
-        Raises:
-            TgdslError: If it cannot be had.
-        """
-        return _plan(self.document, {**self.overrides, **variant.changes}, self.name) if variant.changes else self.own
-
-
-def _plan(document: Document, overrides: Mapping[str, Any], name: str) -> Plan:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what the document's own compilation has warned of already
-        return compile_plan(document, overrides, sensors=[name])
-
-
 def measure(sensor: Sensor, recording: Recording, options: Options, progress: Progress = silent) -> Subject:
     """Return a sensor in all its variants.
 
     Errors are those of all readings of the recorded states against the finest variant in float64. The front is drawn from the
-    environments of even number; those of odd number verify it.
+    first half of the environments; the others verify it.
 
     Args:
         sensor: The sensor.
@@ -131,18 +84,12 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
         StateError: If the states are of another document.
     """
     plans, left_out = _plans(sensor, progress)
-    finest = _finest(sensor, plans)
     states = recording.for_module(sensor.own.inputs)
-    own = TactileModule(sensor.own, known_kinds(), torch.float64)
-    progress(f"{sensor.name}: {finest.label}, float64")
-    fine = TactileModule(sensor.plan(finest), known_kinds(), torch.float64)
-    exact = taken(readings_of(fine, recording.for_module(fine.inputs), sensor.name), rows_at(own, fine, sensor.name))
-    channels = own.outputs[0].channels
-    magnitude = magnitude_of(exact, [quantity(channel) for channel in channels])
+    exact = exact_of(sensor, finest_of(sensor, left_out), recording, progress)
     ways = [Way(variant, plan, "float32") for variant, plan in plans.items()]
     more = ["float64", "bfloat16 readings", *(["tf32"] if options.device.type == "cuda" else [])]
     ways += [Way(sensor.variants.own, sensor.own, precision) for precision in more]
-    measured = [_errors(sensor, way, own, recording, exact, magnitude, options, progress) for way in ways]
+    measured = [_errors(sensor, way, recording, exact, options, progress) for way in ways]
     times = {num: _times(ways, recording, num, sensor.name, options, progress) for num in options.num_envs}
     points = [
         dataclasses.replace(point, times={num: times[num][way.name] for num in times})
@@ -152,17 +99,17 @@ def measure(sensor: Sensor, recording: Recording, options: Options, progress: Pr
     return Subject(
         name=sensor.name,
         kind=sensor.kind.name,
-        reference=f"{finest.label}, float64",
+        reference=f"{exact.variant.label}, float64",
         check=_check(sensor, states),
-        magnitudes=_magnitudes(own, magnitude),
+        magnitudes=_magnitudes(exact),
         points=tuple(dataclasses.replace(p, is_on_front=f) for p, f in zip(points, is_on_front, strict=True)),
-        left_out=tuple(left_out),
+        left_out=tuple(left_out.items()),
     )
 
 
-def _plans(sensor: Sensor, progress: Progress) -> tuple[dict[Variant, Plan], list[tuple[str, str]]]:
+def _plans(sensor: Sensor, progress: Progress) -> tuple[dict[Variant, Plan], dict[str, str]]:
     """Return the Plans of the variants that can be had, and why the others cannot."""
-    plans, left_out = {sensor.variants.own: sensor.own}, []
+    plans, left_out = {sensor.variants.own: sensor.own}, {}
     for variant in (*sensor.variants.fields, *sensor.variants.queries):
         if variant.is_own:
             continue
@@ -170,20 +117,8 @@ def _plans(sensor: Sensor, progress: Progress) -> tuple[dict[Variant, Plan], lis
         try:
             plans[variant] = sensor.plan(variant)
         except TgdslError as error:
-            left_out.append((variant.label, str(error)))
+            left_out[variant.label] = str(error)
     return plans, left_out
-
-
-def _finest(sensor: Sensor, plans: Mapping[Variant, Plan]) -> Variant:
-    """Return the finest variant: of its fields and of its queries the last that can be had."""
-    last = [
-        next((variant for variant in reversed(axis) if variant.is_own or variant in plans), None)
-        for axis in (sensor.variants.fields, sensor.variants.queries)
-    ]
-    found = [variant for variant in last if variant is not None]
-    if not found:
-        return sensor.variants.own
-    return found[0] if len(found) == 1 else found[0].joined(found[1])
 
 
 def _built(way: Way, device: torch.device) -> TactileModule:
@@ -201,16 +136,7 @@ def _precision(way: Way) -> Iterator[None]:
         torch.backends.cuda.matmul.allow_tf32 = before
 
 
-def _errors(
-    sensor: Sensor,
-    way: Way,
-    own: TactileModule,
-    recording: Recording,
-    exact: np.ndarray,
-    magnitude: Magnitude,
-    options: Options,
-    progress: Progress,
-) -> Measured:
+def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, options: Options, progress: Progress) -> Measured:
     """Return a variant with its errors and its counted cost, but no times."""
     progress(f"{sensor.name}: {way.name}, errors")
     touch = _built(way, options.device)
@@ -218,29 +144,15 @@ def _errors(
         found = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
     if way.precision == "bfloat16 readings":
         found = torch.from_numpy(found).to(torch.bfloat16).double().numpy()
-    found = taken(found, rows_at(own, touch, sensor.name))
+    found = taken(found, rows_at(exact.module, touch, sensor.name))
+    channels = range(found.shape[-1])
     chosen, verified = (
-        errors_of(found[:, i::2], exact[:, i::2], magnitude._replace(active=magnitude.active[:, i::2]), seed=options.seed)
-        for i in (0, 1)
+        errors_of(found[:, half], exact.readings[:, half], exact.magnitude.of(half, channels), seed=options.seed)
+        for half in halves(recording.num_envs)
     )
     size = 2 if way.precision == "bfloat16 readings" else torch.finfo(touch.dtype).bits // 8
     is_own = way.variant.is_own and way.precision == "float32"
-    return Measured(way.variant.label, way.precision, is_own, chosen, verified, {}, _cost(touch, size))
-
-
-def _cost(touch: TactileModule, size: int) -> Cost:
-    """Return what a module takes, counted; its state is that of a single call."""
-    state = touch.example_state(2)
-    with torch.no_grad():
-        touch(state)
-    kept = sum(buffer.numel() * buffer.element_size() for buffer in touch.memory.buffers()) // 2
-    touch.free()
-    return Cost(
-        operations=touch.operations_per_env(),
-        constants=sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers()),
-        state=kept,
-        output=size * sum(int(np.prod(output.shape)) for output in touch.outputs),
-    )
+    return Measured(way.variant.label, way.precision, is_own, chosen, verified, {}, cost_of(touch, size))
 
 
 def _times(
@@ -284,13 +196,13 @@ def _check(sensor: Sensor, states: Sequence[SceneState]) -> str:
         return "the kind's definition knows primitives alone, and meshes are felt"
     few = [first_envs(state, CHECKED_ENVS) for state in states[-CHECKED_STEPS:]]
     touch = TactileModule(sensor.own, known_kinds(), torch.float64)
-    reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec), []
+    reference, expected = ReferenceModule(sensor.own, sensor.kind, sensor.spec, sensor.others, sensor.name), []
     for state in few:
         reading, memory = reference(state, np.zeros(3))
         reference.remember(memory)
         expected.append(reading.reshape(reading.shape[0], -1, reading.shape[-1]))
     exact = np.stack(expected)
-    magnitude = magnitude_of(exact, [quantity(channel) for channel in touch.outputs[0].channels])
+    magnitude = magnitude_of(exact, [quantity(channel) for channel in sensor.reading.channels])
     largest = errors_of(readings_of(touch, few, sensor.name), exact, magnitude).largest.value
     return f"as written, float64 differs from the kind's NumPy definition by {largest:.1e} at most ({len(few)} steps)"
 
@@ -301,8 +213,7 @@ def first_envs(state: SceneState, count: int) -> SceneState:
     return SceneState(**values, dt=state.dt, substeps=tuple(first_envs(part, count) for part in state.substeps))
 
 
-def _magnitudes(touch: TactileModule, magnitude: Magnitude) -> dict[str, str]:
+def _magnitudes(exact: Exact) -> dict[str, str]:
     """Return the magnitude of each quantity, with its unit."""
-    output = touch.outputs[0]
-    named = zip(output.channels, output.units, magnitude.scale, strict=True)
-    return {quantity(channel): f"{scale:.4g} {unit}" for channel, unit, scale in named}
+    named = zip(exact.quantities, exact.units, exact.magnitude.scale, strict=True)
+    return {name: f"{scale:.4g} {unit}" for name, unit, scale in named}

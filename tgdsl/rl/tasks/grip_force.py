@@ -165,6 +165,7 @@ class GripForce(Task[GripForceSpec]):
     Spec = GripForceSpec
     wants_normal_force = True
     score_unit = "RMS of force error over command"
+    is_less_better = True
 
     def __init__(self, spec: GripForceSpec, setup: Setup):
         """Look up the keyframes.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import mujoco
 import mujoco.batch
 import numpy as np
+from jaxtyping import Int
 
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.batch.contact_sensors import ContactSensors
@@ -45,8 +46,8 @@ class BatchReader:
         for name in STATE_ARRAYS:
             batch.bind(name)  # an array is filled only by calls that come after its first use
 
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the fields, (env, …), each an array of its own."""
-        live = {name: getattr(self._batch, name) for name in STATE_ARRAYS}
+    def read(self, rows: Int[np.ndarray, " n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return the fields of some environments (default: all), (env, …), each an array of its own."""
+        live = {name: getattr(self._batch, name)[rows] for name in STATE_ARRAYS}
         arrays = self._bodies.read(live) | self._contacts.read(live["sensordata"])
         return {name: np.ascontiguousarray(array) for name, array in arrays.items()}

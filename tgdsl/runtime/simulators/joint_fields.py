@@ -75,15 +75,15 @@ class KeptJoints:
     def keep(self, env_ids: Int[np.ndarray, " n"] | slice = slice(None)) -> None:
         """Take note of where some environments' joints are, and of their controls: a physics step follows, or poses are new."""
         for name, kept in self._kept.items():
-            kept[env_ids] = self._now(name)[env_ids]
+            kept[env_ids] = self._now(name, env_ids)
 
-    def read(self) -> dict[str, np.ndarray]:
-        """Return the fields of a state, (env, joint) or (env, actuator)."""
-        return {name: self._kept[name].copy() if name in self._kept else self._now(name) for name in self._columns.fields}
+    def read(self, rows: Int[np.ndarray, " n"] | slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return the fields of some environments' state (default: all), (env, joint) or (env, actuator)."""
+        return {n: self._kept[n][rows].copy() if n in self._kept else self._now(n, rows) for n in self._columns.fields}
 
-    def _now(self, name: str) -> np.ndarray:
+    def _now(self, name: str, rows: Int[np.ndarray, " n"] | slice = slice(None)) -> np.ndarray:
         array = self._columns.fields[name]
-        return np.array(getattr(self._batch, array)[:, self._columns.by_array[array]], dtype=np.float64)
+        return np.array(getattr(self._batch, array)[rows][:, self._columns.by_array[array]], dtype=np.float64)
 
 
 def _joint_id(model: mujoco.MjModel, name: str) -> int:

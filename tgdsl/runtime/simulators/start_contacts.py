@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean
@@ -72,22 +72,26 @@ class StartContacts:
             self._values[name] = torch.where(broadcast_over(chosen, like), new, old.to(new.dtype))
         self._is_placed = chosen.clone() if self._is_placed is None else self._is_placed | chosen
 
-    def applied_to(self, state: SceneState, is_stored: bool = True) -> SceneState:
+    def applied_to(
+        self, state: SceneState, is_stored: bool = True, rows: Int[Tensor, " n"] | slice = slice(None)
+    ) -> SceneState:
         """Return a state in which placed environments have the contacts of their start.
 
         Args:
             state: What the simulator has.
             is_stored: Whether those that were stored are of this state's pairs and joints; if not, all are zero.
+            rows: The environments that the state is of; default: all.
         """
         if self._is_placed is None:
             return state
+        is_placed = self._is_placed[rows]
         values: dict[str, Any] = {}
         for name in FIELDS:
             now = getattr(state, name)
             if now is not None:
                 start = self._values.get(name) if is_stored else None
-                value = torch.zeros_like(now) if start is None else start.to(now.device, now.dtype)
-                values[name] = torch.where(broadcast_over(self._is_placed.to(now.device), now), value, now)
+                value = torch.zeros_like(now) if start is None else start[rows].to(now.device, now.dtype)
+                values[name] = torch.where(broadcast_over(is_placed.to(now.device), now), value, now)
         return dataclasses.replace(state, **values)
 
     def _given(self, contacts: Contacts, chosen: Bool[Tensor, " env"]) -> dict[str, Tensor]:

@@ -156,6 +156,8 @@ class StateTable:
         return unit, torch.stack([is_unfinite, (norm < _MIN_NORM).any(dim=1)])
 
     def _refuse(self, name: str, bad: Bool[Tensor, "2 env"], env_ids: EnvIds | None) -> None:
+        if not bad.any():
+            return
         chosen = torch.zeros(self._num_envs, dtype=torch.bool)
         chosen[torch.from_numpy(env_indices(env_ids, self._num_envs))] = True
         for what, where in zip(("is not finite", "holds a quaternion of length 0"), bad.cpu() & chosen, strict=True):

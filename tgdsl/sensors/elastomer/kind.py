@@ -149,7 +149,7 @@ def _elastic(depth: Tensor, shear: Vec | None, normal: Vec, constants: Constants
 def alternatives(spec: ElastomerSpec) -> list[Alternative]:
     """Return the forms of the operator; with anchors of points, fewer points or more."""
     forms = [Alternative(f"svd, {100 * error:g} %", {"operator": "svd", "tolerance": error}) for error in (0.1, 1e-2, 1e-3)]
-    forms += [Alternative(form, {"operator": form, "tolerance": None}) for form in ("fft", "dense")]
+    forms += [Alternative(form, {"operator": form, "tolerance": None}, is_exact=True) for form in ("fft", "dense")]
     if spec.anchored != "points":
         return forms
     exact = {"operator": "dense", "tolerance": None}

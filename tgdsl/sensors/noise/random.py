@@ -27,14 +27,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Int, UInt
+from jaxtyping import Float, Int, UInt
 from torch import Tensor
 
 from tgdsl.geometry.planes import pi
 from tgdsl.tensors.fusion import materialised
 
-READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER = range(6)
-"""What numbers are for: the first three are drawn at each step, the others at each reset."""
+READING, RADIUS, JITTER, GAIN, DEAD, PARAMETER, KIND = range(7)
+"""What numbers are for: the first three are drawn at each step, the next three at each reset; the last are those that a kind
+draws itself, at each of its calls."""
 
 PER_STEP = (READING, RADIUS, JITTER)
 UNIFORM_BITS, RADIUS_BITS, ANGLE_BITS = 23, 20, 10
@@ -42,7 +43,7 @@ UNIFORM_BITS, RADIUS_BITS, ANGLE_BITS = 23, 20, 10
 FACTORS = (0x21F0AAAD, 0x735A2D97)
 SHIFTS = (16, 15, 15)
 FIRST_PURPOSE, PURPOSE_STEP = 0x010DCD65, 0x0B873593
-PURPOSES = tuple(FIRST_PURPOSE + PURPOSE_STEP * i for i in range(12))
+PURPOSES = tuple((FIRST_PURPOSE + PURPOSE_STEP * i) % 2**31 for i in range(14))
 """A constant for each purpose and half of a key: below 2³¹, as a compiler may form them by 32-bit index arithmetic."""
 
 
@@ -78,11 +79,25 @@ def streams(
     counter = torch.stack([step, episode], dim=1)[:, None, :, None]
     low, high = counter.to(torch.int32), mix((counter >> 32).to(torch.int32))
     begun = mix(mix(env.to(torch.int32)[:, None, None] ^ keys)[:, :, None] ^ low)  # (env, sensor, counter, half)
-    purposes = torch.arange(len(PURPOSES), device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
+    purposes = torch.arange(2 * KIND, device=env.device) * PURPOSE_STEP + FIRST_PURPOSE
     purposes = purposes.to(torch.int32).view(2, len(PER_STEP), 2)  # (counter, purpose, half)
     found = materialised(mix((begun ^ high)[:, :, :, None] ^ purposes))  # once per environment, not once per taxel
     halves = [own.unbind(-1) for own in found.flatten(2, 3).unbind(1)]
     return [{p: Stream(a[:, p, None], b[:, p, None]) for p in range(a.shape[1])} for a, b in halves]
+
+
+def kind_stream(key: Int[Tensor, " half"], env: Int[Tensor, " env"], count: Int[Tensor, " env"]) -> Stream:
+    """Return the stream that a sensor's kind draws from at one of its calls.
+
+    Args:
+        key: The sensor's key, int32.
+        env: Numbers of the environments, int64, counted over all processes.
+        count: Number of the call of each environment, int64; of a block that of the physics step.
+    """
+    low, high = count[:, None].to(torch.int32), mix((count[:, None] >> 32).to(torch.int32))
+    begun = mix(mix(env.to(torch.int32)[:, None] ^ key) ^ low) ^ high
+    first, second = PURPOSES[2 * KIND :]
+    return Stream(materialised(mix(begun[:, :1] ^ first)), materialised(mix(begun[:, 1:] ^ second)))
 
 
 def words(stream: Stream, index: Int[Tensor, "*row"]) -> Int[Tensor, "*both"]:
@@ -98,6 +113,14 @@ def uniform(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> Tensor:
 def _share(word: Int[Tensor, "*row taxel"], num_bits: int, dtype: torch.dtype) -> Tensor:
     """Return the middle of one of 2ⁿ equal parts of 0 to 1, by a word's first n bits."""
     return ((word >> (32 - num_bits)) & (2**num_bits - 1)).to(dtype) * 2.0**-num_bits + 2.0 ** -(num_bits + 1)
+
+
+def uniform_on_host(word: UInt[np.ndarray, "*row"]) -> Float[np.ndarray, "*row"]:
+    """Return `uniform` of words, uint32, in NumPy: float32."""
+    share = (word >> np.uint32(32 - UNIFORM_BITS)).astype(np.float32)
+    share *= np.float32(2.0**-UNIFORM_BITS)
+    share += np.float32(2.0 ** -(UNIFORM_BITS + 1))
+    return share
 
 
 def normal_pair(word: Int[Tensor, "*row taxel"], dtype: torch.dtype) -> tuple[Tensor, Tensor]:

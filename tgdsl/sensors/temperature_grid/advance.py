@@ -71,7 +71,7 @@ def advanced(patches: ContactPatch, context: Context, constants: Constants, stat
     num = where.num_bodies
     total = cells.sum(dim=(-3, -2, -1)) + cells_low.sum(dim=(-3, -2, -1))
     of_links = tuple(part[:, :num] for part in got)
-    mean = total / constants["is_cell"].sum(dim=(-3, -2, -1))
+    mean = total / constants["number"]
     of_objects = held.account(objects + objects_low, patches, rows.capacity, got, nodes_got, mean)
     return Heat(cells, cells_low, objects, objects_low, total * rows.capacity[:, :num], of_links, of_objects)
 

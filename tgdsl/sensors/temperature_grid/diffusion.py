@@ -74,7 +74,7 @@ def grouped(axes: list[Axis], device: str) -> list[Axis]:
     groups: list[Axis] = []
     for axis in reversed(axes):
         size = axis.gains.shape[-1]
-        is_small = bool(groups) and size * groups[-1].gains.shape[-1] <= MOST_DENSE.get(device, MOST_DENSE["cuda"])
+        is_small = len(groups) > 0 and size * groups[-1].gains.shape[-1] <= MOST_DENSE.get(device, MOST_DENSE["cuda"])
         if is_small and len(axis.gains) == 1:
             groups[-1] = together(axis, groups[-1])
         else:

@@ -42,6 +42,7 @@ import torch
 from torch import Tensor
 
 from tgdsl.errors import LowerError
+from tgdsl.fields.materials import Material
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.patches import ContactPatches
@@ -70,6 +71,7 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
                 f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
             )
     constants = tables(count, size, spec.exposed) | {
+        "box": np.concatenate([boxes[:, 0], size / count, count], axis=1),
         "conductivity": np.array([own.conductivity for own in made_of]),
         "volumetric_heat": np.array([own.density * own.specific_heat for own in made_of]),
         "ambient": scalar(spec.ambient),
@@ -84,6 +86,8 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         constants["convection"] = scalar(spec.convection)
     if spec.source is not None:
         constants |= _source(spec, count, size)
+    if "source" in constants:
+        constants["power"] = constants["source"].sum(axis=(1, 2, 3))
     shape = there.shape
     state = {"cells": Memory(shape=shape), "cells_low": Memory(shape=shape)}
     if spec.feels:
@@ -108,14 +112,19 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         channels=(Channel("temperature", "degC"),),
         constants=constants,
         state=state,
-        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes),),
+        requests=(ContactPatches(spec.feels, slots=spec.slots, boxes=boxes, needs_stiffness=_needs_stiffness(spec, made_of)),),
         rows=rows,
         reports=reports,
         report_rows=report_rows,
     )
 
 
-def _contact(spec: TemperatureGridSpec, made_of: list, size: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:
+    """Return whether the area of a contact follows from the object's stiffness alone, as some link has none."""
+    return spec.contact_area == "manifold" and any(own.youngs_modulus is None for own in made_of)
+
+
+def _contact(spec: TemperatureGridSpec, made_of: list[Material], size: np.ndarray) -> dict[str, np.ndarray]:
     """Return what areas and conductances of patches follow from."""
     if not spec.feels:
         return {}

@@ -75,7 +75,7 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
     return Rows(
         conductivity=k,
         diffusivity=k / heat,
-        capacity=heat * (step[0] * step[1] * step[2]),
+        capacity=heat * tables["volume"],
         emissivity=emissivity,
         outer=tables["outer"],
         boxes=boxes,

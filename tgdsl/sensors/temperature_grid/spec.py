@@ -75,7 +75,7 @@ class TemperatureGridSpec(LinkSpec):
     """Faces that radiate and that air cools."""
     contact_area: Literal["manifold"] | Area = "manifold"
     """Area of a patch: `manifold`, the polygon of the contact points, or by Hertz from the force, whichever is larger; or this,
-    whenever they touch [m²]."""
+    whenever they touch [m²]. A side whose material has no Young's modulus, as skin, counts as rigid."""
     contact_conductance: HeatTransfer | None = None
     """Conductance of the interface itself, of roughness or a film [W/(m²·K)]; default: it is no resistance."""
     curvature_radius: Annotated[PositiveLength | None, Usual("length", low=1e-4, high=1.0)] = None

@@ -137,7 +137,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
         [part.expand(len(cells), -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
-        [constants["conductivity"], constants["volumetric_heat"], patches.boxes, constants["count"], rows.outer],
+        [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), rows.outer],
         constants.get("emissivity"),
         source,
         [*rows.cosines, *rows.exponent],
@@ -147,7 +147,7 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     )
     made = torch.zeros_like(got[:, 0])
     if source is not None:
-        made = made + dt * source.sum(dim=(-3, -2, -1))
+        made = made + dt * constants["power"]
     return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
 
 

@@ -27,10 +27,12 @@ from tgdsl.sensors.temperature_grid.shares import least_width
 SIGMA, ZERO = tl.constexpr(stefan_boltzmann()), tl.constexpr(zero_celsius())
 LEAST = tl.constexpr(least_width())
 PI = tl.constexpr(3.141592653589793)
+UNROLLED = tl.constexpr(8)
+"""Modes up to which they are written out one by one."""
 FEWEST = 256
 """Numbers of a program's block at least: more environments are taken together."""
-OF_WARP = 256
-"""Numbers of a block for each warp."""
+OF_WARP = 512
+"""Numbers of a block for each warp: between warps, sums go through shared memory."""
 
 
 @triton_op("tgdsl::heat_step", mutates_args={})
@@ -50,7 +52,8 @@ def heat_step(
     Args:
         state: Temperatures of the cells (env, row, x, y, z) and of the nodes (env, node), above ambient [K].
         patches: Area, resistance in series, centre and normal: eight planes (env, row, side).
-        rows: Conductivity and heat capacity by volume (row,), boxes (row, 2, 3), cells (row, 3), exposed areas (row, x, y, z).
+        rows: Conductivity, heat capacity by volume, and volume of a cell (row,); lowest corner, sides of a cell and number of
+            cells (row, 9); exposed areas (row, x, y, z).
         emissivity: Of the rows; None if nothing radiates.
         source: What is made in each cell (row, x, y, z) [W].
         modes: Cosines (row, mode, cell) of three axes, then what αΔt/Δ² is multiplied with (row, mode).
@@ -105,7 +108,7 @@ def block_of(num_rows: int, num_sides: int, num_cells: int) -> tuple[int, int, i
 @triton.jit
 def step_kernel(
     cells, nodes, area, series, pos_x, pos_y, pos_z, normal_x, normal_y, normal_z,
-    conductivity, heat, boxes, count, outer, emissivity, source,
+    conductivity, heat, cell_volume, boxes, outer, emissivity, source,
     cosine_x, cosine_y, cosine_z, exponent_x, exponent_y, exponent_z,
     node_heat, node_volume, node_area, node_emissivity,
     heat_env, heat_node, volume_env, volume_node, area_env, area_node, emissivity_env, emissivity_node,
@@ -121,13 +124,10 @@ def step_kernel(
     place = (cell // (NY * NZ), (cell // NZ) % NY, cell % NZ)
     step = tl.load(dt)
     # Rows.
-    box_x, box_y, box_z = (
-        _box(boxes, count, row, is_row, 0),
-        _box(boxes, count, row, is_row, 1),
-        _box(boxes, count, row, is_row, 2),
-    )
+    box_x, box_y, box_z = _box(boxes, row, is_row, 0), _box(boxes, row, is_row, 1), _box(boxes, row, is_row, 2)
     k, by_volume = tl.load(conductivity + row, is_row, 1.0), tl.load(heat + row, is_row, 1.0)
-    capacity = by_volume * (box_x[1] * box_y[1] * box_z[1])
+    volume = tl.load(cell_volume + row, is_row, 1.0)
+    capacity = by_volume * volume
     at = row[None, :] * (NX * NY * NZ) + cell[:, None]
     is_at = is_row[None, :] & is_cell[:, None]
     there = is_at & _is_there(box_x, place[0]) & _is_there(box_y, place[1]) & _is_there(box_z, place[2])
@@ -140,7 +140,7 @@ def step_kernel(
     size = tl.load(area + at_side, is_at_side, 0.0)
     pos = (_at(pos_x, at_side, is_at_side), _at(pos_y, at_side, is_at_side), _at(pos_z, at_side, is_at_side))
     normal = (_at(normal_x, at_side, is_at_side), _at(normal_y, at_side, is_at_side), _at(normal_z, at_side, is_at_side))
-    found = _conductances(size, pos, normal, k, box_x, box_y, box_z, place, there)
+    found = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
     whole = tl.sum(found, axis=0)
     # What is no number stays none: minima and maxima lose it.
     rest = 0.0 * (size + pos[0] + pos[1] + pos[2] + normal[0] + normal[1] + normal[2])
@@ -180,15 +180,14 @@ def step_kernel(
     weight = tl.where(is_row[None, :], weight, 0.0)
     apart -= tl.sum(apart * weight[:, None, :], axis=0)[None, :, :]
     spread = tl.zeros((CELLS, ENVS, ROWS), tl.float32)
-    for mode in range(1, NX * NY * NZ):
-        mode_x, mode_y, mode_z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
-        wave = _wave(cosine_x, row, mode_x, place[0], NX, is_at)
-        wave *= _wave(cosine_y, row, mode_y, place[1], NY, is_at) * _wave(cosine_z, row, mode_z, place[2], NZ, is_at)
-        power = rate / (box_x[1] * box_x[1]) * _power(exponent_x, row, mode_x, NX, is_row)
-        power += rate / (box_y[1] * box_y[1]) * _power(exponent_y, row, mode_y, NY, is_row)
-        power += rate / (box_z[1] * box_z[1]) * _power(exponent_z, row, mode_z, NZ, is_row)
-        along = tl.sum(apart * wave[:, None, :], axis=0) * _expm1(-power)[None, :]
-        spread += along[None, :, :] * wave[:, None, :]
+    rates = (rate / (box_x[1] * box_x[1]), rate / (box_y[1] * box_y[1]), rate / (box_z[1] * box_z[1]))
+    waves, powers = (cosine_x, cosine_y, cosine_z), (exponent_x, exponent_y, exponent_z)
+    if NX * NY * NZ <= UNROLLED:
+        for mode in tl.static_range(1, NX * NY * NZ):
+            spread = _with_mode(spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ)
+    else:
+        for mode in range(1, NX * NY * NZ):
+            spread = _with_mode(spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ)
     spread -= tl.sum(spread * weight[:, None, :], axis=0)[None, :, :] * there.to(tl.float32)[:, None, :]
     tl.store(gained + at_cell, gain + spread + made[:, None, :], is_at_cell)
     tl.store(nodes_gained + at_node, own_touched + own_lost, is_node)
@@ -212,17 +211,31 @@ def _at(plane, at, is_there):
 
 
 @triton.jit
-def _box(boxes, count, row, is_row, AXIS: tl.constexpr):
+def _box(boxes, row, is_row, AXIS: tl.constexpr):
     """Return the lowest corner, the cells' side and their number along an axis (R)."""
-    low = tl.load(boxes + 6 * row + AXIS, is_row, 0.0)
-    number = tl.load(count + 3 * row + AXIS, is_row, 1.0)
-    return low, (tl.load(boxes + 6 * row + 3 + AXIS, is_row, 1.0) - low) / number, number
+    at = boxes + 9 * row + AXIS
+    return tl.load(at, is_row, 0.0), tl.load(at + 3, is_row, 1.0), tl.load(at + 6, is_row, 1.0)
 
 
 @triton.jit
 def _is_there(box, place):
     """Return which cells a row has along an axis (C, R)."""
     return place[:, None].to(tl.float32) < box[2][None, :]
+
+
+@triton.jit
+def _with_mode(
+    spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr
+):
+    """Return `spread` (C, E, R) with what a mode of `apart` adds in a step."""
+    x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
+    wave = _wave(waves[0], row, x, place[0], NX, is_at)
+    wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
+    power = rates[0] * _power(powers[0], row, x, NX, is_row)
+    power += rates[1] * _power(powers[1], row, y, NY, is_row)
+    power += rates[2] * _power(powers[2], row, z, NZ, is_row)
+    along = tl.sum(apart * wave[:, None, :], axis=0) * _expm1(-power)[None, :]
+    return spread + along[None, :, :] * wave[:, None, :]
 
 
 @triton.jit
@@ -241,13 +254,9 @@ def _power(exponent, row, mode, NUM: tl.constexpr, is_row):
 def _expm1(x):
     """Return eˣ − 1 to a few roundings; a difference near 0 would lose digits."""
     near = tl.maximum(tl.minimum(x, 0.5), -0.5)
-    series = 1.0 + near / 8
-    series = 1.0 + near / 7 * series
-    series = 1.0 + near / 6 * series
-    series = 1.0 + near / 5 * series
-    series = 1.0 + near / 4 * series
-    series = 1.0 + near / 3 * series
-    series = 1.0 + near / 2 * series
+    series = 1.0 + near * (1.0 / 8.0)
+    for n in tl.static_range(7, 1, -1):
+        series = 1.0 + near * (1.0 / n) * series
     return tl.where(tl.abs(x) < 0.5, x * series, tl.exp(x) - 1.0)
 
 
@@ -265,7 +274,7 @@ def _lost(above, rate, glow, blowing, around):
 
 
 @triton.jit
-def _conductances(size, pos, normal, k, box_x, box_y, box_z, place, there):
+def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there):
     """Return the conductance between each side and each cell (C, E, R, S) [W/K]: see `shares`."""
     is_any = size > 0
     safe = tl.where(is_any, size, 1e-6)
@@ -277,8 +286,7 @@ def _conductances(size, pos, normal, k, box_x, box_y, box_z, place, there):
     depth = normal[0] * normal[0] * box_x[1][None, :, None] + normal[1] * normal[1] * box_y[1][None, :, None]
     depth += normal[2] * normal[2] * box_z[1][None, :, None]
     radius = tl.sqrt(fit / PI)
-    volume = (box_x[1] * box_y[1] * box_z[1])[None, :, None]
-    rho = radius * tl.sqrt(depth / volume)
+    rho = radius * tl.sqrt(depth * (1.0 / volume)[None, :, None])
     few = (1.0 - x[4] * (1.0 - x[2])) * (1.0 - y[4] * (1.0 - y[2])) * (1.0 - z[4] * (1.0 - z[2]))
     fitted = 1.0 + 0.75 * rho * (2.0 * few - 1.0) * tl.maximum(1.0 - 2.0 * rho, 0.0)
     own = k[None, :, None]
@@ -292,14 +300,14 @@ def _conductances(size, pos, normal, k, box_x, box_y, box_z, place, there):
 @triton.jit
 def _along(pos, normal, edge, box, place, is_first_of_others):
     """Return shares and edges (C, E, R, S), Σ w², the part that is in the box, and 1 − n² (E, R, S) along an axis."""
-    low, step, number = box[0][None, :, None], box[1][None, :, None], box[2][None, :, None]
+    low, number, scale = box[0][None, :, None], box[2][None, :, None], (1.0 / box[1])[None, :, None]
     across = tl.maximum(1.0 - normal * normal, 0.0)
-    half = edge * tl.sqrt(across) / step
+    half = edge * tl.sqrt(across) * scale
     middle = 0.5 * number
     fits = tl.minimum(half, middle)
     within = tl.where(half > 0, fits / tl.where(half > 0, half, 1.0), 1.0)
     width = tl.minimum(tl.maximum(fits, LEAST), middle)
-    centre = (pos - low) / step
+    centre = (pos - low) * scale
     about = tl.minimum(tl.maximum(centre, width), number - width)
     centre = tl.minimum(tl.maximum(centre, fits), number - fits)
     at = (place.to(tl.float32) + 0.5)[:, None, None, None]
@@ -310,7 +318,7 @@ def _along(pos, normal, edge, box, place, is_first_of_others):
     after = tl.maximum(last - top, 0.0) - tl.maximum(first - top, 0.0)
     covered += tl.where(at < 1.0, before[None, :, :, :], 0.0)
     covered += tl.where(tl.abs(at - top[None, :, :, :]) < 0.25, after[None, :, :, :], 0.0)
-    shares = covered / (2.0 * width)[None, :, :, :]
+    shares = covered * (0.5 / width)[None, :, :, :]
     start, end = centre - fits, centre + fits
     open_start = tl.minimum(tl.maximum(2.0 * start, 0.0), 1.0)[None, :, :, :]
     open_end = tl.minimum(tl.maximum(2.0 * (number - end), 0.0), 1.0)[None, :, :, :]
@@ -338,8 +346,8 @@ def _below(offset):
 def _touched(cells, nodes, capacity, inverse, flow, SIDES: tl.constexpr, ENVS: tl.constexpr, SIDE: tl.constexpr):
     """Return what cells (C, E, R) and nodes (E, S) gain by contact [K]: see `conduction`."""
     held = capacity[None, None, :]
-    total = held + tl.sum(flow, axis=3)
-    weight = flow * (held / total)[:, :, :, None]
+    over = 1.0 / (held + tl.sum(flow, axis=3))
+    weight = flow * (held * over)[:, :, :, None]
     pull = tl.sum(tl.sum(weight, axis=0), axis=1)
     right = nodes + inverse * tl.sum(tl.sum(weight * cells[:, :, :, None], axis=0), axis=1)
     if SIDES == 1:
@@ -348,7 +356,7 @@ def _touched(cells, nodes, capacity, inverse, flow, SIDES: tl.constexpr, ENVS: t
     else:
         number = tl.arange(0, SIDE)
         is_diagonal = (number[:, None] == number[None, :])[None, :, :]
-        share = flow / total[:, :, :, None]
+        share = flow * over[:, :, :, None]
         coupled = tl.zeros((ENVS, SIDE, SIDE), tl.float32)
         for m in tl.static_range(SIDES):
             of_other = tl.sum(tl.where((number == m)[None, None, None, :], share, 0.0), axis=3)
@@ -362,7 +370,7 @@ def _touched(cells, nodes, capacity, inverse, flow, SIDES: tl.constexpr, ENVS: t
         left = tl.sum(coupled * (after[:, :, None] - after[:, None, :]), axis=2)
     across = after[None, :, None, :] - cells[:, :, :, None]
     left += tl.sum(tl.sum(weight * across, axis=0), axis=1)
-    return tl.sum(flow * across, axis=3) / total, -inverse * left
+    return tl.sum(flow * across, axis=3) * over, -inverse * left
 
 
 @triton.jit

@@ -101,7 +101,7 @@ def test_an_artefact_knows_them_all(tmp_path):
     again.reset()
     torch.testing.assert_close(tgdsl.simulate(again, 3).read()["warm"][:, 0, 0], torch.full((3,), 26.85, dtype=torch.float64))
     with pytest.raises(ArtifactError, match="plan format"):
-        type(touch.plan).from_json(touch.plan.to_json().replace('"format":13', '"format":12'), touch.plan.arrays)
+        type(touch.plan).from_json(touch.plan.to_json().replace('"format":14', '"format":12'), touch.plan.arrays)
 
 
 def test_what_a_state_may_hold(tmp_path):

@@ -200,8 +200,9 @@ def property_rows(
     if tuple(values.shape) not in ((), (1,), (num_envs,)):
         raise SimulationError(f"{what} has shape {tuple(values.shape)}, expected one number or ({num_envs},)")
     if values.device.type == "cpu":
-        is_fit = torch.isfinite(values) & ((values > 0) if is_positive else (values >= 0))
+        found = values.detach().double().numpy()
+        is_fit = ((found > 0) if is_positive else (found >= 0)) & (found < np.inf)
         if not is_fit.all():
             expected = "more than 0" if is_positive else "at least 0"
-            raise SimulationError(f"{what} is {float(values[~is_fit].flatten()[0]):g}, expected {expected}")
+            raise SimulationError(f"{what} is {found[~is_fit][0]:g}, expected {expected}")
     return values.detach().to(device).expand(num_envs)

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import mujoco
 
 from tgdsl.errors import SimulationError
-from tgdsl.scene.scene import Choice, SceneModels, free_bit, with_choices
+from tgdsl.scene.contact_bits import free_bit
+from tgdsl.scene.scene import Choice, SceneModels, with_choices
 
 SPARE_BODY = "tgdsl/spare"
 """The body that holds one geom per mesh: it belongs to the world, touches nothing and is not seen."""

@@ -25,9 +25,10 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.scripted import Script, script_of
+from tgdsl.scene.scene import scene_model
 
 LEAST_ENVS = 2
-"""Half of the environments choose, the other half verify."""
+"""Half of the environments choose, the others verify."""
 SWAY, PERIODS = 0.03, (0.05, 0.4)
 """Amplitude of what is added to the controls, as a fraction of their range, and its periods, as fractions of a run."""
 REACH = (0.5, 1.1)
@@ -105,7 +106,7 @@ def record(
         touch: The module.
         num_envs: Environments.
         steps: Control steps, about.
-        substeps: Physics steps of each.
+        substeps: Physics steps of each; a module that reads each physics step of a call has as many as it reads.
         seed: Of what differs between environments.
         script: How it is run; default: as `tgdsl run` does.
         progress: Is told what is done.
@@ -116,8 +117,7 @@ def record(
     """
     if num_envs < LEAST_ENVS or steps < 1:
         raise TgdslError(f"{num_envs} environments of {steps} steps: expected at least {LEAST_ENVS}, and at least one step")
-    from tgdsl.scene.scene import scene_model
-
+    substeps = touch.inputs.substeps if touch.inputs.substeps > 1 else substeps
     script = script or script_of(touch, progress=progress)
     phases = 1 if script.keyframes is None and script.closing is None else 3
     seconds = steps / phases * substeps * scene_model(touch.plan.scene).opt.timestep

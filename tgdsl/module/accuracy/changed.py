@@ -1,4 +1,4 @@
-"""States that a conformance test makes of another: the scene moved, some of its environments."""
+"""States made of another: the scene moved, some of its environments."""
 
 from __future__ import annotations
 

@@ -1,0 +1,270 @@
+"""Errors of primitive colliders, capped iterations and tolerances in C MuJoCo in float64, and which pairs of links come near.
+
+Used by colliders.py. From the same states, with the same targets, against mesh colliders with 100 iterations and a tolerance of
+1e-8, of the same friction cone:
+
+- `mm_1`, `mm_10`, `deg_1`, `deg_10`: how far the object is elsewhere after one and after ten control steps, RMS over states;
+- `force_%`: forces on links after one control step, RMS of the difference over RMS of the forces; the states are those of the
+  mesh colliders, so that primitives begin up to a millimetre apart or in the object;
+- `load_%`: sum of the forces' magnitudes after ten control steps, over that of the exact ones;
+- `depth_mm`: mean over states of the deepest penetration after ten control steps;
+- `stays_%`: in how many states the object is still on the palm at the end; `rounds`: Newton's, mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from tgdsl.rl.load import load_task
+from tgdsl.rl.sensed import compile_sensed
+from tgdsl.scene.scene import Choice, SceneModels
+
+COLLISIONS, CONES = ("mesh", "primitive"), ("pyramidal", "elliptic")
+VISIT = 12
+"""Control steps until joints go elsewhere."""
+EXACT = {"iterations": 100, "ls_iterations": 50, "tolerance": 1e-8}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Colliders, friction cone, and the options of the solver that differ from the scene's."""
+
+    collision: str
+    cone: str
+    options: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The variant as a row's first column."""
+        shown = " ".join(f"{name}={value:g}" for name, value in self.options.items())
+        return f"{self.collision:<9} {self.cone:<9} {shown or '-':<32}"
+
+
+class Scenes:
+    """The task's scene in C MuJoCo, with each kind of colliders, for each variant of the object."""
+
+    def __init__(self, task: Path):
+        """Compile both."""
+        self.scenes, self.names = {}, {}
+        for collision in COLLISIONS:
+            loaded = load_task(task, {"physics.collision": collision, "touch": "none"})
+            sensed = compile_sensed(loaded, "cpu")
+            self.scenes[collision], self.spec = sensed.touch.plan.scene, loaded.spec
+            self.body = sensed.object
+        self._models: dict[tuple[Any, ...], mujoco.MjModel] = {}
+
+    def model(self, variant: Variant, number: int) -> mujoco.MjModel:
+        """Return the model of a variant of colliders and options with a variant of the object."""
+        key = (variant.collision, variant.cone, *sorted(variant.options.items()), number)
+        if key not in self._models:
+            options = self.spec.physics.options | EXACT | {"cone": variant.cone} | variant.options
+            models = SceneModels(self.scenes[variant.collision], options)
+            self._models[key] = models.model({"item": Choice(number)})
+        return self._models[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """Where a scene is, and the targets of the control steps that follow, (step, actuator)."""
+
+    number: int
+    qpos: np.ndarray
+    qvel: np.ndarray
+    targets: np.ndarray
+
+
+def advance(model: mujoco.MjModel, data: mujoco.MjData, target: np.ndarray, substeps: int) -> None:
+    """Make a control step."""
+    data.ctrl[:] = target
+    mujoco.mj_step(model, data, substeps)
+
+
+def targets(model: mujoco.MjModel, start: np.ndarray, moved: np.ndarray, steps: int, rng: np.random.Generator) -> np.ndarray:
+    """Return targets as the task's actions make them: joints go to one random place after another, 0.05 rad a control step."""
+    low, high = model.actuator_ctrlrange.T
+    found, now, goal = [], start.copy(), start.copy()
+    for i in range(steps):
+        if i % VISIT == 0:
+            goal[moved] = (low + (high - low) * rng.uniform(0.05, 0.95, len(low)))[moved]
+        now[moved] += np.clip(goal - now, -0.05, 0.05)[moved]
+        found.append(now.copy())
+    return np.array(found)
+
+
+def instants(scenes: Scenes, count: int, ahead: int, seed: int = 0) -> list[Instant]:
+    """Return states in which fingers move an object on the palm, of all its variants in turn."""
+    rng, found = np.random.default_rng(seed), []
+    reference = Variant("mesh", "elliptic")
+    for i in range(count):
+        model = scenes.model(reference, i % 16)
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        moved = np.array([j for j in range(model.nu) if "thumb" in model.actuator(j).name or "_mid_" in model.actuator(j).name])
+        own = model.body(scenes.body).jntadr[0]
+        place = int(model.jnt_qposadr[own])
+        data.qpos[place : place + 2] += rng.uniform(-0.01, 0.01, 2)
+        before = int(rng.integers(10, 50))
+        made = targets(model, model.key_ctrl[0], moved, before + ahead, rng)
+        for target in made[:before]:
+            advance(model, data, target, scenes.spec.physics.substeps)
+        found.append(Instant(i % 16, data.qpos.copy(), data.qvel.copy(), made[before:]))
+    return found
+
+
+def link_forces(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
+    """Return the force of each body's geoms on the object in the world [N], (body, 3)."""
+    found, wrench = np.zeros((model.nbody, 3)), np.zeros(6)
+    for i in range(data.ncon):
+        contact = data.contact[i]
+        one, two = (int(model.geom_bodyid[geom]) for geom in contact.geom)
+        if body in (one, two):
+            mujoco.mj_contactForce(model, data, i, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]  # on the second geom's body
+            found[one if two == body else two] += force if two == body else -force
+    return found
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one instant: the object's place [m] and orientation after 1 and 10 steps, forces, penetration [m]."""
+
+    place: np.ndarray
+    turn: np.ndarray
+    force: np.ndarray
+    load: float
+    depth: float
+    stays: bool
+    rounds: float
+
+
+def outcome(scenes: Scenes, variant: Variant, instant: Instant) -> Outcome:
+    """Run one instant with a variant."""
+    model = scenes.model(variant, instant.number)
+    data, body = mujoco.MjData(model), int(model.body(scenes.body).id)
+    data.qpos[:], data.qvel[:] = instant.qpos, instant.qvel
+    mujoco.mj_forward(model, data)
+    start, place, turn, rounds = data.xpos[body].copy(), [], [], []
+    force, load, depth = np.zeros((model.nbody, 3)), 0.0, 0.0
+    for i, target in enumerate(instant.targets):
+        advance(model, data, target, scenes.spec.physics.substeps)
+        rounds.append(float(data.solver_niter[: max(data.nisland, 1)].max()))
+        if i in (0, 9):
+            mujoco.mj_forward(model, data)
+            place.append(data.xpos[body].copy())
+            turn.append(data.xquat[body].copy())
+        if i == 0:
+            force = link_forces(model, data, body)
+        if i == 9:
+            near = [-data.contact[k].dist for k in range(data.ncon) if body in model.geom_bodyid[data.contact[k].geom]]
+            depth, load = max([0.0, *near]), float(np.linalg.norm(link_forces(model, data, body), axis=1).sum())
+    stays = bool(np.linalg.norm(data.xpos[body] - start) < scenes.spec.drop_distance)  # type: ignore[attr-defined]
+    return Outcome(np.array(place), np.array(turn), force, load, depth, stays, statistics.fmean(rounds))
+
+
+def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the angles between orientations [deg]."""
+    return np.degrees(2 * np.arccos(np.clip(np.abs((one * other).sum(axis=-1)), 0, 1)))
+
+
+def compared(variant: Variant, own: Sequence[Outcome], exact: Sequence[Outcome]) -> dict[str, Any]:
+    """Return a row of the table: a variant against the exact one."""
+    pairs = list(zip(own, exact, strict=True))
+    moved = np.array([np.linalg.norm(a.place - b.place, axis=1) for a, b in pairs])
+    turned = np.array([angles(a.turn, b.turn) for a, b in pairs])
+    forces, differences = np.array([b.force for _, b in pairs]), np.array([a.force - b.force for a, b in pairs])
+    row: dict[str, Any] = asdict(variant)
+    for i, steps in enumerate((1, 10)):
+        row[f"mm_{steps}"] = 1e3 * float(np.sqrt((moved[:, i] ** 2).mean()))
+        row[f"mm_{steps}_median"] = 1e3 * float(np.median(moved[:, i]))
+        row[f"deg_{steps}"] = float(np.sqrt((turned[:, i] ** 2).mean()))
+    row["force_%"] = 100.0 * float(np.sqrt((differences**2).sum() / (forces**2).sum()))
+    row["load_%"] = 100.0 * sum(a.load for a in own) / sum(b.load for b in exact)
+    row["depth_mm"] = 1e3 * statistics.fmean(a.depth for a in own)
+    row["stays_%"] = 100.0 * statistics.fmean(a.stays for a in own)
+    row["rounds"] = statistics.fmean(a.rounds for a in own)
+    return row
+
+
+COLUMNS = ("mm_1", "mm_10", "mm_10_median", "deg_1", "deg_10", "force_%", "load_%", "depth_mm", "stays_%", "rounds")
+
+
+def error(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return a row per variant of colliders and options, each against the exact one with its own cone."""
+    scenes = Scenes(options.task)
+    found = instants(scenes, options.states, options.ahead)
+    print(f"{'variant':<52} {' '.join(f'{name:>12}' for name in COLUMNS)}")
+    rows = []
+    exact = {cone: [outcome(scenes, Variant("mesh", cone), own) for own in found] for cone in options.cones}
+    for cone in options.cones:
+        for collision, chosen in itertools.product(options.collisions, options.error_variants):
+            variant = Variant(collision, cone, chosen)
+            rows.append(compared(variant, [outcome(scenes, variant, own) for own in found], exact[cone]))
+            print(variant.name, " ".join(f"{rows[-1][name]:12.3f}" for name in COLUMNS), flush=True)
+            write(options, "error", rows)
+    if len(options.cones) == 2:
+        other = compared(Variant("mesh", "pyramidal, against elliptic"), exact["pyramidal"], exact["elliptic"])
+        rows.append(other)
+        print(f"{'mesh pyramidal against mesh elliptic':<52}", " ".join(f"{other[name]:12.3f}" for name in COLUMNS))
+    write(options, "error", rows)
+    return rows
+
+
+def pairs(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return per kind of colliders how many pairs of geoms may meet, and which bodies came into contact in a run."""
+    scenes, rows = Scenes(options.task), []
+    found = instants(scenes, options.states, options.ahead)
+    for collision in options.collisions:
+        variant, met, least = Variant(collision, "elliptic"), dict[str, int](), dict[str, float]()
+        for own in found:
+            model = scenes.model(variant, own.number)
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = own.qpos, own.qvel
+            for target in own.targets:
+                advance(model, data, target, scenes.spec.physics.substeps)
+                for k in range(data.ncon):
+                    bodies = sorted(int(model.geom_bodyid[geom]) for geom in data.contact[k].geom)
+                    name = " – ".join(model.body(i).name for i in bodies)
+                    met[name] = met.get(name, 0) + 1
+                    least[name] = min(least.get(name, 0.0), float(data.contact[k].dist))
+        may = candidates(scenes.model(variant, 0))
+        rows.append({"collision": collision, "candidates": may, "met": met})
+        print(f"{collision}: {sum(may.values())} pairs of geoms may meet: {may}")
+        for name, count in sorted(met.items(), key=lambda item: -item[1]):
+            print(f"  {name:<70} {count:7d} contacts, deepest {-1e3 * least[name]:.2f} mm")
+    write(options, "pairs", rows)
+    return rows
+
+
+def candidates(model: mujoco.MjModel) -> dict[str, int]:
+    """Return how many pairs of geoms bits, exclusions and the tree of bodies let meet, by what they are."""
+    counts = {"link – link": 0, "link – object": 0, "world – other": 0}
+    excluded = set(model.exclude_signature.tolist())
+    for a, b in itertools.combinations(range(model.ngeom), 2):
+        one, two = sorted(int(model.geom_bodyid[i]) for i in (a, b))
+        bits = model.geom_contype[a] & model.geom_conaffinity[b] | model.geom_contype[b] & model.geom_conaffinity[a]
+        welded = model.body_weldid[[one, two]]
+        parents = model.body_weldid[model.body_parentid[welded]]
+        is_kin = welded[0] and welded[1] and (welded[0] == parents[1] or welded[1] == parents[0])
+        if not bits or welded[0] == welded[1] or is_kin or (one << 16) + two in excluded:
+            continue
+        is_object = [bool(model.body_dofnum[i] == 6) for i in (one, two)]
+        kind = "link – object" if any(is_object) and one else "world – other" if not one else "link – link"
+        counts[kind] += 1
+    return counts
+
+
+def write(options: argparse.Namespace, part: str, rows: list[dict[str, Any]]) -> None:
+    """Write the rows of a part as JSON."""
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.with_name(f"{options.out.name}_{part}.json").write_text(json.dumps(rows, indent=1), encoding="utf-8")

@@ -1,0 +1,234 @@
+"""Sound: a block of samples as one matrix against a loop over samples, on a CPU; a call on a GPU, replayed as a CUDA graph.
+
+    python benchmarks/sound.py cpu                                    # one thread
+    python benchmarks/sound.py artefacts out/sound                    # where documents can be compiled
+    python benchmarks/sound.py gpu out/sound --out out/sound.json     # needs torch and what tgdsl.load needs, no more
+
+`LINKS` links of `MODES` modes each, `SAMPLES` samples per physics step, each link touching the one object or not.
+
+`cpu`: `block` is what `contact_audio` does from loads to samples, without noise; `loop` does the same with a two-pole resonator
+per mode, sample by sample, as printed by Chung et al., all environments, links and modes at once. Both eager, both compiled; in
+turn, in CPU time of the thread. `module` is a whole call, contacts and noise included. `gpu` times the whole call, compiled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from gpu import captured, median_ms
+from torch import Tensor
+
+import tgdsl
+from tgdsl.module.artifact import load_plan
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.loads import Loads, PairLoads
+from tgdsl.sensors.base import Context
+from tgdsl.sensors.contact_audio.impulses import impulses
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+
+LINKS, MODES, SAMPLES, STEP = 5, 8, 20, 0.001
+CASES: dict[str, dict[str, Any]] = {
+    "one step": {},
+    "without noise": {"scrape": 0.0},
+    "bands": {"outputs": "bands"},
+    "five steps": {"substeps": 5},
+}
+"""What the sensor is given."""
+
+
+def document(folder: Path, **given: Any) -> dict[str, Any]:
+    """Return a document whose scene is written to a folder."""
+    links = [f"link{i}" for i in range(LINKS)]
+    box = '<freejoint/><geom type="box" size=".02 .02 .005"/>'
+    bodies = "".join(f'<body name="{body}">{box}</body>' for body in [*links, "item"])
+    model = folder / "scene.xml"
+    model.write_text(f'<mujoco><option timestep="{STEP}"/><worldbody>{bodies}</worldbody></mujoco>')
+    modes = [{"frequency": 300.0 * 1.45**i, "decay": 5.0 + 8.0 * i, "gain": 1.0 / (i + 1)} for i in range(MODES)]
+    sensor = {"kind": "contact_audio", "links": links, "feels": ["item"], "modes": modes, "samples": SAMPLES, **given}
+    return {"tgdsl": 1, "robot": {"model": str(model)}, "objects": {"item": {"body": "item"}}, "sensors": {"s": sensor}}
+
+
+def artefact(folder: Path, name: str) -> Path:
+    """Return the file of a case."""
+    return folder / f"sound_{name.replace(' ', '_')}.safetensors"
+
+
+def write_artefacts(options: argparse.Namespace) -> None:
+    """Compile all cases."""
+    options.folder.mkdir(parents=True, exist_ok=True)
+    for name, given in CASES.items():
+        with TemporaryDirectory() as scratch:
+            tgdsl.save(tgdsl.compile(document(Path(scratch), **given)), artefact(options.folder, name))
+
+
+# On a CPU -------------------------------------------------------------------------------------------------------------------
+
+
+class Loop:
+    """Two-pole resonators, sample by sample."""
+
+    def __init__(self, constants: dict[str, Tensor], num_envs: int):
+        """Be at rest."""
+        self._constants = constants
+        radius, angle = torch.exp(-constants["decay"] * STEP / SAMPLES), 2 * math.pi * constants["frequency"] * STEP / SAMPLES
+        self._first, self._second, self._gain = 2 * radius * torch.cos(angle), radius**2, constants["gain"] * torch.sin(angle)
+        self.state = {"steady": torch.zeros(num_envs, LINKS, 1), "pending": torch.zeros(num_envs, LINKS, 1)}
+        self.last, self.before = (torch.zeros(num_envs, LINKS, MODES) for _ in range(2))
+
+    def step(self, force: Tensor, last: Tensor, before: Tensor) -> tuple[Tensor, ...]:
+        """Return samples (env, sample, row), and the last two values of each resonator."""
+        impulse, new = impulses(force, self._constants, self.state)
+        struck, found = impulse.sum(dim=2)[..., None], []
+        for k in range(SAMPLES):
+            now = self._first * last - self._second * before
+            now = now + struck if k == 0 else now
+            found.append((self._gain * now).sum(dim=-1))
+            last, before = now, last
+        return torch.stack(found, dim=1), last, before, new["steady"], new["pending"]
+
+    def __call__(self, step: Callable[..., tuple[Tensor, ...]], force: Tensor) -> None:
+        """Advance by a physics step."""
+        _, last, before, steady, pending = step(force, self.last, self.before)
+        for old, new in ((self.last, last), (self.before, before)):
+            old.copy_(new)
+        self.state["steady"].copy_(steady)
+        self.state["pending"].copy_(pending)
+
+
+def block(force: Tensor, context: Context, constants: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[Tensor, dict]:
+    """Return the samples of `contact_audio` and its new state."""
+    found, new = CONTACT_AUDIO.forward(Gathered({Loads: PairLoads(force, force, None)}), context, constants, state)
+    return found["signal"], dict(new)
+
+
+def run_cpu(options: argparse.Namespace) -> None:
+    """Time a block against a loop, and a whole call."""
+    torch.set_num_threads(1)
+    with TemporaryDirectory() as scratch:
+        silent = tgdsl.compile(document(Path(scratch), scrape=0.0))
+        whole = tgdsl.compile(document(Path(scratch)))
+    constants = {
+        name: value.to(torch.float32) if value.is_floating_point() else value
+        for name, value in ((key, silent.constants[f"sensors/s/{key}"]) for key in silent.plan.sensors[0].constants)
+    }
+    n = options.envs
+    step = torch.zeros(n, 1, dtype=torch.int64)
+    context = Context(torch.tensor(STEP), step, 0, torch.ones(n, 1), torch.zeros(n, 1, dtype=torch.bool))
+    force, loop = torch.rand(n, LINKS, 1), Loop(constants, n)
+    state = {name: torch.zeros(n, *part.shape) for name, part in silent.plan.sensors[0].state.items()}
+    states = [whole.example_state(n, seed=seed, dtype=torch.float32) for seed in range(3)]
+    compiled: list[Any] = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
+
+    def advance(step: Callable[..., Any]) -> None:
+        for name, value in step(force, context, constants, state)[1].items():
+            state[name].copy_(value)
+
+    calls: dict[str, Callable[[], Any]] = {
+        "block": lambda: advance(block),
+        "loop": lambda: loop(loop.step, force),
+        "block, compiled": lambda: advance(compiled[0]),
+        "loop, compiled": lambda: loop(compiled[1], force),
+        "module": lambda: [whole(one) for one in states],
+    }
+    with torch.no_grad():
+        taken = timed(calls, options.repeats, options.calls)
+    taken["module"] = [own / len(states) for own in taken["module"]]
+    for name, own in taken.items():
+        print(f"{name:<18}{1e3 * statistics.median(own):9.3f} ms")
+    for ending in ("", ", compiled"):
+        ratio = [slow / fast for slow, fast in zip(taken[f"loop{ending}"], taken[f"block{ending}"], strict=True)]
+        print(f"loop / block{ending}: {statistics.median(ratio):.1f} ({min(ratio):.1f} to {max(ratio):.1f})")
+    mixed = [slow / fast for slow, fast in zip(taken["loop"], taken["block, compiled"], strict=True)]
+    print(f"loop / block, compiled block: {statistics.median(mixed):.1f} ({min(mixed):.1f} to {max(mixed):.1f})")
+    write(options, {"envs": n, "seconds": taken})
+
+
+def timed(calls: dict[str, Callable[[], Any]], repeats: int, count: int) -> dict[str, list[float]]:
+    """Return CPU seconds of the thread that each call takes, in turn."""
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    for i in range(repeats + 1):
+        for name, call in calls.items():
+            start = time.thread_time()
+            for _ in range(count if i else 2):
+                call()
+            if i:
+                taken[name].append((time.thread_time() - start) / count)
+    return taken
+
+
+# On a GPU -------------------------------------------------------------------------------------------------------------------
+
+
+def state_of(touch: TactileModule, num_envs: int, device: torch.device) -> SceneState:
+    """Return a state in which half of the links touch the object."""
+    state = touch.example_state(num_envs, dtype=torch.float32).to(device)
+    for part in (state, *state.substeps):
+        assert part.contact_netforce is not None
+        meets = torch.rand(part.contact_netforce.shape[:2], device=device) < 0.5
+        for name in ("contact_netforce", "contact_force", "contact_normal"):
+            value = getattr(part, name)
+            value.mul_(meets.reshape(*meets.shape, *[1] * (value.ndim - 2)))
+    return state
+
+
+def run_gpu(options: argparse.Namespace) -> None:
+    """Time whole calls, compiled and replayed as CUDA graphs."""
+    device, rows = torch.device(options.device), []
+    for name in CASES:
+        touch = TactileModule(load_plan(artefact(options.folder, name))).to(device)
+        if not options.eager:
+            touch.compile()
+        state = state_of(touch, options.envs, device)
+        with torch.no_grad():
+            start = time.perf_counter()
+            touch(state)
+            tensors = touch.incoming.tensors(state, torch.float32, device)
+            memory = touch.memory.tensors(options.envs, state.dt, torch.float32, device)
+            core = touch.calls.of(touch.advance)
+            replay = captured(lambda core=core, of=tensors, into=memory: core(of, into), device)
+            ready, ms = time.perf_counter() - start, median_ms(replay, options.repeats, device, batch=20)
+        heard = next(iter(core(tensors, memory).values()))
+        assert bool(heard.isfinite().all()) and bool(heard.any()) == ("scrape" not in CASES[name]), name  # loads are steady
+        rows.append({"case": name, "envs": options.envs, "ms": ms, "ready_s": ready})
+        print(f"{name:<16}{options.envs:>8}{ms:9.4f} ms   (ready after {ready:.0f} s)", flush=True)
+    write(options, {"device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu", "rows": rows})
+
+
+def write(options: argparse.Namespace, found: dict[str, Any]) -> None:
+    """Write what was found, if it is wanted."""
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for name, envs in (("cpu", 1024), ("artefacts", 0), ("gpu", 16384)):
+        own = commands.add_parser(name)
+        if name != "cpu":
+            own.add_argument("folder", type=Path)
+        own.add_argument("--envs", type=int, default=envs)
+        own.add_argument("--repeats", type=int, default=15)
+        own.add_argument("--calls", type=int, default=20)
+        own.add_argument("--device", default="cuda")
+        own.add_argument("--eager", action="store_true")
+        own.add_argument("--out", type=Path)
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    given = parsed()
+    {"cpu": run_cpu, "artefacts": write_artefacts, "gpu": run_gpu}[given.command](given)

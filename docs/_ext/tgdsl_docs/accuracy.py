@@ -1,0 +1,76 @@
+"""What is known exactly of each kind: its comparisons with closed forms as a table and a plot, and all of them on a page."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import matplotlib
+from matplotlib.figure import Figure
+
+from tgdsl.report.defects import DEFECTS, answers
+from tgdsl.report.oracles.every import draw, entry_of, run
+from tgdsl.report.oracles.results import Comparison
+from tgdsl_docs.tables import inline, table
+
+HEADER = ("comparison", "quantity", "largest exact", "error", "of what is allowed", "error of the paper's", "source")
+MOST = 4
+"""Comparisons that a kind's plot shows."""
+
+
+class Accuracy:
+    """All comparisons, computed once per build."""
+
+    def __init__(self) -> None:
+        self.fields = {field: comparisons for field, (comparisons, _) in run().items()}
+
+    def of(self, kind: str) -> list[Comparison]:
+        """Return a kind's comparisons."""
+        return [own for comparisons in self.fields.values() for own in comparisons if kind in own.kinds]
+
+    def section(self, kind: str) -> str:
+        """Return what a kind's page says of its accuracy; its plot is `accuracy_<kind>.svg` beside it."""
+        found = self.of(kind)
+        if not found:
+            return "Compared with no closed form.\n"
+        about = "Computed when these pages were built; [accuracy](../../accuracy.md) says how."
+        return f"![Exact values, tgdsl and the paper's formula](accuracy_{kind}.svg)\n\n{_table(found)}\n{about}\n"
+
+    def plot(self, kind: str) -> str:
+        """Return a kind's plot as an SVG file: its comparisons with most points, those with the paper's first."""
+        found = sorted(self.of(kind), key=lambda own: (own.paper is None, -own.exact.shape[-1]))[:MOST]
+        figure = Figure(figsize=(9.0, 3.1 * -(-len(found) // 2)))
+        for i, own in enumerate(found):
+            axes = figure.add_subplot(-(-len(found) // 2), 2, i + 1)
+            draw(own, axes)
+            axes.set_title(own.name, fontsize=8)
+            axes.tick_params(labelsize=7)
+        figure.tight_layout()
+        text = io.StringIO()
+        with matplotlib.rc_context({"svg.hashsalt": kind, "svg.fonttype": "none"}):
+            figure.savefig(text, format="svg", metadata={"Date": None})
+        return text.getvalue()
+
+    def page(self) -> str:
+        """Return the page of all comparisons and of the findings that they answer."""
+        parts = ["# All comparisons\n\n[Accuracy](../accuracy.md) says what they are.\n"]
+        for field, comparisons in self.fields.items():
+            parts.append(f"## {field[0].upper()}{field[1:]}\n\n{_table(comparisons)}")
+        entries = [entry_of(own) for comparisons in self.fields.values() for own in comparisons]
+        found = answers((entry.title, entry.figure, entry.defects) for entry in entries)
+        rows = []
+        for defect in DEFECTS:
+            answer = found.get(defect.number)
+            by, figure = (answer.title, answer.figure) if answer else (f"`tgdsl bench --{defect.answered_in}`", "")
+            rows.append((str(defect.number), inline(defect.about), defect.measured, inline(by), figure))
+        about = (
+            "What was measured on, or read from, the paper's published implementation (Chung et al.), and what answers it here."
+        )
+        header = ("", "finding", "there", "answered by", "figure here")
+        parts.append(f"## Findings\n\n{about}\n\n{table(header, rows)}")
+        return "\n".join(parts)
+
+
+def _table(found: Sequence[Comparison]) -> str:
+    rows = [(inline(entry.title), *map(inline, entry.cells)) for entry in map(entry_of, found)]
+    return table(HEADER, rows)

@@ -1,0 +1,379 @@
+"""Fit capsules, boxes and spheres to the surfaces of a hand's links: a second set of colliders, `collision: primitive`.
+
+Each link starts from primitives of a table; their numbers then minimise the fourth power of the distance between the link's
+surface and the union of the primitives' (Levenberg–Marquardt on its square), most where objects touch the link: on
+the inner sides and the tips. What is written is checked anew by `deviations`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import igl
+import numpy as np
+import torch
+import trimesh
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from robots.reflection import Mirror
+from tgdsl.formats.model import Model
+from tgdsl.formats.robot import load_model
+from tgdsl.geometry.shapes import SHAPES
+from tgdsl.plan.scene import Collider
+from tgdsl.surfaces.convex import hull_planes
+from tgdsl.surfaces.surface import Surface
+
+MM = 1e-3
+TOUCHED_SCALE, REST_SCALE = 0.5, 3.0
+"""Distances that count alike where objects touch the link and elsewhere [mm]."""
+CONE = 60.0
+"""Largest angle between a surface's normal and a direction that objects come from [deg]."""
+NUM_SAMPLES = 1500
+MOST_STEPS = 40
+STRAY, STRAY_TURN = 8.0, 30.0
+"""How far the fit may move a primitive's numbers from the table's [mm], [deg]."""
+_LINE = np.linspace(-1, 1, 9)
+EDGES = np.unique(
+    np.concatenate([np.roll([[t, a, b] for t in _LINE for a in (-1, 1) for b in (-1, 1)], k, axis=1) for k in range(3)]), axis=0
+)
+"""Points of the edges of a box of half-extents 1."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A primitive in a link's frame, in millimetres and degrees, as the fit starts from it.
+
+    Attributes:
+        shape: `capsule`, `sphere` or `box`.
+        at: A capsule's first end, else the centre.
+        size: A capsule's or sphere's radius; a box's half-extents.
+        to: A capsule's other end.
+        turn: A box's rotation vector [deg].
+        is_pair: Whether there is a second one, mirrored at the link's plane of symmetry.
+        is_core: Whether other links meet it too: it is then the link to them.
+    """
+
+    shape: str
+    at: tuple[float, float, float]
+    size: tuple[float, ...]
+    to: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    is_pair: bool = False
+    is_core: bool = False
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a link's primitives are fitted.
+
+    Attributes:
+        primitives: What the fit starts from.
+        touched: Directions that objects come from, in the link's frame; none: it is not touched.
+        region: Lower and upper corner of what is touched [mm].
+        lateral: Axis that the link is symmetric along, as an index; None: it is not.
+        middle: Where its plane of symmetry is on that axis [mm].
+    """
+
+    primitives: tuple[Primitive, ...]
+    touched: tuple[tuple[float, float, float], ...] = ()
+    region: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1e3,) * 3, (1e3,) * 3)  # type: ignore
+    lateral: int | None = None
+    middle: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points of a link's surface [m], and whether objects touch it there."""
+
+    pos: np.ndarray
+    is_touched: np.ndarray
+
+
+# ---- the surface
+
+
+def samples(surface: Surface, link: Link, count: int = NUM_SAMPLES, seed: int = 0) -> Samples:
+    """Return points spread over a link's surface, the same ones every time."""
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    pos, face, *_ = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return Samples(np.asarray(pos), touched(np.asarray(pos), surface.face_normals[face], link))
+
+
+def _hull_planes(surface: Surface) -> np.ndarray:
+    hull = trimesh.convex.convex_hull(surface.vertices)
+    count = len(hull.faces)
+    return hull_planes(Surface(np.asarray(hull.vertices), np.asarray(hull.faces), np.zeros(count, dtype=np.int64), ()))
+
+
+def touched(pos: np.ndarray, normal: np.ndarray, link: Link) -> np.ndarray:
+    """Return whether points with normals are where objects touch a link."""
+    low, high = (MM * np.array(corner) for corner in link.region)
+    is_inside = ((pos >= low) & (pos <= high)).all(axis=1)
+    facing = np.zeros(len(pos), dtype=bool)
+    for direction in link.touched:
+        unit = np.array(direction) / np.linalg.norm(direction)
+        facing |= normal @ unit >= np.cos(np.radians(CONE))
+    return is_inside & facing
+
+
+# ---- primitives as numbers
+
+
+def _flip(link: Link, is_mirrored: bool) -> np.ndarray:
+    signs = np.ones(3)
+    if is_mirrored and link.lateral is not None:
+        signs[link.lateral] = -1.0
+    return signs
+
+
+def _numbers(primitive: Primitive) -> np.ndarray:
+    """Return a primitive's numbers: at, to or turn, size [mm, deg]."""
+    second = primitive.to if primitive.shape == "capsule" else primitive.turn if primitive.shape == "box" else ()
+    return np.array([*primitive.at, *second, *primitive.size], dtype=np.float64)
+
+
+def _bound(primitive: Primitive, sign: int) -> np.ndarray:
+    """Return the least or greatest values of a primitive's numbers [mm, deg]: sizes stay above 1 mm."""
+    numbers = _numbers(primitive)
+    steps = np.full(len(numbers), STRAY)
+    if primitive.shape == "box":
+        steps[3:6] = STRAY_TURN
+    found = numbers + sign * steps
+    found[-len(primitive.size) :] = np.maximum(found[-len(primitive.size) :], 1.0)
+    return found
+
+
+def _is_free(primitive: Primitive, link: Link) -> np.ndarray:
+    """Return which of a primitive's numbers the fit may change: one on the plane of symmetry stays there."""
+    free = np.ones(len(_numbers(primitive)), dtype=bool)
+    if link.lateral is not None and not primitive.is_pair:
+        free[link.lateral] = False
+        if primitive.shape == "capsule":
+            free[3 + link.lateral] = False
+        elif primitive.shape == "box":
+            free[[3 + i for i in range(3) if i != link.lateral]] = False
+    return free
+
+
+def _placed(primitive: Primitive, numbers: np.ndarray, link: Link, is_mirrored: bool = False) -> Collider:
+    """Return a primitive with some numbers as MuJoCo has it."""
+    flip, middle = _flip(link, is_mirrored), np.zeros(3)
+    if link.lateral is not None:
+        middle[link.lateral] = link.middle
+    at = (middle + (numbers[:3] - middle) * flip) * MM
+    if primitive.shape == "capsule":
+        to = (middle + (numbers[3:6] - middle) * flip) * MM
+        axis = to - at
+        length = float(np.linalg.norm(axis))
+        turn = Rotation.align_vectors([axis / length], [[0.0, 0.0, 1.0]])[0] if length > 1e-9 else Rotation.identity()
+        size, pos = (numbers[6] * MM, 0.5 * length), 0.5 * (at + to)
+    elif primitive.shape == "box":
+        vector = numbers[3:6] * flip * np.prod(flip)  # a rotation vector is a pseudovector
+        turn, size, pos = Rotation.from_rotvec(vector, degrees=True), tuple(numbers[6:9] * MM), at
+    else:
+        turn, size, pos = Rotation.identity(), (numbers[3] * MM,), at
+    quat = turn.as_quat(scalar_first=True)
+    as_floats = lambda values: tuple(float(value) for value in values)  # noqa: E731
+    return Collider("", primitive.shape, as_floats(size), as_floats(pos), as_floats(quat), primitive.is_core)  # type: ignore
+
+
+def all_placed(link: Link, numbers: Sequence[np.ndarray]) -> list[Collider]:
+    """Return all primitives of a link with some numbers, those of pairs one after the other."""
+    found = []
+    for primitive, own in zip(link.primitives, numbers, strict=True):
+        found += [
+            _placed(primitive, own, link, is_mirrored) for is_mirrored in ((False, True) if primitive.is_pair else (False,))
+        ]
+    return found
+
+
+# ---- distances
+
+
+def distance(placed: Sequence[Collider], pos: np.ndarray) -> np.ndarray:
+    """Return the signed distance [m] of each primitive's surface from points, (primitive, point)."""
+    found = []
+    for own in placed:
+        turn = Rotation.from_quat(own.quat, scalar_first=True).as_matrix()
+        x, y, z = torch.from_numpy(((pos - own.pos) @ turn).T.copy())
+        size = torch.tensor([*own.size, 0.0, 0.0][:3], dtype=torch.float64)
+        found.append(SHAPES[own.type]((x, y, z), tuple(size))[0].numpy())  # type: ignore[arg-type]
+    return np.stack(found)
+
+
+def fitted(link: Link, surface: Surface) -> list[Collider]:
+    """Return a link's primitives, fitted to its surface."""
+    points, planes = samples(surface, link), _hull_planes(surface)
+    scale = np.where(points.is_touched, TOUCHED_SCALE, REST_SCALE) * MM
+    start = [_numbers(primitive) for primitive in link.primitives]
+    free = np.concatenate([_is_free(primitive, link) for primitive in link.primitives])
+    ends = np.cumsum([len(own) for own in start])[:-1]
+
+    def numbers(chosen: np.ndarray) -> list[np.ndarray]:
+        whole = np.concatenate(start)
+        whole[free] = chosen
+        return np.split(whole, ends)
+
+    def residuals(chosen: np.ndarray, power: float) -> np.ndarray:
+        placed = all_placed(link, numbers(chosen))
+        found = distance(placed, points.pos).min(axis=0) / scale
+        edges = sharp(placed, planes) / (TOUCHED_SCALE * MM)
+        return np.concatenate([np.sign(found) * np.abs(found) ** np.where(points.is_touched, power, 2), edges**power])
+
+    chosen = np.concatenate(start)[free]
+    low, high = (np.concatenate([_bound(own, sign) for own in link.primitives])[free] for sign in (-1, 1))
+    for power in (2, 3, 4):
+        made = least_squares(
+            residuals, chosen, bounds=(low, high), x_scale=1.0, diff_step=1e-5, max_nfev=MOST_STEPS, args=(power,)
+        )
+        chosen = made.x
+    return all_placed(link, [np.round(own, 2) for own in numbers(chosen)])
+
+
+def sharp(placed: Sequence[Collider], planes: np.ndarray) -> np.ndarray:
+    """Return how far points of the boxes' edges stick out of a convex hull and of the other primitives [m], or less."""
+    found = []
+    for i, own in enumerate(placed):
+        if own.type != "box":
+            continue
+        pos = EDGES * own.size @ Rotation.from_quat(own.quat, scalar_first=True).as_matrix().T + own.pos
+        outside = (pos @ planes[:, :3].T - planes[:, 3]).max(axis=1)
+        others = [other for j, other in enumerate(placed) if j != i]
+        if others:
+            outside = np.minimum(outside, distance(others, pos).min(axis=0))
+        found.append(np.clip(outside, 0, None))
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+# ---- how well they fit
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far primitives are from a link's surface [m], where objects touch it, or elsewhere.
+
+    Attributes:
+        mean: Mean distance of the surface's points from the primitives' surface.
+        gap: Largest distance of a point of the surface from the primitives, outside of them.
+        excess: Largest depth of a point of the surface in a primitive, or height of a primitive's point above the surface.
+    """
+
+    mean: float
+    gap: float
+    excess: float
+
+
+def deviations(
+    link: Link, placed: Sequence[Collider], surface: Surface, count: int = 20000, seed: int = 1
+) -> tuple[Deviation, Deviation]:
+    """Measure on points that were not fitted how far primitives are from a surface: where it is touched, and elsewhere."""
+    points = samples(surface, link, count, seed)
+    found = distance(placed, points.pos).min(axis=0)
+    outer = exterior(placed, max(count // len(placed), 500), seed)
+    height = np.asarray(igl.signed_distance(outer, surface.vertices, surface.faces)[0])
+    _, face, nearest = igl.point_mesh_squared_distance(outer, surface.vertices, surface.faces)
+    is_touched = touched(np.asarray(nearest), surface.face_normals[np.asarray(face)], link)
+    made = []
+    for chosen, other in ((points.is_touched, is_touched), (~points.is_touched, ~is_touched)):
+        own, above = found[chosen], height[other].max(initial=0)
+        mean = float(np.abs(own).mean()) if len(own) else 0.0
+        made.append(Deviation(mean, float(own.max(initial=0)), float(max(-own.min(initial=0), above))))
+    return made[0], made[1]
+
+
+def exterior(placed: Sequence[Collider], count: int, seed: int) -> np.ndarray:
+    """Return points of the primitives' surfaces that are inside none of the others [m]."""
+    found = []
+    for i, own in enumerate(placed):
+        if own.type == "box":
+            mesh = trimesh.creation.box(2 * np.array(own.size))
+        elif own.type == "sphere":
+            mesh = trimesh.creation.icosphere(subdivisions=4, radius=own.size[0])
+        else:
+            mesh = trimesh.creation.capsule(2 * own.size[1], own.size[0], count=[48, 48])
+            mesh.apply_translation([0, 0, -mesh.bounds.mean(axis=0)[2]])
+        pos = trimesh.sample.sample_surface(mesh, count, seed=seed)[0]
+        pos = np.concatenate([np.asarray(pos), np.asarray(mesh.vertices)])
+        pos = pos @ Rotation.from_quat(own.quat, scalar_first=True).as_matrix().T + own.pos
+        others = [other for j, other in enumerate(placed) if j != i]
+        found.append(pos[distance(others, pos).min(axis=0) > 0] if others else pos)
+    return np.concatenate(found)
+
+
+# ---- writing
+
+
+HEADER = """\
+# Generated by robots/{folder}/make_colliders.py: run it again to change this. Capsules, spheres and boxes in place of convex
+# hulls of meshes, for `collision: primitive`; metres, quaternions w, x, y, z. Other links meet the `core` ones alone.
+"""
+
+
+def text(placed: Mapping[str, Sequence[Collider]], folder: str) -> str:
+    """Return the primitives of bodies as YAML."""
+    lines = [HEADER.format(folder=folder) + "tgdsl: 1\nbodies:"]
+    for body, own in placed.items():
+        lines.append(f"  {body}:")
+        for part in own:
+            size, pos, quat = (", ".join(_number(v) for v in values) for values in (part.size, part.pos, part.quat))
+            place = f"pos: [{pos}]" + ("" if part.quat[0] == 1.0 else f", quat: [{quat}]")
+            lines.append(f"    - {{type: {part.type}, size: [{size}], {place}{', core: true' if part.is_core else ''}}}")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float) -> str:
+    shown = f"{value:.6f}".rstrip("0").rstrip(".")
+    return "0" if shown in ("-0", "") else shown
+
+
+def meshes(robot: Model) -> dict[str, str]:
+    """Return the mesh of each body that has one which collides."""
+    return {geom.body: geom.mesh for geom in robot.geoms if geom.is_colliding and geom.mesh}
+
+
+def surface_of(robot: Model, mesh: str) -> Surface:
+    """Return the surface of the first link that has a mesh."""
+    body = next(body for body, own in meshes(robot).items() if own == mesh)
+    return robot.surface(robot.touchable(body))
+
+
+def row(name: str, placed: Sequence[Collider], made: Sequence[Deviation]) -> str:
+    """Return a line of the report."""
+    numbers = [[own.mean, own.gap, own.excess] for own in made]
+    shown = "   ".join(" ".join(f"{value / MM:7.2f}" for value in own) for own in numbers)
+    return f"{name:<14} {len(placed):6d}  {shown}"
+
+
+def write(model: Path, links: Mapping[str, Link]) -> None:
+    """Fit the primitives of a hand's links, print how well they fit, and write them beside its model.
+
+    Args:
+        model: The hand's model.
+        links: How the links with each mesh are fitted.
+    """
+    robot = load_model(model)
+    found: dict[str, list[Collider]] = {}
+    print(f"{'mesh':<14} number  touched: mean, gap, excess [mm]  elsewhere")
+    for name, link in links.items():
+        found[name] = fitted(link, surface_of(robot, name))
+        print(row(name, found[name], deviations(link, found[name], surface_of(robot, name))))
+    save(found, robot, model.parent)
+
+
+def save(found: Mapping[str, Sequence[Collider]], robot: Model, folder: Path) -> None:
+    """Write the colliders of the links with each mesh, and those of the left hand, into a folder."""
+    placed = {body: found[mesh] for body, mesh in meshes(robot).items() if mesh in found}
+    mirror = Mirror()
+    others = {mirror.renamed(body): [mirrored(own, mirror) for own in parts] for body, parts in placed.items()}
+    for name, bodies in (("colliders.yaml", placed), ("colliders_left.yaml", others)):
+        (folder / name).write_text(text(bodies, folder.name), encoding="utf-8")
+
+
+def mirrored(own: Collider, mirror: Mirror) -> Collider:
+    """Return the mirror image of a primitive: its frame R is turned to M R M."""
+    x, y, z = (float(value * sign) for value, sign in zip(own.pos, mirror.polar, strict=True))
+    turn = tuple(float(value * sign) for value, sign in zip(own.quat[1:], mirror.axial, strict=True))
+    return replace(own, pos=(x, y, z), quat=(own.quat[0], *turn))  # type: ignore[arg-type]

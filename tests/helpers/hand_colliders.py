@@ -1,0 +1,10 @@
+"""The fit of primitive colliders, `robots/colliders.py`, as a module."""
+
+import importlib
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+sys.path.append(str(ROOT))  # as the hands' scripts have it
+fit = importlib.import_module("robots.colliders")

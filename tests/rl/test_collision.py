@@ -1,0 +1,33 @@
+"""`physics: {collision: primitive}` and the solver's options in a task's document, as the simulation has them."""
+
+from pathlib import Path
+
+import mujoco
+import pytest
+import torch
+
+from tgdsl.errors import SpecError
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+
+TASK = Path(__file__).parents[2] / "examples" / "tasks" / "in_palm_rotate.yaml"
+GIVEN = {"physics.collision": "primitive", "physics.ls_tolerance": 0.05, "physics.iterations": 20, "physics.tolerance": 1e-6}
+
+
+def test_colliders_and_options_reach_the_simulation():
+    env = TouchEnv(TASK, 2, overrides=GIVEN | {"touch": "none"}, threads=1)
+    model = env.sim.model
+    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    assert is_mesh.any() and not model.geom_contype[is_mesh].any() and not model.geom_conaffinity[is_mesh].any()
+    assert (model.opt.ls_tolerance, model.opt.iterations, model.opt.tolerance) == (0.05, 20, 1e-6)
+    for _ in range(20):
+        made = env.step(torch.zeros(2, env.num_actions))
+    assert not made.info.faults.any()
+    contacts = env.sim.env_model(0).geom("tgdsl/right_hand_link/collider/0").contype[0]
+    assert contacts  # the palm's core
+    env.close()
+
+
+def test_a_word_that_is_none_is_told_at_its_place():
+    with pytest.raises(SpecError, match=r"physics\.collision"):
+        load_task(TASK, {"physics.collision": "capsule"})

@@ -1,0 +1,36 @@
+"""Sound from MuJoCo Warp and from MuJoCo: joints and places at each physics step of a control step."""
+
+import torch
+from warp_cases import SCENE, warp
+
+import tgdsl
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.batch.simulation import BatchSimulation
+
+
+def test_motors_and_a_microphone_in_both_simulators(tmp_path):
+    """Two arms in motion, heard on one of them and in the room, to a thousandth of the loudest after 30 control steps."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    block = {"samples": 20, "substeps": 3}
+    document = {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "scene.xml")},
+        "sensors": {
+            "motors": {"kind": "actuation_audio", **block, "friction": 0.0, "pitch": 50.0},
+            "ear": {"kind": "microphone", "body": "pad", "pos": [0.02, 0, 0.3]},
+            "room": {"kind": "microphone", "pos": [0, 0.5, 0.5]},
+        },
+    }
+    plan = tgdsl.compile(document).plan
+    control, readings = torch.tensor([0.6, -0.3]), []
+    for simulator in (warp, BatchSimulation):
+        touch = TactileModule(plan)
+        sim, blocks = simulator(touch, 2, substeps=3), []
+        for _ in range(30):
+            sim.step(control)
+            blocks.append(touch(sim.state()))
+        readings.append({name: torch.cat([own[name] for own in blocks], dim=1) for name in ("motors", "ear", "room")})
+    for name, expected in readings[1].items():
+        assert expected.shape[1] == 30 * 60 and expected.abs().max() > 1e-4
+        error = (readings[0][name] - expected).abs().amax() / expected.abs().amax()
+        assert error < 1e-3, f"{name} differs by {error:.1e}"

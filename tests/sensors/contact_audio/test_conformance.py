@@ -1,0 +1,110 @@
+"""The suite that every kind passes, for samples and bands, links and objects, and the paper's response."""
+
+import pytest
+import torch
+
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+from tgdsl.testing import SCENE, KindConformance, assert_agrees
+
+MODES = [
+    {"frequency": 310.0, "decay": 12.0, "gain": 2.0},
+    {"frequency": 845.0, "decay": 40.0, "gain": -1.0},
+    {"frequency": 1520.0, "decay": 90.0, "gain": 0.5},
+]
+COMMON = {"modes": MODES, "timestep": 0.002, "samples": 8, "scrape": 0.05, "settling": 0.02}
+
+
+class TestSamples(KindConformance):
+    kind = CONTACT_AUDIO
+    parameters = COMMON
+    gates = ()
+    num_steps = 4
+    is_differentiable = False
+    float64_tolerance = 1e-6  # the cosines of normal numbers are series
+
+    def test_something_is_felt(self, scene):
+        """Every body of the suite's states is scraped; none is silent."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        assert all((module(state)["s"] != 0).any(dim=1).all() for state in self.states(module))
+
+    def test_no_contact_gives_the_rest_value(self, scene):
+        """Without contact it is silent from the start."""
+        module, _ = self.build(self.document(scene), torch.float32)
+        state = module.example_state(4)
+        for name in ("contact_found", "contact_pos", "contact_force", "contact_normal", "contact_netforce"):
+            for part in (state, *state.substeps):
+                setattr(part, name, torch.zeros_like(getattr(part, name)))
+        for _ in range(3):
+            assert (module(state)["s"] == 0).all()
+
+    def test_a_broken_pose_is_seen(self, scene):
+        """A force that is none, or a velocity, comes out as not-a-number."""
+        for name in ("contact_force", *(["body_linvel"] if self.parameters["scrape"] else [])):
+            module, _ = self.build(self.document(scene), torch.float32)
+            state = module.example_state(2)
+            getattr(state, name)[1] = torch.nan
+            readings = module(state)["s"]
+            assert not readings[0].isnan().any()
+            assert readings[1].isnan().any()
+
+
+class TestWithoutNoise(TestSamples):
+    parameters = {**COMMON, "scrape": 0.0}
+    float64_tolerance = KindConformance.float64_tolerance
+    test_compiled_equals_eager = None  # its graph is part of one that is compiled beside it
+
+    def test_something_is_felt(self, scene):
+        """The first load is steady; what the next ones add strikes once it no longer grows."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        readings = [module(state)["s"] for state in self.states(module)]
+        assert (readings[0] == 0).all()
+        assert 0.3 < (readings[-1] != 0).any(dim=1).double().mean() <= 1
+
+
+class TestOfObjects(TestSamples):
+    parameters = {**COMMON, "of": "object", "bodies": {"floor": [{"frequency": 1000.0, "decay": 5.0}]}}
+    test_compiled_equals_eager = None
+
+
+class TestBands(TestSamples):
+    parameters = {**COMMON, "outputs": "bands"}
+
+    def test_something_is_felt(self, scene):
+        """310, 845 and 1520 Hz are in the third octaves of 316, 794 and 1585 Hz, and those between are empty."""
+        module, _ = self.build(self.document(scene), torch.float64)
+        assert module.outputs[0].channels == tuple(f"band_{f}" for f in (316, 398, 501, 631, 794, 1000, 1259, 1585))
+        for state in self.states(module):
+            assert ((module(state)["s"] > 0).all(dim=(0, 1, 2)).tolist()) == [True, *[False] * 3, True, *[False] * 2, True]
+
+
+class TestLevels(TestSamples):
+    parameters = {**COMMON, "outputs": "bands", "scale": "decibel"}
+    test_compiled_equals_eager = None
+    test_something_is_felt = TestBands.test_something_is_felt
+
+
+class TestSubsteps(TestSamples):
+    parameters = {**COMMON, "substeps": 3}
+    num_steps = 2
+
+
+class TestPaper(TestSamples):
+    parameters = {**COMMON, "model": "paper"}
+    test_compiled_equals_eager = None
+
+
+@pytest.mark.parametrize("other", [1e-3, 3.1e-3])
+def test_another_time_step_is_the_references_too(tmp_path, other):
+    """Matrices are made anew when calls come faster or slower than was compiled for, and again when they do as before."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    suite = TestWithoutNoise()
+    module, reference = suite.build(suite.document(tmp_path / "scene.xml"), torch.float64)
+    for i, (step, seed) in enumerate([(0.002, 0), (other, 1), (other, 2), (0.002, 3)]):
+        state = module.example_state(3, seed=seed)
+        state.dt = step
+        if i == 1:
+            with pytest.warns(UserWarning, match=rf"compiled for 1 steps of 0.002 s per call.* counts steps of {other:g} s"):
+                found = module(state)["s"]
+        else:
+            found = module(state)["s"]
+        assert_agrees(found, reference, state, 1e-12)

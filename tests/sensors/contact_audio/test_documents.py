@@ -1,0 +1,159 @@
+"""What documents may say of contact audio, and what is wrong with them: places, names, and what would be right."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from struck_plate import MODES, plate, plate_document, pressed
+
+import tgdsl
+from tgdsl.errors import SimulationError, SpecError
+from tgdsl.modal.modes import Modes
+from tgdsl.sensors.contact_audio import given_modes
+
+HIGH = [{"frequency": 30000.0, "decay": 10.0}, {"frequency": 40000.0, "decay": 10.0}]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            {"modes": HIGH},
+            'sensors.s.samples: the lowest mode of "plate" is at 30000 Hz, and 16 samples of a step of 0.001 s hold 7200 Hz; '
+            "it needs `samples: 67`",
+        ),
+        ({"bodies": {"lid": MODES}}, 'sensors.s.bodies: `bodies`: no link of the sensor matches "lid"; it has plate'),
+        ({"scale": "decibel"}, "`scale` is used by `outputs: bands` alone, expected it to be left out"),
+        ({"modes": []}, "sensors.s.modes: found a list of 0, expected at least 1 entry"),
+        ({"modes": [{"frequency": 100, "decay": 0}]}, "0 is out of range, expected more than 0"),
+        ({"modes": [{"frequency": "100 kg", "decay": 1}]}, '"kg" is not a unit of frequency'),
+        ({"modes": "stel"}, 'did you mean "steel"?'),
+        ({"settling": 0}, "0 is out of range, expected more than 0"),
+        ({"rate": 100}, "this sensor reads a block of samples at each call; leave `rate` out"),
+        ({"history": 3}, "this sensor reads a block of samples at each call; leave `history` out"),
+        ({"noise": {"white_noise": 1e-3}}, '"contact_audio" has no knob "white_noise"'),
+    ],
+)
+def test_mistakes_are_named_where_they_are(tmp_path, given, message):
+    with pytest.raises(SpecError) as caught:
+        plate(tmp_path, **given)
+    assert message in str(caught.value)
+
+
+def test_the_number_of_samples_that_is_named_suffices(tmp_path):
+    with pytest.warns(UserWarning, match="plate: a mode is left out, 40000 Hz: the sample rate is 67000 Hz"):
+        touch = plate(tmp_path, modes=HIGH, samples=67)
+    assert touch.outputs[0].shape == (67, 1, 1)
+    with pytest.raises(SpecError, match="samples: 67"):
+        plate(tmp_path, modes=HIGH, samples=66)
+
+
+def test_modes_that_are_not_heard_are_dropped_by_name(tmp_path):
+    """They are warned of, an account lists them, and the sound is that of the others."""
+    with pytest.warns(UserWarning, match="contact audio of plate: a mode is left out, 2903 Hz: the sample rate is 6000 Hz"):
+        touch = plate(tmp_path, samples=6, scrape=0)
+    fewer = plate(tmp_path, samples=6, scrape=0, modes=MODES[:2])
+    assert "plate: a mode is left out, 2903 Hz" in touch.explain()
+    assert "6 samples per step of 0.001 s: 6000 Hz" in touch.explain()
+    for force in (0.0, 2.0, 0.0, 0.0):
+        state = pressed(touch, [force])
+        torch.testing.assert_close(touch(state)["s"], fewer(state)["s"], rtol=0, atol=0)
+
+
+def test_bodies_have_modes_of_their_own(tmp_path):
+    """By name or wildcard; the first that matches counts."""
+    own = {"oth*": MODES[:1], "*": MODES[1:]}
+    touch = plate(tmp_path, links=["plate", "other"], bodies=own)
+    frequency = touch.plan.sensors[0].constants["frequency"]
+    np.testing.assert_array_equal(frequency, [[1171.0, 2903.0], [523.0, 0.0]])
+
+
+@pytest.mark.parametrize("of", ["link", "object"])
+def test_a_shape_is_analysed_in_its_bodys_frame(tmp_path, monkeypatch, of):
+    """Modal analysis gets the surface of what rings, and up to where modes are heard."""
+    asked = []
+
+    def analysed(name, surface, given, below):
+        asked.append((name, np.ptp(surface.vertices, axis=0).round(6).tolist(), given.material.name, below))
+        return Modes(np.array([700.0]), np.array([3.0]), np.array([1.0]))
+
+    monkeypatch.setattr(given_modes, "analysed", analysed)
+    touch = plate(tmp_path, modes="steel", of=of)
+    assert touch.plan.sensors[0].constants["frequency"].tolist() == [[700.0]]
+    size = [0.2, 0.2, 0.01] if of == "link" else [0.02, 0.02, 0.02]
+    assert asked == [("plate" if of == "link" else "ball", size, "steel", pytest.approx(7200.0))]
+
+
+def test_the_time_step_is_the_scenes_unless_it_is_given(tmp_path):
+    scene, own = plate(tmp_path), plate(tmp_path, timestep="4 ms", samples=32)
+    assert (scene.inputs.dt, own.inputs.dt) == (0.001, 0.004)
+    assert (scene.example_state(1).dt, own.example_state(1).dt) == (0.001, 0.004)
+
+
+def test_a_simulation_of_other_substeps_is_refused_or_warned_of(tmp_path):
+    touch = plate(tmp_path, substeps=5)
+    with pytest.raises(SimulationError, match="simulate with substeps=5"):
+        tgdsl.simulate(touch, 1, substeps=2).step()
+    once = plate(tmp_path)
+    sim = tgdsl.simulate(once, 1, substeps=4)
+    sim.step()
+    with pytest.warns(UserWarning, match=r'"s" is compiled for 1 steps of 0.001 s per call, and the state\'s dt is 0.004 s'):
+        once(sim.state())
+
+
+def test_an_artefact_sounds_as_what_was_compiled(tmp_path):
+    touch = plate(tmp_path)
+    tgdsl.save(touch, tmp_path / "plate.safetensors")
+    again = tgdsl.load(tmp_path / "plate.safetensors", dtype=torch.float64)
+    for force in (0.0, 3.0, 1.0, 0.0):
+        state = pressed(touch, [force, 2 * force], 0.2)
+        assert torch.equal(touch(state)["s"], again(state)["s"])
+
+
+def test_some_environments_are_read_alone(tmp_path):
+    """A mask reads and strikes those alone; the others go on where they were."""
+    touch, whole = plate(tmp_path), plate(tmp_path)
+    states = [pressed(touch, [force] * 3, 0.2) for force in (0.0, 3.0, 1.0, 0.5)]
+    for state in states[:2]:
+        touch(state), whole(state)
+    before = touch(states[2])["s"].clone()
+    mask = torch.tensor([False, True, False])
+    some = touch(states[3], mask=mask)["s"]
+    whole(states[2])
+    expected = whole(states[3])["s"]
+    assert torch.equal(some[[0, 2]], before[[0, 2]])
+    torch.testing.assert_close(some[1], expected[1], rtol=0, atol=1e-15)
+
+
+def test_a_policy_observes_bands(tmp_path):
+    document = plate_document(tmp_path, outputs="bands", scale="decibel", substeps=2)
+    document["observations"] = {"policy": [{"type": "reading", "of": "s"}]}
+    touch = tgdsl.compile(document)
+    state = touch.example_state(3)
+    assert touch.observe(touch(state))["policy"].shape == (3, 2 * len(touch.outputs[0].channels))
+
+
+def test_alike_objects_that_share_a_body_strike_a_link_once(tmp_path):
+    """Two objects of one body: their force is one to the link, and each of them rings itself."""
+    document = plate_document(tmp_path, scrape=0)
+    document["objects"]["same"] = {"body": "ball"}
+    document["sensors"]["s"]["feels"] = ["ball", "same"]
+    both, one = tgdsl.compile(document, dtype=torch.float64), plate(tmp_path, scrape=0)
+    heard = []
+    for touch in (one, both):
+        states = [pressed(touch, [force]) for force in (0.0, 3.0, 0.0)]
+        for i, state in enumerate(states):
+            fields = {
+                name: getattr(state, name)[:, :1].expand(-1, len(touch.inputs.pairs), *[-1] * rest)
+                for name, rest in (
+                    ("contact_force", 2),
+                    ("contact_normal", 2),
+                    ("contact_pos", 2),
+                    ("contact_netforce", 1),
+                    ("contact_found", 0),
+                )
+            }
+            states[i] = dataclasses.replace(state, **fields)
+        heard.append([touch(state)["s"] for state in states][-1])
+    torch.testing.assert_close(heard[1], heard[0], rtol=0, atol=1e-15)

@@ -1,0 +1,99 @@
+"""What strikes: impulses of collisions, however many steps they take, and the noise of sliding."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from held import assert_holds
+from struck_plate import STEP, plate, pressed, sound
+
+from tgdsl.report.oracles import sound as oracles
+from tgdsl.report.oracles.setups.sounds import half_sine, struck
+
+MODE = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}]
+
+
+@pytest.mark.parametrize("duration", [0.0005, 0.001, 0.002, 0.004])
+def test_a_collision_strikes_once_with_its_impulse_whatever_the_number_of_steps(duration):
+    """0.02 N·s in one step to 16 steps: within the share T/τ of it, and alike for all steps."""
+    found = oracles.collision(duration)
+    assert_holds(found)
+    assert max(found.ours) / min(found.ours) - 1 < 1.1 * duration / 0.02
+
+
+def test_twice_the_force_sounds_twice_as_loud(tmp_path):
+    one, two = (sound(plate(tmp_path, scrape=0), np.array(half_sine(0.003, STEP)) * k) for k in (1, 2))
+    np.testing.assert_allclose(two, 2 * one, rtol=0, atol=1e-12 * abs(one).max())
+
+
+def test_a_steady_load_makes_no_sound(tmp_path):
+    """Neither one that is there when an episode begins, nor one that has settled, nor one that lets go."""
+    found = sound(plate(tmp_path, scrape=0), [5.0, *[5.0] * 20, *[0.0] * 20])
+    assert not found.any()
+
+
+@pytest.mark.parametrize("rate", [20.0, 200.0])
+def test_a_slow_load_hardly_sounds(tmp_path, rate):
+    """A load that rises for 0.3 s strikes once it no longer rises, with R τ²; as a blow of a step ΔF it would with ΔF Δt."""
+    loads = np.minimum(np.arange(400) * STEP, 0.3) * rate
+    impulse, last = struck(plate(tmp_path, modes=MODE, scrape=0), loads, MODE[0]["decay"])
+    assert impulse == pytest.approx(rate * 0.02**2, rel=0.1)
+    assert 300 <= last <= 303
+
+
+def test_the_next_collision_is_heard_for_itself(tmp_path):
+    """A ball that bounces: two blows 30 ms apart, on a plate that carries another load throughout."""
+    touch = plate(tmp_path, modes=MODE, samples=16, scrape=0)
+    forces = np.full(80, 2.0)
+    forces[10] += 8.0
+    forces[40] += 4.0
+    found = sound(touch, forces)[0]
+    time = np.arange(1, len(found) + 1) * STEP / 16
+    waves = [
+        j * np.exp(-10 * np.maximum(time - t, 0)) * np.sin(2000 * math.pi * (time - t)) * (time >= t)
+        for j, t in ((8e-3, 11e-3), (4e-3, 41e-3))
+    ]
+    np.testing.assert_allclose(found, sum(waves), rtol=0, atol=1e-12)
+
+
+def test_the_level_of_scraping_is_as_the_equation_says():
+    """The mean square of the samples is g² m_s F v/(4d): 10 dB for ten times the force or ten times the speed."""
+    found = oracles.scraping()
+    assert_holds(found)
+    np.testing.assert_allclose(10 * np.log10(found.ours[1:] / found.ours[0]), 10, atol=1e-9)
+
+
+def test_the_spectrum_of_scraping_is_that_of_the_modes(tmp_path):
+    """The noise itself is white: two modes of the same decay and gain are as loud, a low one and one near the end."""
+    modes = [{"frequency": f, "decay": 300.0, "gain": 1.0} for f in (400.0, 4100.0)]
+    touch = plate(tmp_path, modes=modes, samples=10, scrape=1e-3)
+    heard = sound(touch, np.full((90, 400), 1.0), 0.5)[:, 300:]
+    spectrum = (np.abs(np.fft.rfft(heard * np.hanning(heard.shape[1]), axis=1)) ** 2).mean(axis=0)
+    frequency = np.fft.rfftfreq(heard.shape[1], STEP / 10)
+    low, high = (spectrum[abs(frequency - mode["frequency"]) < 150].sum() for mode in modes)
+    assert 0.85 < low / high < 1.18
+
+
+def test_environments_scrape_differently_and_whatever_their_number(tmp_path):
+    """Counted random numbers: those of an environment do not depend on how many there are; a seed gives the same again."""
+    force = np.full((5, 4), 2.0)
+    four, two, again, other = (
+        sound(plate(tmp_path).seed(seed), force[:, :count], 0.3) for seed, count in ((7, 4), (7, 2), (7, 4), (8, 4))
+    )
+    np.testing.assert_array_equal(four, again)
+    np.testing.assert_allclose(four[:2], two, rtol=0, atol=1e-15)
+    correlation = np.corrcoef(np.concatenate([four, other]))
+    assert abs(correlation - np.eye(8)).max() < 0.9
+
+
+def test_two_links_or_objects_are_struck_apart(tmp_path):
+    """The other plate is silent; of objects the ball rings, whichever plate it strikes."""
+    touch = plate(tmp_path, links=["plate", "other"], modes=MODE, scrape=0)
+    heard = torch.cat([touch(pressed(touch, [f]))["s"] for f in (0.0, 3.0, 0.0)], dim=1)[0, :, :, 0]
+    assert touch.rows["s"]["body"].tolist() == ["plate", "other"]
+    assert heard[:, 0].any() and not heard[:, 1].any()
+    rung = plate(tmp_path, of="object", links=["plate", "other"], modes=MODE, scrape=0)
+    again = torch.cat([rung(pressed(rung, [f]))["s"] for f in (0.0, 3.0, 0.0)], dim=1)[0, :, :, 0]
+    assert rung.rows["s"]["object"].tolist() == ["ball"]
+    torch.testing.assert_close(again[:, 0], heard[:, 0], rtol=0, atol=0)

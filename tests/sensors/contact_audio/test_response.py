@@ -1,0 +1,111 @@
+"""What an impulse sounds like: closed forms, over a long time, for any number of samples, and in third octaves."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from held import assert_holds
+from struck_plate import STEP, energy, plate, pressed, sound
+
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.loads import Loads, PairLoads
+from tgdsl.quantities.places import Places
+from tgdsl.report.oracles import sound as oracles
+from tgdsl.sensors.base import Context
+from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+from tgdsl.sensors.contact_audio.operators import operators
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_an_impulse_rings_as_damped_sines(dtype):
+    """J Σ g e^(−dt) sin 2πft from the impulse on, and nothing at all before."""
+    assert_holds(oracles.ring_down(dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_million_samples(dtype):
+    """Two modes that ring for all of it, by blocks of 2500 samples through the module."""
+    found = oracles.million_samples(dtype)
+    assert found.exact.shape == (1_000_000,)
+    assert_holds(found)
+
+
+def test_a_mode_is_as_loud_as_the_impulse_at_every_frequency_and_rate():
+    """The paper's is 1/sin θ as loud: at 50 Hz and 40 kHz by 127 times."""
+    found = oracles.response_by_frequency()
+    assert_holds(found)
+    theta = 2 * np.pi * found.over.numbers / np.array([[1e4], [4e4]])
+    np.testing.assert_allclose(found.paper, 1 / np.sin(theta), rtol=1e-9)
+
+
+def test_roundings_do_not_add_up():
+    """20,000 blocks of a mode that hardly decays, in float32: one rounded factor would be off by 5e-4 by then."""
+    frequency, decay, step, samples = 3333.3, 1e-3, 1e-3, 20
+    table = {"frequency": frequency, "decay": decay, "gain": 1.0}
+    constants = {name: np.array([[value]]) for name, value in table.items()}
+    constants |= {"samples": np.array(samples), "settling": np.array(0.02), "scrape": np.array(0.0)}
+    load = {name: torch.zeros(1, 1, 1) for name in ("steady", "pending")}
+    own = {name: torch.from_numpy(np.asarray(value)).float() for name, value in operators(constants, step).items()}
+    state, force, found = {"phasors": torch.tensor([[[1.0, 0.0]]]), **load}, torch.zeros(1, 1, 1), []
+    for count in range(20_000):
+        context = Context(torch.tensor(step), torch.tensor([[count]]), 0, torch.tensor([[1.0]]), torch.tensor([[False]]))
+        gathered = Gathered({Loads: PairLoads(force, force, None), Places: (torch.zeros(1, 3),)})
+        read, state = CONTACT_AUDIO.forward(gathered, context, own, state)
+        found.append(read["signal"].flatten())
+    heard = torch.cat(found).double().numpy()
+    time = np.arange(1, len(heard) + 1) * step / samples
+    assert abs(heard - np.exp(-decay * time) * np.sin(2 * math.pi * frequency * time)).max() < 3e-5
+
+
+def test_energy_never_grows_unless_struck(tmp_path):
+    """Of float32 phasors too, down to where they are flushed to zero."""
+    modes = [{"frequency": f, "decay": d} for f, d in ((50.0, 40.0), (499.9, 50.0), (500.0, 80.0), (3000.0, 400.0))]
+    touch = plate(tmp_path, torch.float32, modes=modes, samples=8, scrape=0)
+    sound(touch, oracles.STRIKE)
+    silent, held = pressed(touch, [0.0]), [energy(touch)]
+    while held[-1] > 0 and len(held) < 900:
+        touch(silent)
+        held.append(energy(touch))
+    assert all(after < before for before, after in itertools.pairwise(held))
+    assert held[-1] == 0 and held[-2] < 1e-22
+
+
+@pytest.mark.parametrize("samples", [7, 10, 40])
+def test_samples_at_common_times_are_the_same_for_all_numbers_of_samples(samples):
+    """Struck and scraped: what 20 samples and another number have in common."""
+    assert_holds(oracles.common_times(samples))
+
+
+def test_calls_of_several_steps_sound_as_calls_of_one(tmp_path):
+    """The blocks of all physics steps come together, and the noise is that of the physics step."""
+    forces = np.abs(np.cos(np.arange(12))) * 2
+    expected = sound(plate(tmp_path, samples=10), forces, 0.2)
+    touch = plate(tmp_path, samples=10, substeps=4)
+    states = [pressed(touch, [f], 0.2) for f in forces.tolist()]
+    found = []
+    for i in range(0, 12, 4):
+        *earlier, last = states[i : i + 4]
+        last.substeps, last.dt = tuple(earlier), 4 * STEP
+        found.append(touch(last)["s"][0, :, 0, 0])
+    np.testing.assert_allclose(torch.cat(found).numpy()[None], expected, rtol=0, atol=1e-15)
+
+
+def test_the_papers_response_is_as_printed():
+    """y[k] = r^k sin((k+1)θ)/sin θ times the rise of the force, from the first sample of the step of the rise on."""
+    assert_holds(oracles.two_pole({"frequency": 1171.0, "decay": 20.0, "gain": 1.0}))
+
+
+def test_bands_are_the_mean_squares_of_modes(tmp_path):
+    """½ (g J)² e^(−2dt) at the end of each step, 523 Hz in that of 501, 1171 in 1259, 2903 in 3162."""
+    touch = plate(tmp_path, outputs="bands", samples=16, scrape=0)
+    assert touch.outputs[0].shape == (1, 1, 9) and touch.outputs[0].units == ("m²/s²",) * 9
+    assert_holds(oracles.bands())
+
+
+def test_levels_are_in_decibels(tmp_path):
+    linear, level = (plate(tmp_path, outputs="bands", scrape=0, scale=scale) for scale in ("linear", "decibel"))
+    read = [[touch(pressed(touch, [force]))["s"] for force in oracles.STRIKE][-1] for touch in (linear, level)]
+    torch.testing.assert_close(read[1], 10 * torch.log10(1 + read[0] / 1e-12), rtol=1e-12, atol=0)
+    assert level.outputs[0].units == ("dB",) * 9

@@ -1,0 +1,177 @@
+"""What a microphone hears of sources at rest and in motion, against closed forms, in a simulation."""
+
+import numpy as np
+import pytest
+import torch
+from held import assert_holds
+
+import tgdsl
+from tests.helpers.tone import TONE
+from tgdsl.errors import SpecError
+from tgdsl.report.oracles import hearing as oracles
+from tgdsl.report.oracles.setups.listening import RATE, SCENE, heard, listening
+
+
+@pytest.fixture
+def build(tmp_path):
+    def compiled(mic=None, tone=None, dtype="float64", **sensors):
+        return listening(tmp_path, mic, tone, dtype, **sensors)
+
+    return compiled
+
+
+@pytest.mark.parametrize("falloff", [1.0, 2.0, 0.5])
+def test_level_is_that_of_the_inverse_law(falloff):
+    """To 1e-3, from 25 cm to 8 m: the amplitude of a tone is 1/r^p."""
+    assert_holds(oracles.level(falloff))
+
+
+def test_nearer_than_nearest_it_gets_no_louder():
+    assert_holds(oracles.nearest())
+
+
+@pytest.mark.parametrize("frequency", [400.0, 3000.0, 7000.0])
+def test_delay_is_that_of_the_distance(frequency):
+    """To 1/20 of a sample: the phase of a tone is that of r/c, at distances of no whole number of samples."""
+    assert_holds(oracles.delay(frequency))
+
+
+def test_a_pulse_arrives_when_sound_does():
+    """The centre of a band-limited pulse is r/c after it, to 1/20 of a sample, and nothing is heard long before."""
+    assert_holds(oracles.pulse())
+
+
+def test_doppler_shift():
+    """f′ − f to 1 %: f/(1 + v/c) of a source that moves away with v, f (1 − v/c) of a microphone that does."""
+    assert_holds(oracles.doppler())
+
+
+def test_of_both_in_motion_the_shift_is_the_product():
+    assert_holds(oracles.doppler_of_both())
+
+
+def test_a_source_that_flies_by_is_heard_without_a_jump(build):
+    """At 30 m/s and 30 cm: successive samples of a low tone differ by no more than its slope and level allow."""
+    touch = build(tone={"frequency": 200.0})
+    samples = heard(touch, 200, source=(-3.0, 0.3, 0), speeds=(30.0, 0.0))
+    assert np.abs(np.diff(samples)).max() < 1.3 * (2 * np.pi * 200.0 * 1.1 / RATE) / 0.3
+
+
+def test_sounds_add_up():
+    """Two sensors, one of two rows: what is heard of all is the sum of what is heard of each."""
+    assert_holds(oracles.two_sensors())
+
+
+def test_blocks_of_substeps_are_those_of_single_steps(build):
+    found = []
+    for substeps in (1, 4):
+        touch = build(tone={"substeps": substeps})
+        sim = tgdsl.simulate(touch, 1, substeps=substeps)
+        sim.qpos[0, 0], sim.qvel[0, 0], sim.qvel[0, 6] = 0.7, 9.0, -4.0
+        sim.forward()
+        blocks = [touch(sim.state())["mic"]]
+        for _ in range(40 // substeps):
+            sim.step()
+            blocks.append(touch(sim.state())["mic"])
+        found.append(torch.cat(blocks[1:], dim=1)[0, :, 0, 0].numpy())
+    assert np.abs(found[0]).max() > 1
+    np.testing.assert_allclose(found[1], found[0], atol=1e-12)
+
+
+def test_after_a_reset_what_was_on_its_way_is_gone(build):
+    touch = build()
+    sim = tgdsl.simulate(touch, 3)
+    for _ in range(30):
+        sim.qpos[:, 0] = 2.0
+        sim.step()
+        before = touch(sim.state())["mic"]
+    sim.reset([1], qpos=sim.qpos[[1]])
+    state = sim.state()
+    after = touch(state, env_ids=[1])["mic"]
+    assert torch.equal(after[[0, 2]], before[[0, 2]]) and before.abs().amin(dim=0).max() > 0
+    assert (after[1] == 0).all()
+    sim.step()
+    after = touch(sim.state())["mic"]
+    assert (after[1] == 0).all() and (after[[0, 2]].abs().amax(dim=1) > 0.1).all()
+
+
+def test_what_is_beyond_reach_is_not_heard_and_warned_of_once(build):
+    touch = build({"reach": 2.0})
+    with pytest.warns(UserWarning, match=r'"mic" does not hear tone\[0\]: it was farther than `reach`, 2 m') as said:
+        samples = heard(touch, 30, source=(2.5, 0, 0))
+    assert (samples == 0).all() and len(said) == 1
+    touch.free()
+    assert np.abs(heard(touch, 30, source=(1.9, 0, 0))).max() > 0.4
+
+
+def test_a_jump_without_a_reset_is_heard_as_one_and_nothing_lasts(build):
+    """A body that is put elsewhere is faster than sound for a step: what is heard stays finite, and is right afterwards."""
+    touch = build()
+    sim = tgdsl.simulate(touch, 1)
+    sim.qpos[0, 0] = 1.0
+    for k in range(90):
+        if k == 40:
+            sim.qpos[0, 0] = 4.0
+        sim.step()
+        samples = touch(sim.state())["mic"][0, :, 0, 0]
+        assert torch.isfinite(samples).all()
+    assert samples.square().mean().mul(2).sqrt() == pytest.approx(0.25, rel=1e-2)
+
+
+def test_single_precision_hears_the_same_for_long(build):
+    """A kilometre from the origin: samples as the float64 module has them, to what the time of a float32 clock is worth."""
+    found = [
+        heard(
+            build(dtype=dtype, tone={"frequency": 200.0}),
+            200,
+            source=(1000.0, 0, 0),
+            listener=(1001.3, 0.2, 0),
+            speeds=(2.0, 0.0),
+        )[-400:]
+        for dtype in ("float64", "float32")
+    ]
+    assert np.abs(found[0]).max() > 0.5
+    np.testing.assert_allclose(found[1], found[0], atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("mic", "message"),
+    [
+        ({"hears": ["knock"]}, r'sensors\.mic\.hears\[0\]: unknown sensor "knock"'),
+        ({"hears": ["tone", "tone"]}, r'sensors\.mic\.hears\[1\]: sensor "tone" is listed twice'),
+        (
+            {"hears": ["mic"]},
+            r'sensors\.mic\.hears\[0\]: "mic" \(microphone\) makes no sound, as it is written; those that do: tone',
+        ),
+        ({"levels": {"ton": 2.0}}, r'sensors\.mic\.levels: it does not hear "ton"; did you mean "tone"'),
+        ({"body": "c"}, r'sensors\.mic\.body: the scene has no body "c"'),
+        ({"body": None}, r"expected `pos`, in the world, or `body`, or both"),
+        ({"nearest": 12.0}, r"nearest 12 m is not below reach 10 m"),
+        ({"history": 3}, r"sensors\.mic\.history: this sensor reads a block of samples"),
+    ],
+)
+def test_mistakes_are_located(build, mic, message):
+    with pytest.raises(SpecError, match=message):
+        build(mic)
+
+
+def test_sources_are_of_one_rate(build):
+    other = {"kind": "tone", "links": "b", "samples": 10}
+    with pytest.raises(SpecError, match=r'sensors\.mic\.hears: "other" makes 10 samples per physics step, "tone" 20'):
+        build(other=other)
+
+
+def test_without_sources_there_is_nothing_to_hear(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    sensors = {"mic": {"kind": "microphone", "pos": [0, 0, 0]}}
+    with pytest.raises(SpecError, match=r"sensors\.mic: no sensor of the document makes sound"):
+        tgdsl.compile({"tgdsl": 1, "robot": {"model": str(tmp_path / "scene.xml")}, "sensors": sensors})
+
+
+def test_a_chosen_microphone_brings_what_it_hears(tmp_path, build):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    tones = {name: {"kind": "tone", "links": link} for name, link in (("one", "a"), ("two", "b"))}
+    sensors = {"mic": {"kind": "microphone", "body": "b", "hears": ["two"]}, **tones}
+    document = {"tgdsl": 1, "robot": {"model": str(tmp_path / "scene.xml")}, "sensors": sensors}
+    touch = tgdsl.compile(document, kinds=[TONE], sensors=["mic"])
+    assert [output.name for output in touch.outputs] == ["mic", "two"]

@@ -1,0 +1,142 @@
+"""Where temperatures meet the rest: turned and far away, steps of other lengths, some environments alone, a look, samples."""
+
+import numpy as np
+import pytest
+import torch
+from heat_scenes import begin, cells_of, face_contacts, heat_module, heat_state
+from scipy.spatial.transform import Rotation
+
+TIP = {"tip": [0.012, 0.01, 0.02]}
+SENSOR = {"cells": [2, 3, 2], "material": "steel", "convection": 20.0, "lag": 0.3}
+OBJECTS = {
+    "ball": ([0.02] * 3, {"material": "copper", "temperature": 45.0, "cells": [2, 2, 1]}),
+    "chip": ([0.01] * 3, {"material": "wood", "temperature": -5.0}),
+}
+CONTACTS = {
+    ("tip", "ball"): face_contacts([0.006, 0.004], -0.01),
+    ("tip", "chip"): [((0.006, 0.001, 0.003), (-1, 0, 0), 2.0)],
+}
+
+
+def touching(module, dt=0.05, num_envs=1):
+    """Return a state in which the tip stands on the ball, and the chip leans on it."""
+    state = heat_state(module, dt, CONTACTS, num_envs)
+    state.body_pos[:, module.inputs.bodies.index("ball"), 2] = -0.02
+    return state
+
+
+def turned(state, degrees, shift):
+    """Return a scene that is pitched and carried elsewhere as a whole."""
+    rotation = Rotation.from_euler("y", degrees, degrees=True)
+    matrix, shift = torch.from_numpy(rotation.as_matrix()), torch.tensor(shift, dtype=torch.float64)
+    for name in ("body_pos", "contact_pos"):
+        setattr(state, name, getattr(state, name) @ matrix.T + shift)
+    for name in ("contact_force", "contact_normal", "contact_netforce"):
+        setattr(state, name, getattr(state, name) @ matrix.T)
+    state.body_quat[:] = torch.from_numpy(np.roll(rotation.as_quat(), 1))
+    return state
+
+
+def read(module, state, num=20):
+    with torch.no_grad():
+        for _ in range(num):
+            readings = module(state)
+    return {name: value.clone() for name, value in readings.items()}
+
+
+@pytest.mark.parametrize(("dtype", "shift", "tolerance"), [(torch.float64, 50.0, 1e-9), (torch.float32, 0.3, 1e-3)])
+def test_a_pitched_link_equals_an_upright_one(tmp_path, dtype, shift, tolerance):
+    """By 110°, and elsewhere. Of positions in float32 what they are rounded to counts: 3e-8 m of cells of 5 mm."""
+    module = heat_module(tmp_path, TIP, SENSOR, OBJECTS, dtype)
+    upright = read(module, touching(module).to("cpu", dtype))
+    module.reset()
+    pitched = read(module, turned(touching(module), 110.0, [shift, -shift, shift]).to("cpu", dtype))
+    assert float(upright["heat"].max() - upright["heat"].min()) > 1.0
+    for name in ("heat", "heat/objects"):
+        torch.testing.assert_close(pitched[name], upright[name], rtol=1e-6 if dtype == torch.float32 else 1e-12, atol=tolerance)
+
+
+def test_the_step_may_change_from_call_to_call(tmp_path):
+    """Two steps of 50 ms conduct what one of 100 ms does, whatever was called before."""
+    module, found = heat_module(tmp_path, {"tip": [0.01] * 3}, {"cells": [3, 3, 3], "material": "steel"}), []
+    above = 10 * np.random.default_rng(0).normal(size=(3, 3, 3))
+    for steps in ([0.1], [0.05, 0.05], [0.001, 0.099], [0.07, 0.01, 0.02]):
+        module.reset()
+        begin(module, heat_state(module, 0.3), above)
+        for dt in steps:
+            module(heat_state(module, dt))
+        found.append(cells_of(module).clone())
+    for other in found[1:]:
+        torch.testing.assert_close(other, found[0], rtol=0, atol=1e-12)
+
+
+def test_environments_that_are_not_called_hold_their_heat(tmp_path):
+    """And catch up to the bit: two environments at other times see the same."""
+    module = heat_module(tmp_path, TIP, SENSOR, OBJECTS)
+    state = touching(module, num_envs=4)
+    before = read(module, state, 5)
+    some = {name: value.clone() for name, value in module(state, env_ids=[1, 3]).items()}
+    for name, value in before.items():
+        assert torch.equal(some[name][[0, 2]], value[[0, 2]]) and not torch.equal(some[name][1], value[1])
+    others = module(state, env_ids=[0, 2])
+    for name, value in others.items():
+        assert torch.equal(value[0], value[1]), name
+
+
+def test_a_reset_gives_links_and_objects_back_their_start_in_these_environments_alone(tmp_path):
+    module = heat_module(tmp_path, TIP, SENSOR, OBJECTS)
+    state = touching(module, num_envs=3)
+    before, going_on = read(module, state, 10), heat_module(tmp_path, TIP, SENSOR, OBJECTS)
+    read(going_on, state, 10)
+    module.reset([1])
+    after, expected = read(module, state, 1), read(going_on, state, 1)
+    assert (after["heat"][1] == 22.0).all() and after["heat/objects"][1, :, 0].tolist() == [45.0, -5.0]
+    assert (after["heat/heat"][1] == 0).all() and (after["heat/objects"][1, :, 2:] == 0).all()
+    assert (before["heat/objects"][:, 0, 0] < 45.0).all()
+    for name, value in after.items():
+        assert torch.equal(value[[0, 2]], expected[name][[0, 2]]), name
+
+
+def test_a_look_changes_nothing_and_is_what_the_next_call_reads(tmp_path):
+    module = heat_module(tmp_path, TIP, SENSOR, OBJECTS)
+    state = touching(module)
+    read(module, state, 3)
+    looks, then = [module.peek(state) for _ in range(2)], module(state)
+    for name, value in then.items():
+        assert torch.equal(looks[0][name], value) and torch.equal(looks[1][name], value), name
+
+
+def test_samples_and_stacks_are_of_temperatures_that_go_on(tmp_path):
+    """With a rate of its own and a history what is read is held; what is stored is that of a sensor without."""
+    plain = heat_module(tmp_path, TIP, SENSOR, OBJECTS)
+    held = heat_module(tmp_path, TIP, {**SENSOR, "rate": "5 Hz", "history": 3}, OBJECTS)
+    state, seen = touching(plain, 0.05), []
+    for _ in range(13):
+        seen.append(plain(state)["heat"].clone())
+        found = held(state)["heat"]
+    torch.testing.assert_close(found[:, -1], seen[12], rtol=0, atol=0)
+    assert any(torch.equal(found[:, 0], value) for value in seen[:12])
+    assert torch.equal(cells_of(held), cells_of(plain))
+
+
+def test_links_that_touch_one_another_keep_their_heat(tmp_path):
+    """Felt from both sides, it flows once: what leaves one enters the other, and they end at one temperature."""
+    objects = {
+        "first": (None, {"body": "a", "material": "copper"}),
+        "second": (None, {"body": "b", "material": "steel"}),
+    }
+    sensor = {"cells": [2, 2, 2], "material": "copper", "materials": {"b": "steel"}, "contact_area": "20 mm2"}
+    module = heat_module(tmp_path, {"a": [0.01] * 3, "b": [0.01] * 3}, sensor, objects)
+    contacts = {
+        (pair.link, pair.object): [((0, 0, 0.005), (0, 0, -1.0 if pair.link == "a" else 1.0), 1.0)]
+        for pair in module.inputs.pairs
+    }
+    state = heat_state(module, 0.1, contacts)
+    begin(module, state, 20 * np.ones((2, 2, 2)))
+    first = read(module, state, 1)["heat/heat"][0]
+    for _ in range(200):
+        readings = module(state)
+        heat = readings["heat/heat"][0]
+        assert float(heat[0, 4] + heat[1, 4]) == pytest.approx(0.0, abs=1e-12)
+    assert float(heat[:, 0].sum()) == pytest.approx(float(first[:, 0].sum()), rel=1e-12)
+    assert float(readings["heat"].max() - readings["heat"].min()) < 0.2

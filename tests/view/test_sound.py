@@ -1,0 +1,54 @@
+"""Files and spectrograms of sound."""
+
+import numpy as np
+import pytest
+import soundfile
+
+from tgdsl.view.sound import PEAK, Sound, draw, spectrogram, write_wav
+
+RATE = 8000.0
+
+
+def decaying(*modes):
+    """Return half a second of silence, then modes that ring: frequency [Hz] and decay [1/s] of each."""
+    time = np.arange(4000) / RATE
+    ring = sum(np.exp(-decay * time) * np.sin(2 * np.pi * frequency * time) for frequency, decay in modes)
+    return Sound("bell", "m/s", RATE, np.concatenate([np.zeros(4000), 0.02 * ring]))
+
+
+def test_a_file_holds_the_samples_by_the_gain_that_is_returned(tmp_path):
+    sound = decaying((440.0, 5.0))
+    gain = write_wav(sound, tmp_path / "folder" / "bell.wav")
+    found, rate = soundfile.read(tmp_path / "folder" / "bell.wav")
+    assert rate == 8000 and np.abs(found).max() == pytest.approx(PEAK, abs=1e-4)
+    np.testing.assert_allclose(found / gain, sound.samples, atol=1.01 * 0.5**15 / gain)
+
+
+def test_silence_is_silent(tmp_path):
+    sound = Sound("nothing", "Pa", RATE, np.zeros(800))
+    assert write_wav(sound, tmp_path / "nothing.wav") == 1.0
+    assert not soundfile.read(tmp_path / "nothing.wav")[0].any()
+    assert (spectrogram(sound).level == -np.inf).all()
+    assert draw([sound], tmp_path / "nothing.png").stat().st_size > 1000
+
+
+def test_a_spectrogram_has_modes_at_their_frequencies_and_decay_rates():
+    """The level of a mode's row falls by 20 d/ln 10 dB a second from the impact on; before, there is nothing."""
+    modes = ((600.0, 12.0), (1500.0, 40.0))
+    found = spectrogram(decaying(*modes))
+    late = found.time > 0.52
+    for frequency, decay in modes:
+        row = int(np.abs(found.frequency - frequency).argmin())
+        assert found.frequency[row] == frequency
+        assert found.level[row, late][0] > found.level[row + 3, late][0] + 20
+        early = late & (found.time < 0.6)
+        slope = np.polyfit(found.time[early], found.level[row, early], 1)[0]
+        assert slope == pytest.approx(-20 * decay / np.log(10), rel=0.03)
+    assert (found.level[:, found.time < 0.48] == -np.inf).all()
+
+
+def test_a_sound_shorter_than_a_window_has_one(tmp_path):
+    sound = Sound("click", "Pa", RATE, np.array([0.0, 1.0, 0.0]))
+    assert spectrogram(sound).level.shape[1] == 1
+    draw([sound, decaying((440.0, 5.0))], tmp_path / "two.png", "two", {"bell": [440.0]})
+    assert (tmp_path / "two.png").stat().st_size > 1000

@@ -1,0 +1,88 @@
+"""Modal analysis: from the triangles around a solid, and what it is made of, to its modes.
+
+    f = κ √(E/ρ) / 2πL,   d = (α + β ω²)/2,   g = γ/m
+
+with κ = ω L/c and γ = g m of the shape (`spectrum.py`), L the longest side of its bounding box, m its mass, and Rayleigh's
+damping α [1/s] and β [s] of the material. In mass-normalised modal coordinates q [m·√kg] a force F at x moves the body by
+
+    q̈ + 2d q̇ + ω² q = φ_n(x) F(t),   displacement of the surface along its normal at y: φ_n(y) q
+
+and g is φ_n(x) φ_n(y) with root mean squares over the surface for both: an impulse J at some point of it makes the surface move
+with the velocity g J e^(−dt) cos ωt, in the mean. `loudness.py` says what g is where symmetry makes modes equal.
+
+The body is free and homogeneous. Its modes are not those of a body that is held, filled or glued, and what air takes from them
+is in the damping only as far as it is in its source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tgdsl.errors import LowerError
+from tgdsl.fields.materials import Material
+from tgdsl.modal.modes import Modes, SurfaceGains
+from tgdsl.modal.spec import ShapeModes
+from tgdsl.modal.spectrum import spectrum
+from tgdsl.surfaces.surface import Surface
+
+WANTED = {
+    "youngs_modulus": "Young's modulus",
+    "poissons_ratio": "Poisson's ratio",
+    "mass_damping": "damping",
+    "stiffness_damping": "damping",
+}
+"""What must be known of a material for its modes, besides its density."""
+MAX_POISSON = 0.4999
+"""Poisson's ratio from which on the elements no longer follow what is incompressible."""
+
+
+def analysed(name: str, surface: Surface, given: ShapeModes, below: float) -> Modes:
+    """Return the modes of a solid: those that ring and are wanted, or else the lowest one.
+
+    Args:
+        name: What the body is called in messages.
+        surface: Its surface, in its frame; of several geoms, all of theirs.
+        given: What the document says of its modes.
+        below: Frequency beyond which no mode is wanted [Hz].
+
+    Raises:
+        LowerError: If the surface encloses no solid that can be analysed, the material is not known well enough, or none of its
+            modes rings.
+    """
+    material = given.material
+    youngs_modulus, poissons_ratio, mass_damping, stiffness_damping = _known(name, material)
+    try:
+        shape, size, middle = spectrum(surface, poissons_ratio, given.count)
+    except LowerError as error:
+        raise LowerError(f'modes of "{name}": {error.what}', field="modes", hint=error.hint) from error
+    omega = shape.wave_number * np.sqrt(youngs_modulus / material.density) / size
+    decay = (mass_damping + stiffness_damping * omega**2) / 2
+    rings = decay < omega
+    if not rings.any():
+        what = f'none of the modes of "{name}" rings: {material.name} damps the lowest one, at {omega[0] / (2 * np.pi):.4g} Hz'
+        raise LowerError(what, field="modes", hint="give another material, or list its modes")
+    kept = rings & (omega <= 2 * np.pi * below * (1 + 1e-12))
+    if not kept.any():
+        kept = np.arange(len(omega)) == int(np.argmax(rings))
+    mass = material.density * shape.volume * size**3
+    return Modes(
+        frequency=omega[kept] / (2 * np.pi),
+        decay=decay[kept],
+        gain=shape.gain[kept] / mass,
+        at=SurfaceGains(shape.pos * size + middle, shape.share[:, kept]),
+    )
+
+
+def _known(name: str, material: Material) -> tuple[float, float, float, float]:
+    """Return stiffness, Poisson's ratio and damping of a material."""
+    values = [getattr(material, field) for field in WANTED]
+    if missing := [what for what, value in zip(WANTED.values(), values, strict=True) if value is None]:
+        shown = " and no ".join(dict.fromkeys(missing))
+        hint = (
+            f"give {', '.join(field for field, value in zip(WANTED, values, strict=True) if value is None)}, or list its modes"
+        )
+        raise LowerError(f'modes of "{name}": {material.name} has no {shown}', field="modes", hint=hint)
+    if values[1] > MAX_POISSON:
+        what = f'modes of "{name}": Poisson\'s ratio of {material.name} is {values[1]:g}, expected at most {MAX_POISSON:g}'
+        raise LowerError(what, field="modes", hint="what is incompressible has no modes by this method")
+    return values[0], values[1], values[2], values[3]

@@ -1,0 +1,181 @@
+"""The modes of a shape, whatever its size and material: one analysis per shape and Poisson's ratio, kept by content.
+
+Frequencies of similar bodies are as √(E/ρ)/L, and mode shapes of unit modal mass as 1/√m. So all that follows from the shape is
+computed in units of the body's size L, with E = 1 and ρ = 1, and scaled exactly.
+
+Shapes: `group` modes of distinct frequency, `point` points of the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+from jaxtyping import Float, Int
+
+from tgdsl.files import cache
+from tgdsl.modal import cells, grid
+from tgdsl.modal.closed import closed, enclosed, refused
+from tgdsl.modal.elasticity import Elements
+from tgdsl.modal.loudness import loudness, picked
+from tgdsl.modal.vibration import vibration
+from tgdsl.surfaces.surface import Surface
+
+FORMAT = b"tgdsl modes 2"
+"""To be changed with anything that changes what is computed."""
+UNKNOWNS = 25_000
+"""Number of unknowns that the cells are made small for."""
+MAX_UNKNOWNS = 60_000
+"""Bound on it: a body whose flat walls alone ask for more cells is refused."""
+FINEST = 1 / 48
+"""Smallest cells, over the size of the body."""
+COARSEST = 1 / 3
+"""Largest cells."""
+BULKY = 1.0
+"""Smallest cells, over the volume over the surface: a ball or a cube has six of them from side to side."""
+ROUNDS = 6
+"""Times that the size of the cells is adjusted."""
+SIGHT, GLANCE = 12, 3
+"""Lines of sight through a cell along each axis: for the analysis, and to count cells."""
+SLIVER = 2e-3
+"""Share of a cell that is filled below which it is left out: too few lines of sight pass through the body there."""
+WHOLE = 0.9
+"""Share of the volume that one connected part has at least; smaller parts beside it are left out."""
+DIGITS = 9
+"""Decimals of coordinates, over the size of the body: so that similar bodies are equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Modes of a shape by ascending frequency; those of one frequency are one.
+
+    Attributes:
+        wave_number: ω L/c with c = √(E/ρ) and the length L of the longest side of the bounding box.
+        multiplicity: Number of modes that are one.
+        gain: Gain times the body's mass: see `loudness.py`.
+        volume: The body's, over L³.
+        pos: Points of the surface, from the middle of the bounding box and over L.
+        share: How strongly each mode is struck at them, over its root mean square over the surface.
+        unknowns: Size of the eigenproblem.
+    """
+
+    wave_number: Float[np.ndarray, " group"]
+    multiplicity: Int[np.ndarray, " group"]
+    gain: Float[np.ndarray, " group"]
+    volume: float
+    pos: Float[np.ndarray, "point 3"]
+    share: Float[np.ndarray, "point group"]
+    unknowns: int
+
+
+def spectrum(
+    surface: Surface, poissons_ratio: float, count: int, unknowns: int | None = None
+) -> tuple[Spectrum, float, Float[np.ndarray, " 3"]]:
+    """Return the lowest modes of a shape, from the cache if they are there; its size L [m]; and the middle of its box [m].
+
+    Args:
+        surface: Triangles around the body [m].
+        poissons_ratio: Less than 1/2.
+        count: Most modes of distinct frequency.
+        unknowns: Number of unknowns that the cells are made small for; default: `UNKNOWNS`.
+
+    Raises:
+        LowerError: If the surface has no inside, the body falls into parts, or needs more cells than are allowed.
+    """
+    unknowns = UNKNOWNS if unknowns is None else unknowns
+    vertices, faces = closed(surface)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size, middle = float((high - low).max()), (low + high) / 2
+    vertices = np.round((vertices - middle) / size, DIGITS) + 0.0
+    key = cache.digest(FORMAT, [vertices, faces, np.array(poissons_ratio), np.array([count, unknowns])])
+    found = cache.cached(key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns), _packed, _unpacked)
+    return found, size, middle
+
+
+def _computed(vertices: np.ndarray, faces: np.ndarray, poissons_ratio: float, count: int, unknowns: int) -> Spectrum:
+    turned = grid.axes(vertices, faces)
+    placed = vertices @ turned.T
+    filled, crossings = cells.filled(placed, faces, _lines(placed, faces, unknowns), SIGHT, SLIVER)
+    elements, crossings = _whole(Elements.of(filled), crossings)
+    stiffness, mass = elements.matrices(poissons_ratio)
+    # A few more than asked for: some are one, and the last group may lack some of its modes.
+    found = vibration(stiffness, mass, count + 8)
+    displacement = elements.displacement(crossings.cell, crossings.pos, found.shape)
+    normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
+    volume = float(elements.filled.volume.sum())
+    heard = loudness(found.wave_number, normal, crossings.area, volume)
+    kept = slice(None, count)
+    at = picked(crossings)
+    return Spectrum(
+        wave_number=_rounded(heard.wave_number[kept]),
+        multiplicity=heard.multiplicity[kept],
+        gain=_rounded(heard.gain[kept]),
+        volume=volume,
+        pos=crossings.pos[at] @ turned,
+        share=np.round(heard.share[at][:, kept], 6),
+        unknowns=3 * len(elements.pos),
+    )
+
+
+def _rounded(values: np.ndarray) -> np.ndarray:
+    """Return values to nine digits, so that the order in which a machine adds up does not show."""
+    return np.array([float(f"{value:.9g}") for value in values.tolist()])
+
+
+def _lines(vertices: np.ndarray, faces: np.ndarray, wanted: int) -> cells.Lines:
+    """Return a grid that gives about as many unknowns as wanted, or the finest one."""
+    flat = [grid.planes(vertices, faces, axis) for axis in range(3)]
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size, area = float((high - low).max()), float(np.asarray(igl.doublearea(vertices, faces)).sum()) / 2
+    finest = max(FINEST * size, BULKY * abs(enclosed(vertices, faces)) / area)
+
+    def at(cell: float) -> tuple[cells.Lines, int]:
+        x, y, z = (grid.lines(flat[axis], low[axis], high[axis], cell) for axis in range(3))
+        filled, _ = cells.filled(vertices, faces, (x, y, z), GLANCE, SLIVER)
+        return (x, y, z), 3 * len(Elements.of(filled).pos)
+
+    cell, best = size / 8, None
+    for _ in range(ROUNDS):
+        found, unknowns = at(cell)
+        if unknowns <= wanted and (best is None or unknowns > best[1]):
+            best = found, unknowns
+        at_end = (unknowns > wanted and cell >= COARSEST * size) or (unknowns <= wanted and cell <= finest)
+        if at_end or 0.8 * wanted <= unknowns <= wanted:
+            break
+        cell = float(np.clip(cell * (unknowns / (0.9 * wanted)) ** 0.4, finest, COARSEST * size))
+    if best is None and unknowns > MAX_UNKNOWNS:
+        walls = " × ".join(str(len(line) - 1) for line in found)
+        raise refused(
+            f"its flat walls ask for a grid of {walls} cells and {unknowns} unknowns, {MAX_UNKNOWNS} are allowed",
+            "leave out small details",
+        )
+    return found if best is None else best[0]
+
+
+def _whole(elements: Elements, crossings: cells.Crossings) -> tuple[Elements, cells.Crossings]:
+    """Return the largest connected part of a body."""
+    part = elements.part
+    if not part.any():
+        return elements, crossings
+    volume = np.bincount(part, elements.filled.volume)
+    if volume[0] < WHOLE * volume.sum():
+        shown = ", ".join(f"{share:.1%}" for share in volume[:4] / volume.sum())
+        raise refused(f"it is {len(volume)} parts that do not touch, of {shown} of its volume", "join its geoms")
+    kept = part == 0
+    row = np.cumsum(kept) - 1
+    own = elements.filled
+    filled = cells.Filled(own.index[kept], own.low[kept], own.size[kept], own.weight[kept])
+    on = kept[crossings.cell]
+    one = cells.Crossings(row[crossings.cell[on]], crossings.pos[on], crossings.normal[on], crossings.area[on])
+    return Elements.of(filled), one
+
+
+def _packed(found: Spectrum) -> Mapping[str, np.ndarray]:
+    return {name: np.asarray(getattr(found, name)) for name in Spectrum.__dataclass_fields__}
+
+
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> Spectrum:
+    found = {name: arrays[name] for name in Spectrum.__dataclass_fields__}
+    return Spectrum(**{**found, "volume": float(found["volume"]), "unknowns": int(found["unknowns"])})

@@ -1,0 +1,1 @@
+"""Contact mechanics: half-spaces, bonded layers, markers of a skin, stick and slip."""

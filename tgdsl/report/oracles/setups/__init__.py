@@ -1,0 +1,1 @@
+"""Scenes, signals and states that oracles and hard cases are computed on."""

@@ -1,0 +1,153 @@
+"""What makes sound, driven as an oracle says: a plate that a ball presses and rubs, and a motor's joint.
+
+Shapes: `step` physics steps, `env` environments, `sample` samples of all steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tgdsl.module.module import TactileModule
+from tgdsl.module.state import SceneState
+from tgdsl.tuning.compile import compile
+
+STEP = 0.001
+"""A physics step [s]."""
+PLATE = """
+<mujoco>
+  <option timestep="0.001" cone="elliptic"/>
+  <worldbody>
+    <body name="plate"><geom name="plate" type="box" size=".1 .1 .005"/></body>
+    <body name="other" pos="1 0 0"><geom type="box" size=".1 .1 .005"/></body>
+    <body name="ball" pos="0 0 .03"><freejoint/><geom type="sphere" size=".01" mass=".05"/></body>
+  </worldbody>
+</mujoco>
+"""
+MODES: list[dict[str, float]] = [
+    {"frequency": 523.0, "decay": 6.0, "gain": 2.0},
+    {"frequency": 1171.0, "decay": 20.0, "gain": -1.0},
+    {"frequency": 2903.0, "decay": 55.0, "gain": 0.7},
+]
+"""The plate's, if no others are given."""
+MOTOR = """
+<mujoco>
+  <option timestep="0.001"/>
+  <worldbody>
+    <body name="arm" pos="0 0 .1"><joint name="elbow" axis="0 1 0" pos=".01 0 .02"/><geom size=".01" mass=".5"/></body>
+  </worldbody>
+  <actuator><motor name="motor" joint="elbow"/></actuator>
+</mujoco>
+"""
+
+
+def plate_document(folder: Path, **sensor: Any) -> dict[str, Any]:
+    """Return a document of a plate that feels a ball; its scene is written to a folder."""
+    (folder / "plate.xml").write_text(PLATE, encoding="utf-8")
+    given = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": MODES, **sensor}
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(folder / "plate.xml")},
+        "objects": {"ball": {"body": "ball"}},
+        "sensors": {"s": given},
+    }
+
+
+def plate(folder: Path, dtype: torch.dtype = torch.float64, **sensor: Any) -> TactileModule:
+    """Return a compiled plate."""
+    return compile(plate_document(folder, **sensor), dtype=dtype)
+
+
+def pressed(
+    touch: TactileModule, force: Sequence[float | int], speed: Sequence[float | int] | float | int = 0.0, step: float = STEP
+) -> SceneState:
+    """Return the state of a ball in each environment that presses with a normal force [N], sliding at a speed [m/s].
+
+    It lies turned, and the plate moves along and turns, so that only what is relative counts.
+    """
+    forces, speeds = torch.as_tensor(force, dtype=torch.float64), torch.as_tensor(speed, dtype=torch.float64)
+    state = touch.example_state(len(forces))
+    for name in ("contact_force", "contact_normal", "contact_netforce", "body_angvel"):
+        getattr(state, name).zero_()
+    assert state.contact_normal is not None and state.contact_force is not None and state.contact_netforce is not None
+    assert state.body_linvel is not None
+    normal, along = torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64), torch.tensor([0.8, 0.0, 0.6], dtype=torch.float64)
+    pair = [own.link for own in touch.inputs.pairs].index("plate")
+    state.contact_normal[:, pair, 0] = normal
+    state.contact_force[:, pair, 0] = forces[:, None] * (normal + 0.3 * along)
+    state.contact_netforce[:, pair] = state.contact_force[:, pair, 0]
+    ball, link = (touch.inputs.bodies.index(name) for name in ("ball", "plate"))
+    state.body_linvel[:, ball] = state.body_linvel[:, link] + speeds[..., None] * along + 0.4 * normal
+    state.dt = step
+    return state
+
+
+def sound(touch: TactileModule, forces: Any, speeds: Any = 0.0, step: float = STEP) -> Float[np.ndarray, "env sample"]:
+    """Return what is heard of normal forces (step, env) [N] and sliding speeds [m/s], one after the other [m/s]."""
+    forces = np.atleast_2d(np.asarray(forces, dtype=np.float64).T).T
+    speeds = np.broadcast_to(np.asarray(speeds, dtype=np.float64), forces.shape)
+    heard = [touch(pressed(touch, f.tolist(), v.tolist(), step))["s"][:, :, 0, 0] for f, v in zip(forces, speeds, strict=True)]
+    return torch.cat(heard, dim=1).double().numpy()
+
+
+def ringing(impulse: float, time: np.ndarray, modes: Sequence[Mapping[str, float]] = MODES) -> np.ndarray:
+    """Return J Σ g e^(−dt) sin(2πft) [m/s], 0 before the impulse."""
+    after = np.maximum(time, 0.0)
+    each = [m["gain"] * np.exp(-m["decay"] * after) * np.sin(2 * math.pi * m["frequency"] * after) for m in modes]
+    return impulse * np.sum(each, axis=0) * (time >= 0)
+
+
+def amplitudes(
+    touch: TactileModule, forces: Sequence[float | int] | np.ndarray, step: float = STEP
+) -> Float[np.ndarray, "step mode"]:
+    """Return the amplitude of the plate's modes, |z| [N·s], after each step of forces [N]."""
+    found = []
+    for force in forces:
+        touch(pressed(touch, [float(force)], step=step))
+        found.append(touch.memory.get_buffer("s:phasors").double().view(2, -1).norm(dim=0).numpy())
+    return np.array(found)
+
+
+def half_sine(duration: float, step: float, impulse: float = 0.02, rest: float = 0.06) -> list[float]:
+    """Return a half-sine of force of an impulse [N·s], averaged over each step, silence before and after [N]."""
+    edges = np.arange(0, duration + rest, step)
+    passed = impulse * 0.5 * (1 - np.cos(math.pi * np.clip(edges / duration, 0, 1)))
+    return [0.0, *(np.diff(passed) / step).tolist()]
+
+
+def struck(
+    touch: TactileModule, forces: Sequence[float | int] | np.ndarray, decay: float, step: float = STEP
+) -> tuple[float, int]:
+    """Return the amplitude of the only mode at the time of the last strike, if it were alone, |z| e^(d Δt) [N·s]; its step."""
+    found = amplitudes(touch, forces, step)[:, 0]
+    last = int(np.argmax(np.diff([0.0, *found]) > 0))
+    return float(found[last] * math.exp(decay * step)), last
+
+
+def motor(folder: Path, dtype: torch.dtype | str = torch.float64, **fields: Any) -> TactileModule:
+    """Return a module that hears a joint, `elbow`, in `motors`: only the parts of its sound whose levels are given."""
+    (folder / "motor.xml").write_text(MOTOR, encoding="utf-8")
+    parts = {"load": 0.0, "power": 0.0, "friction": 0.0, "hum": 0.0}
+    sensor = {"kind": "actuation_audio", "joints": ["elbow"], "samples": 20, **parts, **fields}
+    document = {"tgdsl": 1, "robot": {"model": str(folder / "motor.xml")}, "sensors": {"motors": sensor}}
+    return compile(document, dtype=dtype)
+
+
+def driven(
+    touch: TactileModule, velocities: Sequence[float | int] | np.ndarray, efforts: Any, num_envs: int = 1
+) -> Float[np.ndarray, "env sample"]:
+    """Return all samples of a joint whose velocity [rad/s] and effort [N·m] are given at each step [Pa]."""
+    state, blocks = touch.example_state(num_envs), []
+    assert state.joint_vel is not None
+    one = torch.ones_like(state.joint_vel)
+    for velocity, effort in zip(velocities, np.broadcast_to(efforts, len(velocities)), strict=True):
+        state = replace(state, joint_vel=float(velocity) * one, joint_effort=float(effort) * one, dt=STEP)
+        blocks.append(touch(state)["motors"][:, :, 0, 0])
+    return torch.cat(blocks, dim=1).double().numpy()

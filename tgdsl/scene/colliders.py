@@ -1,0 +1,102 @@
+"""Primitive colliders in place of the robot's own geoms, which are then only seen: `robot: {collision: primitive}`.
+
+Of a link with several colliders one or more are its *core*. Links that have colliders meet each other by their cores alone,
+whatever else is in the scene meets all of them: so the pairs of geoms that a simulator looks at are those of the links' number,
+and only where objects touch the surface counts what the other colliders add.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from tgdsl.errors import RobotError
+from tgdsl.plan.scene import Collider
+from tgdsl.scene.contact_bits import INHERITED, free_bit, meets
+
+GROUP = 3
+"""MuJoCo's group of colliders: its viewers do not show it unless they are told to."""
+
+
+def collider_name(body: str, i: int) -> str:
+    """Return the name of collider i of a body in the scene."""
+    return f"tgdsl/{body}/collider/{i}"
+
+
+def with_colliders(spec: mujoco.MjSpec, colliders: Sequence[Collider]) -> mujoco.MjSpec:
+    """Give links colliders in place of those of their geoms that collide: the spec is changed in place and returned.
+
+    These stay, to be seen. Masses and inertias are not changed. What a geom in contact is besides its shape, such as friction,
+    a link's colliders have of the first of them.
+
+    Args:
+        spec: The scene.
+        colliders: Those of all links.
+
+    Raises:
+        RobotError: If the scene lacks a body, or one has no geom that collides; if what a link shall go on meeting meets it by
+            `contype` of the link's geoms alone, or by an explicit pair of geoms.
+    """
+    by_body: dict[str, list[Collider]] = {}
+    for collider in colliders:
+        by_body.setdefault(collider.body, []).append(collider)
+    if not by_body:
+        return spec
+    own = {body: _colliding(spec, body) for body in by_body}
+    replaced = [geom for geoms in own.values() for geom in geoms]
+    _refuse_pairs(spec, replaced)
+    others = [geom for geom in spec.geoms if geom not in replaced]
+    is_self_colliding = any(meets(one.contype, one.conaffinity, other) for one in replaced for other in replaced)
+    core = free_bit(spec, "links with primitive colliders", RobotError, ("contype", "conaffinity")) if is_self_colliding else 0
+    for body, parts in by_body.items():
+        _refuse_lost(body, own[body], others)
+        for i, collider in enumerate(parts):
+            _add(spec, collider, i, own[body][0], core if collider.is_core else 0)
+    for geom in replaced:
+        geom.contype = geom.conaffinity = 0
+    return spec
+
+
+def _colliding(spec: mujoco.MjSpec, body: str) -> list[mujoco.MjsGeom]:
+    found = spec.body(body)
+    if found is None:
+        raise RobotError(f'the scene has no body "{body}", which has primitive colliders')
+    geoms = [geom for geom in found.geoms if geom.contype or geom.conaffinity]
+    if not geoms:
+        raise RobotError(f'no geom of body "{body}" collides, expected one whose place its primitive colliders take')
+    return geoms
+
+
+def _refuse_pairs(spec: mujoco.MjSpec, replaced: Sequence[mujoco.MjsGeom]) -> None:
+    names = {geom.name for geom in replaced if geom.name}
+    for pair in spec.pairs:
+        if named := names & {pair.geomname1, pair.geomname2}:
+            what = f'the scene has a contact pair of geom "{sorted(named)[0]}", whose place primitive colliders take'
+            raise RobotError(f"{what}; expected pairs of other geoms")
+
+
+def _refuse_lost(body: str, replaced: Sequence[mujoco.MjsGeom], others: Sequence[mujoco.MjsGeom]) -> None:
+    """Refuse a scene where something meets a link only because of its `contype`, which its colliders do not have."""
+    for other in others:
+        met = any(meets(own.contype, own.conaffinity, other) for own in replaced)
+        if met and not meets(0, replaced[0].conaffinity, other):
+            what = f'geom "{other.name}" (body "{other.parent.name}") collides with "{body}" by its `conaffinity` alone'
+            raise RobotError(f"{what}; primitive colliders meet what has one of their bits in its `contype`")
+
+
+def _add(spec: mujoco.MjSpec, collider: Collider, i: int, like: mujoco.MjsGeom, core: int) -> None:
+    geom = spec.body(collider.body).add_geom(
+        name=collider_name(collider.body, i),
+        type=getattr(mujoco.mjtGeom, f"mjGEOM_{collider.type.upper()}"),
+        size=[*collider.size, 0.0, 0.0, 0.0][:3],
+        pos=collider.pos,
+        quat=collider.quat,
+    )
+    geom.fromto, geom.meshname = np.full(6, np.nan), ""  # whatever the scene's defaults say
+    geom.fluid_ellipsoid = 0.0
+    for name in INHERITED:
+        setattr(geom, name, getattr(like, name))
+    geom.contype, geom.conaffinity, geom.group = core, int(like.conaffinity) | core, GROUP
+    geom.mass, geom.density = 0.0, 0.0

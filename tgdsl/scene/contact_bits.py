@@ -1,0 +1,36 @@
+"""Which geoms collide, by MuJoCo's bits `contype` and `conaffinity`, and what a geom in another's place has of it."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from tgdsl.errors import TgdslError
+
+INHERITED = (
+    *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap"),
+    *("group", "rgba", "material"),
+)
+"""What a geom in the place of a body's geoms has of the first of them."""
+
+
+def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError], fields: tuple[str, ...] = ("conaffinity",)) -> int:
+    """Return a bit that no geom collides with; if there is none, an error says who needs it.
+
+    Args:
+        spec: The scene.
+        who: Who needs it.
+        error: Type of the error.
+        fields: Where the bit must be free.
+    """
+    used = int(np.bitwise_or.reduce([int(getattr(geom, field)) for geom in spec.geoms for field in fields]))
+    free = next((1 << bit for bit in range(30, -1, -1) if not used >> bit & 1), None)
+    if free is None:
+        names = " and ".join(f"`{field}`" for field in fields)
+        raise error(f"the scene's geoms use all bits of {names}; {who} need a free one")
+    return free
+
+
+def meets(contype: int, conaffinity: int, geom: mujoco.MjsGeom) -> bool:
+    """Return whether a geom with some bits collides with a geom, as far as bits say."""
+    return bool((contype & geom.conaffinity) | (geom.contype & conaffinity))

@@ -1,0 +1,1 @@
+"""Contact audio: what bodies sound like that are struck and scraped."""

@@ -1,0 +1,68 @@
+"""From the load of a pair at each physics step to the impulses that strike it.
+
+A collision takes the solver one step or several, as its time step and its contacts' stiffness have it, but a stiff body rings
+from all of its impulse. So what a load F exceeds a steady load F̄ by is summed up, and strikes at once when it no longer grows:
+
+    A ← κA + (F − F̄)₊ Δt,   F̄ ← F + κ(F̄ − F),   κ = e^(−Δt/τ)                               [N·s], [N]
+    J = A, and A ← 0, F̄ ← F, where (F − F̄)₊ Δt ≤ (1 − κ) A                                   [N·s]
+
+A collision of the duration T ≪ τ strikes with its impulse ∫F dt, whatever the number of steps; a load that takes much longer
+than τ to rise by ΔF, at the rate R, with R τ² alone; a steady one not at all. The first load of an episode counts as steady.
+
+Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.sensors.base import Constants, State
+
+Load = Float[Tensor, "env body object"]
+UNKNOWN = 1e30
+"""Steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first."""
+
+
+def impulses(force: Load, constants: Constants, state: State) -> tuple[Load, dict[str, Tensor]]:
+    """Return the impulses that strike at the start of this step [N·s], and what is remembered."""
+    above, kept = force - state["steady"], constants["kept"]
+    grown = above.clamp(min=0.0) * constants["step"]
+    if "is_paper" in constants:
+        return grown, {"steady": force}
+    pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
+    is_over = grown <= constants["leaked"] * pending
+    impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
+    after = torch.where(is_over, force, torch.addcmul(force, above, kept, value=-1))
+    return impulse, {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
+
+
+def reference_impulses(
+    force: Float[np.ndarray, "body object"],
+    before: tuple[np.ndarray, np.ndarray],
+    step: float,
+    settling: float,
+    is_paper: bool,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return J, and F̄ and A after it, of one environment: pair by pair.
+
+    Args:
+        force: F [N].
+        before: F̄ [N] and A [N·s].
+        step: Δt [s].
+        settling: τ [s].
+        is_paper: Whether each rise of the force strikes by itself.
+    """
+    impulse, (steady, pending) = np.zeros_like(force), (part.copy() for part in before)
+    kept = np.exp(-step / settling)
+    for place, load in np.ndenumerate(force):
+        grown = max(0.0, load - steady[place]) * step
+        if is_paper:
+            impulse[place], steady[place] = grown, load
+        elif grown <= (1 - kept) * pending[place]:
+            impulse[place], pending[place], steady[place] = pending[place], 0.0, load
+        else:
+            pending[place], steady[place] = kept * pending[place] + grown, load + kept * (steady[place] - load)
+    return impulse, steady, pending

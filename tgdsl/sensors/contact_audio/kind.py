@@ -1,0 +1,183 @@
+"""Contact audio: what bodies sound like that are struck and scraped, as a block of samples per physics step.
+
+Each mode i of a body that rings is a phasor z_i [N·s], which is struck by impulses and decays:
+
+    ż_i = (−d_i + 2πi f_i) z_i + Σ_n u_n δ(t − t_n)                                            [N·s]
+    s(t) = Σ_i g_i Im z_i(t)                                                                  [m/s]
+
+with its frequency f [Hz], the decay rate d of its amplitude [1/s], and its gain g [1/kg]. An impulse J at t = 0 alone sounds as
+J Σ g e^(−dt) sin(2πft): the pseudo-velocity of the surface, see `modal.modes`. Sample k = 1 … K of a physics step is s at
+k Δt/K after its start, so that the rate is K/Δt, and samples at common times are the same for all K.
+
+Impulses u act at four times of each step, t_n = (0, ¼, ½, ¾) Δt:
+
+    u_n = J [n = 0] + ξ_n √(m_s W Δt/4),   ξ_n ~ N(0, 1)                                      [N·s]
+
+- J is the impulse of a collision, over all steps that it takes the solver, once it has been passed on: see `impulses`. It is
+  summed over what touches the body.
+- The noise is of sliding: W = Σ F |v_t| over the contacts, with the normal force F [N] and the sliding speed v_t [m/s], and
+  m_s [kg] the variance of the impulses of one second at 1 N and 1 m/s [N²·s²]. The energy that it brings is a fixed part of
+  that of friction, and the level grows by 10 dB with ten times the force or ten times the speed.
+
+`outputs: bands` reads instead, at the end of each step, the mean square of what is heard of the modes in each third octave:
+
+    E_b = ½ Σ_(i in b) g_i² |z_i|²   [m²/s²],   or   10 lg(1 + E_b/E₀), E₀ = (1 µm/s)²   [dB]
+
+A step is one matrix, made in float64 beforehand: exact at any step, without drift. Components of phasors within 1e-12 N·s of
+zero are flushed to it.
+
+A microphone hears it at the frames of the bodies that ring, as ρc √(A/4π) s at 1 m [Pa]: what a surface of A = 0.01 m² radiates
+that moves with s, at all frequencies alike (Kinsler et al., *Fundamentals of Acoustics*, 7.5).
+
+`model: paper`: y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], a₁ = 2r cos(2πfΔt/K), a₂ = r², r = e^(−dΔt/K), and s = Σ g y, with
+u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is then depends on K and Δt.
+
+Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; noise by the power of friction as in van den
+Doel, Kry and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
+
+Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tgdsl.errors import LowerError
+from tgdsl.geometry import planes
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.base import Gathered
+from tgdsl.quantities.loads import Loads
+from tgdsl.quantities.places import Places
+from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
+from tgdsl.sensors.contact_audio.bands import band_numbers, membership, middle
+from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
+from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
+from tgdsl.sensors.contact_audio.reference import reference
+from tgdsl.sensors.contact_audio.rows import axis_of, ringing
+from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
+from tgdsl.sensors.noise import random
+from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
+from tgdsl.surfaces.surface import Surface
+
+
+def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowered:
+    """The modes that are heard become the matrices of a step."""
+    step = spec.timestep
+    if step is None:
+        raise LowerError("the time of a physics step is not known", "timestep", "give it, `timestep: 2 ms`")
+
+    def surface(name: str) -> Surface:
+        return surface_of(name, ()) if spec.of == "link" else surface_of.of_object(name)
+
+    modes, rows = ringing(spec, layout, step, surface), axis_of(spec, layout)
+    constants = {
+        "frequency": modes.frequency,
+        "decay": modes.decay,
+        "gain": modes.gain,
+        "samples": scalar(float(spec.samples)),
+        "settling": scalar(spec.settling),
+        "scrape": scalar(spec.scrape),
+    }
+    constants |= {"is_of_object": scalar(1.0)} if spec.of == "object" else {}
+    constants |= {"is_paper": scalar(1.0)} if spec.model == "paper" else {}
+    channels = (Channel("sound", "m/s"),)
+    if spec.outputs == "bands":
+        constants["band"] = membership(modes.frequency)
+        constants |= {"is_decibel": scalar(1.0)} if spec.scale == "decibel" else {}
+        unit = "dB" if spec.scale == "decibel" else "m²/s²"
+        channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in band_numbers(modes.frequency))
+    pairs = (len(layout.bodies), len(spec.feels))
+    state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
+    is_heard = spec.outputs == "samples"
+    return Lowered(
+        channels=channels,
+        constants=constants | operators(constants, step),
+        state=state | ({} if spec.model == "paper" else {"pending": Memory(shape=pairs)}),
+        requests=(Loads(spec.feels, slots=spec.slots, of=spec.of), *((_places(spec, layout),) if is_heard else ())),
+        rows=rows,
+        notes=(f"{spec.samples} samples per step of {step:g} s: {spec.samples / step:g} Hz", *modes.notes),
+        substeps=spec.substeps,
+        samples=spec.samples if is_heard else 0,
+        timestep=step,
+        provides=SOUND if is_heard else frozenset(),
+        sound=spec.samples if is_heard else 0,
+    )
+
+
+def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
+    """Return the request for where the sound comes from."""
+    if spec.of == "object":
+        return Places(spec.feels)
+    return Places(bodies=layout.bodies, offset=np.zeros((len(layout.bodies), 3)))
+
+
+def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
+    """Return the samples of a step (env, sample, 1, row) [m/s], or the energies of its bands (env, band, row)."""
+    loads = gathered[Loads]
+    impulse, new = impulses(loads.force, constants, state)
+    struck = _of_rows(impulse, constants)[..., None]
+    if "noise" in constants:
+        strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
+        struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
+    parts = torch.cat([state["phasors"], struck], dim=-1)
+    new["phasors"] = after = _turned(parts, turn_of(constants, context.step[0] + context.substep), constants)
+    if "heard" in constants:
+        made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
+        return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
+    energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
+    return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
+
+
+def _turned(parts: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step, (env, row, part · mode) [N·s], of those at its start and what strikes them."""
+    (cosine, sine), modes = turn.unbind(), turn.shape[-1]
+    real, imag, struck = parts[..., :modes], parts[..., modes : 2 * modes], parts[..., 2 * modes :]
+    turned = torch.addcmul(real * cosine, imag, sine, value=-1), torch.addcmul(real * sine, imag, cosine)
+    after = torch.cat(turned, dim=-1)
+    for grain, own in enumerate(constants["struck"].unbind()):
+        after = torch.addcmul(after, struck[..., grain, None], own)
+    return torch.nn.functional.hardshrink(after, least())
+
+
+def _of_rows(pairs: Tensor, constants: Constants) -> Tensor:
+    """Return the sum over what touches each body (or object) that rings, (env, row)."""
+    dim = 1 if "is_of_object" in constants else 2
+    return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
+
+
+def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
+    """Return the impulses of sliding (env, row, grain) [N·s]."""
+    assert context.stream is not None
+    rows, grains = sliding.shape[1], constants["struck"].shape[0]
+    count = (grains + 1) // 2
+    index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
+    pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)
+    normals = torch.stack(pair, dim=-1).view(-1, rows, 2 * count)[..., :grains]
+    return (constants["noise"] * planes.safe_sqrt(sliding))[..., None] * normals
+
+
+def _level(energy: Tensor) -> Tensor:
+    """Return the level of energies [dB]."""
+    return 10.0 * torch.log10(1.0 + energy / quiet())
+
+
+def retimed(constants: Mapping[str, np.ndarray], dt: float) -> Mapping[str, np.ndarray]:
+    """Return the matrices of another time step."""
+    return operators(constants, dt)
+
+
+CONTACT_AUDIO = Kind(
+    ContactAudioSpec,
+    lower,
+    forward,
+    reference,
+    knobs=frozenset(),
+    is_timed=True,
+    is_random=True,
+    retimed=retimed,
+    provides=SOUND,
+)

@@ -1,0 +1,136 @@
+"""A step of the modes, and a block of samples as one matrix: what of it depends on the time step, in float64.
+
+    heard = Hᵀ (Re z, Im z, u),   z′ = p z + Bᵀ u
+
+with the phasors z of the modes at the start of a step [N·s] and impulses u at `GRAINS` times within it [N·s]; H holds the
+samples' sines, p and B what is left of phasors and impulses at the end. All are exact, whatever the step. A phasor that is
+turned by the same rounded factor at every step drifts by 3e-8 a step. So in float32 p is rounded down at some steps and up at
+others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
+last place by which it is above the lower number. What is left are roundings that do not add up.
+
+Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `sample` samples of a block,
+`band` bands, `grain` times of impulses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+GRAINS = 4
+"""Times within a physics step at which noise strikes: the same for any number of samples, so that the noise is."""
+HIGHEST = 0.45
+"""Largest frequency that is heard, in sample rates."""
+Arrays = Mapping[str, np.ndarray]
+
+# Functions, not floats of the module: under dynamic shapes torch.compile makes those inputs of the graph.
+
+
+def golden() -> float:
+    """Return the golden ratio's fraction: modulo 1, its multiples fill the unit interval most evenly of all numbers'."""
+    return 0.6180339887498949
+
+
+def least() -> float:
+    """Return up to where a component of a phasor is flushed to zero [N·s]."""
+    return 1e-12
+
+
+def quiet() -> float:
+    """Return the energy E₀ that levels are relative to, of 1 µm/s [m²/s²]."""
+    return 1e-12
+
+
+def highest(samples: int, step: float) -> float:
+    """Return the largest frequency that blocks of so many samples hold [Hz]."""
+    return HIGHEST * samples / step
+
+
+def strike_times(samples: int, step: float, is_paper: bool, has_noise: bool) -> Float[np.ndarray, " grain"]:
+    """Return when impulses act [s], impacts first: from the start of the step on, of the paper's response at each sample."""
+    if is_paper:
+        return np.arange(1, samples + 1 if has_noise else 2) * step / samples
+    return np.arange(GRAINS if has_noise else 1) * step / GRAINS
+
+
+def strike_phasors(frequency: np.ndarray, samples: int, step: float, is_paper: bool) -> Complex[np.ndarray, "row mode"]:
+    """Return the phasor that a unit impulse adds to each mode: 1, or e^(iθ)/sin θ of the two-pole response."""
+    if not is_paper:
+        return np.ones_like(frequency, dtype=np.complex128)
+    angle = 2 * math.pi * frequency * step / samples
+    return np.exp(1j * angle) / np.where(np.sin(angle) != 0, np.sin(angle), 1.0)
+
+
+def radiated() -> float:
+    """Return the sound pressure at 1 m per velocity of a surface of 0.01 m², ρc √(A/4π), of air at 20 °C [Pa·s/m]."""
+    return 1.204 * 343.2 * 0.028209479177387815  # a float of a module, such as math.pi, is an input of a compiled graph
+
+
+def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
+    """Return what of a sensor's constants depends on the time step [s].
+
+    Args:
+        constants: `frequency` [Hz], `decay` [1/s], `gain` [1/kg], each (row, mode), 0 where a row has fewer; `samples`;
+            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands.
+        step: The time step.
+    """
+    samples, is_paper, scrape = int(constants["samples"]), "is_paper" in constants, float(constants["scrape"])
+    frequency = constants["frequency"]
+    is_heard = (frequency > 0) & (frequency <= highest(samples, step) * (1 + 1e-12))
+    rate, gain = -constants["decay"] + 2j * math.pi * frequency, np.where(is_heard, constants["gain"], 0.0)
+    times, strikes = np.arange(1, samples + 1) * step / samples, strike_times(samples, step, is_paper, scrape > 0)
+    begun = strike_phasors(frequency, samples, step, is_paper)
+
+    def factors(time: np.ndarray) -> np.ndarray:
+        """Return e^((−d + 2πif) t), (row, mode, *time); 0 of modes that are not heard, and before an impulse."""
+        shape = (..., *[None] * time.ndim)
+        return np.where(is_heard[shape] & (time >= -1e-12 * step), np.exp(rate[shape] * np.maximum(time, 0.0)), 0.0)
+
+    kept, turn, left = math.exp(-step / float(constants["settling"])), factors(np.array(step)), factors(step - strikes)
+    added = (begun[..., None] * left).transpose(2, 0, 1)
+    found = {
+        "kept": np.asarray(kept),
+        "leaked": np.asarray(1.0 - kept),
+        "step": np.asarray(step),
+        "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
+        **_rounded("turn", np.stack([np.real(turn), np.imag(turn)])),
+    }
+    if scrape > 0:
+        found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
+    if "band" in constants:
+        energy = 0.5 * (gain**2)[..., None] * constants["band"]
+        return found | {"energy": np.concatenate([energy, energy], axis=1)}
+    free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
+    parts = [
+        gain[..., None] * np.imag(free),
+        gain[..., None] * np.real(free),
+        (gain[..., None, None] * np.imag(of_impulses)).sum(axis=1),
+    ]
+    return found | {"heard": np.concatenate(parts, axis=1)}
+
+
+def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the float32 numbers below and above each number, and how far on the way from one to the other it is."""
+    nearest = exact.astype(np.float32)
+    low = np.where(nearest > exact, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+    high = np.nextafter(low, np.float32(np.inf))
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    return {f"{name}_low": low, f"{name}_high": high, f"{name}_share": (exact - low) / (high - low)}
+
+
+def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "part row mode"]:
+    """Return p as a step uses it, its real and imaginary parts: exact in float64, rounded down or up in float32.
+
+    Args:
+        constants: The module's.
+        count: Number of the step, int64; any steps will do that follow one another.
+    """
+    low, high, share = (constants[f"turn_{name}"] for name in ("low", "high", "share"))
+    if low.dtype == torch.float64:
+        return low + share * (high - low)
+    return torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)

@@ -1,0 +1,126 @@
+"""The definition of contact audio in float64: impulse by impulse, sample by sample, mode by mode.
+
+Shapes: `row` bodies that ring, `sample` samples of a step.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.layout.layout import Layout
+from tgdsl.quantities.loads import Loads
+from tgdsl.quantities.places import Places
+from tgdsl.quantities.reference import References
+from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
+from tgdsl.sensors.contact_audio.bands import band_numbers, middle
+from tgdsl.sensors.contact_audio.impulses import reference_impulses
+from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet, radiated
+from tgdsl.sensors.contact_audio.rows import ringing
+from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
+from tgdsl.sensors.noise.reference import normal_pair
+from tgdsl.sensors.upstream import PLACE, SAMPLES
+from tgdsl.surfaces.surface import Surface
+
+Strikes = list[tuple[float, float]]
+"""When each impulse acts after the start of the step [s], and how large it is [N·s]."""
+
+
+def reference(
+    spec: ContactAudioSpec, layout: Layout, gathered: References, context: ReferenceContext, state: ReferenceState
+) -> ReferenceAnswer:
+    """Return the samples of one step (sample, row, 1) [m/s], or the energies of its bands (row, band); and what is kept.
+
+    Of samples there is also what a microphone hears.
+    """
+    loads, step = gathered[Loads], context.dt
+    modes = ringing(spec, layout, spec.timestep or step, _no_surface)
+    is_paper, below = spec.model == "paper", highest(spec.samples, step)
+    before = loads.force if context.is_first else state["steady"]
+    pending = state.get("pending", np.zeros_like(before))
+    impulse, steady, pending = reference_impulses(loads.force, (before, pending), step, spec.settling, is_paper)
+    axis = 1 if spec.of == "link" else 0
+    struck, rubbed = impulse.sum(axis=axis), loads.sliding.sum(axis=axis)
+    num = len(struck)
+    phasors, heard = state["phasors"].copy(), np.zeros((spec.samples, num))
+    half = modes.frequency.shape[1]
+    amplitude = np.zeros((num, half))
+    for row in range(num):
+        strikes = _strikes(spec, context, row, num, float(struck[row]), float(rubbed[row]))
+        for m in range(half):
+            frequency, decay, gain = (float(table[row, m]) for table in (modes.frequency, modes.decay, modes.gain))
+            if not 0 < frequency <= below * (1 + 1e-12):
+                phasors[row, [m, half + m]] = 0.0
+                continue
+            rate, before = complex(-decay, 2 * math.pi * frequency), complex(phasors[row, m], phasors[row, half + m])
+            samples, after = _ring(rate, before, strikes, spec.samples, step, is_paper)
+            heard[:, row] += gain * samples
+            phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
+            amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
+    after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
+    if spec.outputs == "bands":
+        return _bands(spec, modes.frequency, amplitude), after
+    return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
+
+
+def _no_surface(name: str) -> Surface:
+    raise NotImplementedError(f"the reference of contact audio knows listed modes alone, not those of the shape of {name}")
+
+
+def _strikes(
+    spec: ContactAudioSpec, context: ReferenceContext, row: int, num_rows: int, impulse: float, rubbed: float
+) -> Strikes:
+    """Return the impulses on a row: the impact at the start of the step, and noise of variance m_s W Δt/G each."""
+    is_paper = spec.model == "paper"
+    grains = 1 if spec.scrape == 0 else spec.samples if is_paper else GRAINS
+    times = [(g + 1) * context.dt / spec.samples if is_paper else g * context.dt / GRAINS for g in range(grains)]
+    if spec.scrape == 0:
+        return [(times[0], impulse)]
+    words = (grains + 1) // 2
+    index = np.arange(row * words, (row + 1) * words, dtype=np.uint64)
+    normals = np.stack(normal_pair(context.words(index)), axis=-1).ravel()
+    size = math.sqrt(spec.scrape * rubbed * context.dt / grains)
+    return [(time, size * normals[g] + (impulse if g == 0 else 0.0)) for g, time in enumerate(times)]
+
+
+def _ring(
+    rate: complex, phasor: complex, strikes: Strikes, samples: int, step: float, is_paper: bool
+) -> tuple[Float[np.ndarray, " sample"], complex]:
+    """Return what a mode of gain 1 sounds like in a step, and its phasor at the end."""
+    if is_paper:
+        return _two_pole(rate, phasor, strikes, samples, step)
+    times = np.arange(1, samples + 1) * step / samples
+    found = [
+        (np.exp(rate * t) * phasor).imag + sum((u * np.exp(rate * (t - s))).imag for s, u in strikes if s <= t + 1e-12 * step)
+        for t in times
+    ]
+    return np.array(found), complex(np.exp(rate * step) * phasor + sum(u * np.exp(rate * (step - s)) for s, u in strikes))
+
+
+def _two_pole(
+    rate: complex, phasor: complex, strikes: Strikes, samples: int, step: float
+) -> tuple[Float[np.ndarray, " sample"], complex]:
+    """Return y[k] = a₁ y[k−1] − a₂ y[k−2] + u[k], and the phasor whose imaginary part has the last two as its last values."""
+    pole = np.exp(rate * step / samples)
+    first, second = 2 * pole.real, abs(pole) ** 2
+    last, before = phasor.imag, (phasor / pole).imag
+    found = []
+    for k in range(samples):
+        struck = sum(u for time, u in strikes if abs(time - (k + 1) * step / samples) < 1e-9 * step)
+        last, before = first * last - second * before + struck, last
+        found.append(last)
+    # y = Im z and y[k−1] = Im(z/p): two equations for Re z, with 1/p = p*/|p|².
+    real = (last * pole.real - before * second) / pole.imag
+    return np.array(found), complex(real, last)
+
+
+def _bands(spec: ContactAudioSpec, frequency: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """Return ½ Σ (g |z|)² of the modes in each third octave (row, band) [m²/s²], or its level [dB]."""
+    found = np.zeros((len(frequency), len(band_numbers(frequency))))
+    for place, own in np.ndenumerate(frequency):
+        for b, number in enumerate(band_numbers(frequency)):
+            if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
+                found[place[0], b] += 0.5 * amplitude[place] ** 2
+    return 10 * np.log10(1 + found / quiet()) if spec.scale == "decibel" else found

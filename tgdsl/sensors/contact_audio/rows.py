@@ -1,0 +1,113 @@
+"""What rings, and its modes that are heard at the sample rate.
+
+Shapes: `row` bodies or objects that ring, `mode` modes of the one with most.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tgdsl.errors import LowerError, listed
+from tgdsl.layout.layout import Layout
+from tgdsl.modal.modes import Modes
+from tgdsl.sensors.base import Axis, body_axis
+from tgdsl.sensors.contact_audio.given_modes import modes_of
+from tgdsl.sensors.contact_audio.operators import HIGHEST, highest
+from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, ModesField
+from tgdsl.surfaces.surface import Surface
+
+SurfaceByName = Callable[[str], Surface]
+"""Returns the surface of something that rings, by its name."""
+
+
+class Ringing(NamedTuple):
+    """The modes of all rows that are heard; those that a row has fewer of than another are 0.
+
+    Attributes:
+        frequency: [Hz].
+        decay: [1/s].
+        gain: [1/kg].
+        notes: What was left out, and why.
+    """
+
+    frequency: Float[np.ndarray, "row mode"]
+    decay: Float[np.ndarray, "row mode"]
+    gain: Float[np.ndarray, "row mode"]
+    notes: tuple[str, ...]
+
+
+def axis_of(spec: ContactAudioSpec, layout: Layout) -> Axis:
+    """Return what rings: the bodies that carry the sensor, or the objects."""
+    return body_axis(layout) if spec.of == "link" else Axis("object", len(spec.feels), {"object": spec.feels})
+
+
+def names_of(spec: ContactAudioSpec, layout: Layout) -> list[tuple[str, tuple[str, ...]]]:
+    """Return of each row the name of its link or object, and all that it can be chosen by."""
+    if spec.of == "object":
+        return [(name, (name,)) for name in spec.feels]
+    own = [[link.name for link in layout.links if link.body == body] for body in layout.bodies]
+    return [(names[0], (*names, body)) for names, body in zip(own, layout.bodies, strict=True)]
+
+
+def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: SurfaceByName) -> Ringing:
+    """Return the modes of what rings.
+
+    Args:
+        spec: The sensor.
+        layout: Its links.
+        step: The time step [s].
+        surface: Returns surfaces.
+
+    Raises:
+        LowerError: If a pattern matches nothing, or a body has no mode that is heard at the sample rate.
+    """
+    rows = names_of(spec, layout)
+    for pattern in spec.bodies:
+        if not any(fnmatchcase(name, pattern) for _, names in rows for name in names):
+            what = f'`bodies`: no {spec.of} of the sensor matches "{pattern}"'
+            raise LowerError(what, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
+    below, each, notes = highest(spec.samples, step), [], []
+    for name, names in rows:
+        modes = modes_of(_given(spec, names), name, lambda own=name: surface(own), below)
+        is_heard = modes.frequency <= below * (1 + 1e-12)
+        if not is_heard.any():
+            raise _unheard(name, modes, spec, step)
+        if not is_heard.all():
+            notes.append(f"{name}: {_dropped(modes.frequency[~is_heard])}: the sample rate is {spec.samples / step:g} Hz")
+        each.append((modes, is_heard))
+    for note in notes:
+        warnings.warn(f"contact audio of {note}, and frequencies up to {HIGHEST:g} of it are heard", stacklevel=2)
+    most = max(int(is_heard.sum()) for _, is_heard in each)
+    frequency, decay, gain = np.zeros((3, len(rows), most))
+    for i, (modes, is_heard) in enumerate(each):
+        count = int(is_heard.sum())
+        for table, own in ((frequency, modes.frequency), (decay, modes.decay), (gain, modes.gain)):
+            table[i, :count] = own[is_heard]
+    return Ringing(frequency, decay, gain, tuple(notes))
+
+
+def _given(spec: ContactAudioSpec, names: tuple[str, ...]) -> ModesField:
+    own = (modes for pattern, modes in spec.bodies.items() if any(fnmatchcase(name, pattern) for name in names))
+    return next(own, spec.modes)
+
+
+def _dropped(frequency: np.ndarray) -> str:
+    shown = listed([f"{own:.5g} Hz" for own in frequency.tolist()], 8)
+    return f"{'a mode is' if len(frequency) == 1 else 'modes are'} left out, {shown}"
+
+
+def _unheard(name: str, modes: Modes, spec: ContactAudioSpec, step: float) -> LowerError:
+    """Return the error of a body that has no mode below the largest frequency."""
+    if not len(modes.frequency):
+        return LowerError(f'"{name}" has no mode below {highest(spec.samples, step):.5g} Hz', "samples", "take more samples")
+    lowest = float(modes.frequency.min())
+    what = f'the lowest mode of "{name}" is at {lowest:.5g} Hz, and {spec.samples} samples of a step of {step:g} s hold '
+    needed = math.ceil(lowest * step / HIGHEST * (1 - 1e-12))
+    return LowerError(f"{what}{highest(spec.samples, step):.5g} Hz", "samples", f"it needs `samples: {needed}`")

@@ -1,0 +1,80 @@
+"""What a document says of a contact audio sensor."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, model_validator
+
+from tgdsl.fields.models import Frequency, NonNegative, Number, Positive, Quantity, SpecModel, Usual
+from tgdsl.modal.spec import ShapeModes
+from tgdsl.sensors.base import ProbeSpec
+
+Time = Annotated[float, Quantity("time", gt=0.0)]
+
+
+class ModeSpec(SpecModel):
+    """One mode of vibration."""
+
+    frequency: Annotated[Frequency, Usual("frequency", low=1.0, high=1e5)]
+    """Its frequency, f [Hz]."""
+    decay: Positive
+    """Rate at which its amplitude decays, d [1/s]; it falls by 60 dB in 6.91/d."""
+    gain: Number = 1.0
+    """Amplitude of what is heard per impulse, g [1/kg]."""
+
+
+def _as_shape(found: Any) -> Any:
+    return {"material": found} if isinstance(found, str) else found
+
+
+def _tag(value: Any) -> str:
+    return "a list of modes" if isinstance(value, (list, tuple)) else "of the shape"
+
+
+ListedModes = Annotated[tuple[ModeSpec, ...], Field(min_length=1)]
+ModesField = Annotated[
+    Annotated[ListedModes, Tag("a list of modes")] | Annotated[ShapeModes, Tag("of the shape")],
+    Discriminator(_tag),
+    BeforeValidator(_as_shape, json_schema_input_type=str | ListedModes | ShapeModes),
+]
+"""What a user may write for the modes of a body: a list of them, `{material: steel, …}` for those of its shape, or `steel`."""
+
+
+class ContactAudioSpec(ProbeSpec):
+    """What bodies sound like that are struck and scraped."""
+
+    kind: Literal["contact_audio"]
+    """Sound of each body that is struck or scraped: blocks of samples [m/s], or energies by band [m²/s²]."""
+    of: Literal["link", "object"] = "link"
+    """Whose bodies ring: the links of the sensor, struck by the objects it feels, or these objects, struck by the links."""
+    modes: ModesField
+    """Modes of what rings: a list of frequency, decay and gain; `{material: steel}` or `steel` for those of its shape."""
+    bodies: dict[str, ModesField] = {}
+    """Other modes, by names of links (of objects with `of: object`) or shell wildcards; the first that matches counts."""
+    samples: Annotated[StrictInt, Field(ge=1)] = 16
+    """Samples per physics step, K: the sample rate is K over the time step."""
+    substeps: Annotated[StrictInt, Field(ge=1)] = 1
+    """Physics steps per call: a reading holds the blocks of all of them, one after the other."""
+    timestep: Annotated[Time | None, Usual("time", low=1e-5, high=0.1)] = None
+    """Time that a physics step takes [s]; default: that of the scene."""
+    settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
+    """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound."""
+    scrape: NonNegative = 1e-5
+    """Noise of sliding, m_s [kg]: with a normal force of 1 N at 1 m/s, variance of the impulses of one second [N²·s²]."""
+    outputs: Literal["samples", "bands"] = "samples"
+    """`samples` to hear, one after the other; or `bands`: energy in third octaves, once per physics step."""
+    scale: Literal["linear", "decibel"] | None = None
+    """Of `bands`: `linear` [m²/s²], the default, or `decibel`, 10 lg(1 + E/E₀) with E₀ = (1 µm/s)²."""
+    model: Literal["physical", "paper"] = "physical"
+    """`paper`: the two-pole response as printed, and impulses of each rise of the force, however many steps it takes."""
+    slots: Annotated[StrictInt, Field(ge=1)] = 4
+    """Contacts per pair of body and object that are read one by one."""
+    needs_taxels: ClassVar[bool] = False
+    is_on_taxels: ClassVar[bool] = False
+
+    @model_validator(mode="after")
+    def _is_used(self) -> ContactAudioSpec:
+        if self.scale is not None and self.outputs != "bands":
+            raise ValueError("`scale` is used by `outputs: bands` alone, expected it to be left out")
+        return self

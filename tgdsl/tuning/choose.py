@@ -1,0 +1,227 @@
+"""Chooses what sensors with an `accuracy` leave open: the cheapest that holds it on states of the document's scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from tgdsl.compiler.pipeline import Choice, Document, compile_plan
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import LowerError, SpecError, TgdslError
+from tgdsl.fields.accuracy import Accuracy
+from tgdsl.files.cache import cached
+from tgdsl.files.find import is_file
+from tgdsl.module.accuracy.variants import bare, is_taken
+from tgdsl.module.module import TactileModule
+from tgdsl.schema.load import load
+from tgdsl.schema.loaded import Loaded
+from tgdsl.schema.objects import query_alternatives
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
+from tgdsl.tuning.account import Shared, account
+from tgdsl.tuning.recording import Recording, record
+from tgdsl.tuning.trial import Level, Outcome, Places, Trial, cheapest, level_of
+from tgdsl.tuning.trials import Sensor
+
+FORMAT = 1
+"""Version of how choices are made."""
+ENVS, STEPS = 16, 90
+"""Environments of the run, of which half choose and half verify (more where objects have more variants), and control steps."""
+
+
+class Task(NamedTuple):
+    """A document that is compiled, and the sensors in it that have an `accuracy`."""
+
+    document: Document
+    overrides: Mapping[str, Any]
+    kinds: Sequence[Kind]
+    sensors: Collection[str] | None
+    loaded: Loaded
+    wanted: Mapping[str, Accuracy]
+    progress: Progress
+
+
+def choose(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
+) -> Choice:
+    """Return what is chosen for the sensors of a document that have an `accuracy`.
+
+    A variant holds it if the RMS error of each quantity, against the finest variant in float64, is within the bound: with 95 %
+    confidence in one half of the environments of a scripted run, and as measured in the other half, which takes no part. Of
+    those the one of fewest counted operations is taken, then of fewest bytes. What is chosen is kept in the cache.
+
+    Args:
+        document: The document.
+        overrides: By dotted path YAML text, or a plain value. What is set there counts as written.
+        kinds: Kinds beside tgdsl's and those of installed packages.
+        progress: Is told what is done.
+        sensors: Names of the sensors that are wanted; default: all.
+
+    Raises:
+        SpecError: What is wrong with the document, or an `accuracy` that nothing holds.
+    """
+    if not _is_asked(document, overrides):
+        return Choice()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what it warns of is told where it is compiled
+        task = task_of(document, overrides, kinds, progress, sensors)
+        return cached(key_of(task), lambda: _chosen(task), packed, unpacked) if task.wanted else Choice()
+
+
+def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
+    """Return whether a document may have an `accuracy`, without reading it twice; one that cannot be read has none."""
+    if "accuracy" in repr(overrides):
+        return True
+    if isinstance(document, (str, PathLike)):
+        return is_file(Path(document)) and b"accuracy" in Path(document).read_bytes()
+    return "accuracy" in repr(document)
+
+
+def task_of(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
+) -> Task:
+    """Return what is to be chosen: see `choose`.
+
+    Raises:
+        SpecError: If so much is wrong with the document that it cannot be looked at.
+    """
+    loaded = load(document, overrides, known_kinds(kinds), sensors=sensors)
+    wanted = {name: spec.accuracy for name, spec in loaded.spec.sensors.items() if spec.accuracy is not None}
+    return Task(document, overrides or {}, kinds, sensors, loaded, wanted, progress or silent)
+
+
+def key_of(task: Task) -> str:
+    """Return a hash of all that a choice follows from: what the document computes now, what is asked for, and what is free.
+
+    Raises:
+        SpecError: What is wrong with the document.
+    """
+    unchosen = Choice(notes=dict.fromkeys(task.wanted, ()))
+    own = compile_plan(task.document, task.overrides, task.kinds, task.progress, task.sensors, unchosen)
+    blank = dataclasses.replace(own.origin, document_sha256="")
+    specs = {"sensors": task.loaded.spec.sensors, "objects": task.loaded.spec.objects}
+    written = {f"{part}.{name}": sorted(spec.model_fields_set) for part, each in specs.items() for name, spec in each.items()}
+    kinds = {kind.name: kind for kind in known_kinds(task.kinds)}
+    asked = {name: task.loaded.spec.sensors[name] for name in task.wanted}
+    known = {name: kinds[spec.kind].alternatives(spec) for name, spec in asked.items()}  # type: ignore[attr-defined]
+    parts = [FORMAT, ENVS, STEPS, dataclasses.replace(own, origin=blank).to_json(), repr(task.wanted), written, known]
+    parts += [query_alternatives(), {name: version(name) for name in ("tgdsl", "torch", "mujoco")}]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=repr).encode()).hexdigest()
+
+
+def packed(choice: Choice) -> dict[str, np.ndarray]:
+    """Return what a cache file holds of a choice."""
+    text = json.dumps({"changes": dict(choice.changes), "notes": dict(choice.notes)})
+    return {"choice": np.frombuffer(text.encode(), dtype=np.uint8)}
+
+
+def unpacked(arrays: Mapping[str, np.ndarray]) -> Choice:
+    """Return the choice that `packed` packed."""
+    found = json.loads(arrays["choice"].tobytes())
+    return Choice(found["changes"], {name: tuple(lines) for name, lines in found["notes"].items()})
+
+
+class Found(NamedTuple):
+    """What was chosen for a sensor."""
+
+    trial: Trial
+    outcome: Outcome
+    level: Level
+
+
+def _chosen(task: Task) -> Choice:
+    """Measure and choose: for each sensor by itself, then with objects as fine as the strictest sensor needs.
+
+    Raises:
+        SpecError: If there is a sensor whose accuracy nothing holds, or that cannot be measured.
+    """
+    recording, floors = _states(task), _floors(task.loaded, task.wanted)
+
+    def by_itself(name: str) -> Found:
+        sensor = Sensor.of(task.document, task.overrides, name, task.kinds)
+        trial = Trial(sensor, task.wanted[name], recording, task.progress)
+        return Found(trial, *cheapest(trial, trial.fields(), trial.levels(floors)))
+
+    found = _each(task, list(task.wanted), by_itself)
+    alone = {name: own.level.places for name, own in found.items()}
+    places: dict[str, int] = {}
+    for own in alone.values():
+        places |= {target: max(place, places.get(target, place)) for target, place in own.items()}
+
+    def with_others(name: str) -> Found:
+        trial, level = found[name].trial, level_of({target: places[target] for target in alone[name]})
+        return Found(trial, *cheapest(trial, trial.fields(), [level]))
+
+    moved = [name for name, own in alone.items() if any(places[target] != place for target, place in own.items())]
+    found |= _each(task, moved, with_others)
+    changes = {key: value for own in found.values() for key, value in own.outcome.variant.changes.items()}
+    shared = Shared(places, alone, floors)
+    return Choice(changes, {name: account(own.trial, own.outcome, shared) for name, own in found.items()})
+
+
+def _each(task: Task, names: Sequence[str], work: Callable[[str], Found]) -> dict[str, Found]:
+    """Return what work returns of each sensor.
+
+    Raises:
+        SpecError: All that it refuses, where `accuracy` stands.
+    """
+    found, problems = {}, []
+    for name in names:
+        try:
+            found[name] = work(name)
+        except LowerError as error:
+            problems.append(task.loaded.problem(("sensors", name, "accuracy"), error.what, error.hint))
+    if problems:
+        raise SpecError(problems)
+    return found
+
+
+def _floors(loaded: Loaded, wanted: Collection[str]) -> Places:
+    """Return of objects that sensors without an accuracy feel which way they have: no coarser one is taken."""
+    felt = {target for name, spec in loaded.spec.sensors.items() if name not in wanted for target in spec.objects}
+    alternatives = query_alternatives()
+    found = {}
+    for target in sorted(felt & loaded.spec.objects.keys()):
+        own = [i for i, other in enumerate(alternatives) if is_taken(loaded.spec.objects[target], other)]
+        found |= {target: own[0]} if own else {}
+    return found
+
+
+def _states(task: Task) -> Recording:
+    """Return states of a run of the scene, with all that the sensors read without imperfections.
+
+    Raises:
+        SpecError: If the scene cannot be run.
+    """
+    changes = {key: value for name in task.wanted for key, value in bare(name).items()}
+    plan = compile_plan(task.document, {**task.overrides, **changes}, task.kinds, task.progress, list(task.wanted))
+    inputs = plan.inputs
+    num_envs = max([ENVS, *(2 * num for num in (*inputs.num_variants, *inputs.num_materials))])
+    try:
+        return record(
+            TactileModule(plan, known_kinds(task.kinds), torch.float32), num_envs, steps=STEPS, progress=task.progress
+        )
+    except TgdslError as error:
+        what = f"there are no states to measure errors on: {error}"
+        at = [("sensors", name, "accuracy") for name in task.wanted]
+        raise SpecError(
+            [task.loaded.problem(path, what, "take it out, or give a scene that can be run") for path in at]
+        ) from error

@@ -1,0 +1,79 @@
+"""The whole way from a document to a module: what `accuracy` leaves open is chosen by measured error first."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import torch
+
+from tgdsl.compiler import pipeline
+from tgdsl.compiler.pipeline import Document
+from tgdsl.console.progress import Progress
+from tgdsl.errors import TgdslError
+from tgdsl.module.module import TactileModule
+from tgdsl.plan.plan import Plan
+from tgdsl.sensors import Kind
+from tgdsl.sensors.known import known_kinds
+from tgdsl.tensors.devices import device_of, dtype_of
+from tgdsl.tuning.choose import choose
+
+
+def compile_plan(
+    document: Document,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    progress: Progress | None = None,
+    sensors: Collection[str] | None = None,
+) -> Plan:
+    """Return the Plan of a document, as `compile` has it.
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column.
+        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+    """
+    choice = choose(document, overrides, kinds, progress, sensors)
+    return pipeline.compile_plan(document, overrides, kinds, progress, sensors, choice)
+
+
+def compile(
+    document: Document,
+    *,
+    resolution: str | None = None,
+    sensors: Collection[str] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    kinds: Sequence[Kind] = (),
+    dtype: torch.dtype | str = torch.float32,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+) -> TactileModule:
+    """Compile a document to a module.
+
+    Args:
+        document: A YAML file, or the same as a mapping (file names in it are then relative to the working folder).
+        resolution: Instead of the document's own.
+        sensors: Names of the document's sensors that are wanted: of the others nothing is computed; default: all.
+        overrides: YAML text, or plain values, by dotted path, such as `{"sensors.touch.normal_stiffness": 400.0}`.
+        kinds: Sensor kinds of your own, beside those of tgdsl and of installed packages: see `sensors.known`.
+        dtype: Dtype of the readings, and of what is computed on the way: float32 or float64; its name will do. Narrower floats
+            are refused, as their rounding of places is as large as the depths; cast the readings instead,
+            `readings["s"].to(torch.bfloat16)`.
+        device: Where the module lives.
+        progress: Is told in a line what is being done, such as "object mug: distances", each time that something begins; meshes
+            that are met for the first time take seconds, sensors with an `accuracy` a run of the scene.
+
+    Returns:
+        The module, not yet compiled by torch: call its `compile()` for fused kernels.
+
+    Raises:
+        SpecError: All mistakes in the document and its layout, with file, line and column; an `accuracy` that nothing holds.
+        RobotError: If a robot or scene file cannot be read, or holds what is not supported.
+        TgdslError: If the dtype is neither float32 nor float64, there is no such device, a kind is none, or the overrides are
+            no mapping.
+    """
+    dtype, device = dtype_of(dtype), device_of(device)
+    if not isinstance(overrides, Mapping | None):
+        raise TgdslError(f"overrides are a mapping from dotted paths to values, found {type(overrides).__name__}")
+    chosen = {**(overrides or {}), **({"resolution": resolution} if resolution is not None else {})}
+    plan = compile_plan(document, chosen, kinds, progress, sensors)
+    return TactileModule(plan, known_kinds(kinds), dtype).to(device)

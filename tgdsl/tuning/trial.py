@@ -1,0 +1,273 @@
+"""One sensor that has an `accuracy`: its variants, what each costs, and how far each is off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+
+from tgdsl.console.progress import Progress
+from tgdsl.errors import LowerError, TgdslError, listed
+from tgdsl.fields.accuracy import Accuracy, Bound
+from tgdsl.module.accuracy.errors import Errors, errors_of, halves
+from tgdsl.module.accuracy.states import readings_of, rows_at, taken
+from tgdsl.module.accuracy.variants import Variant, is_free, is_taken, written_of
+from tgdsl.schema.objects import query_alternatives
+from tgdsl.tuning.recording import Recording
+from tgdsl.tuning.trials import Cost, Exact, Sensor, cost_of, exact_of, finest_of
+
+Places = Mapping[str, int]
+"""Of objects, which of `query_alternatives` they have."""
+
+
+class Level(NamedTuple):
+    """A way to find distances to the meshes that a sensor feels."""
+
+    variant: Variant
+    places: Places
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A variant, measured.
+
+    Attributes:
+        variant: It.
+        cost: What it takes, counted.
+        chosen: Errors of each quantity in the environments that variants are compared in.
+        verified: The same in the others, which take no part.
+        excess: Largest upper end of an interval of `chosen` over its bound: at most 1 if the accuracy is held.
+        verified_excess: Largest error of `verified` over its bound.
+    """
+
+    variant: Variant
+    cost: Cost
+    chosen: Mapping[str, Errors]
+    verified: Mapping[str, Errors]
+    excess: float
+    verified_excess: float
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the accuracy is held, in the environments that take no part too."""
+        return self.excess <= 1 and self.verified_excess <= 1
+
+
+class Trial:
+    """A sensor's variants on recorded states, each measured once.
+
+    Attributes:
+        sensor: The sensor.
+        accuracy: What is asked for.
+        bounds: The same for each quantity.
+        recording: The states.
+        left_out: Why variants cannot be had, by their labels.
+        exact: What errors are measured against.
+        outcomes: What was measured, by the variants' labels.
+    """
+
+    def __init__(self, sensor: Sensor, accuracy: Accuracy, recording: Recording, progress: Progress):
+        """Raise `LowerError` if the reading does not change on the states, or what is written is the finest there is."""
+        self.sensor, self.accuracy, self.recording, self._progress = sensor, accuracy, recording, progress
+        self.left_out: dict[str, str] = {}
+        self.exact: Exact = exact_of(sensor, finest_of(sensor, self.left_out), recording, progress)
+        self.outcomes: dict[str, Outcome] = {}
+        self._costs: dict[str, Cost] = {}
+        self.bounds: dict[str, Bound] = {}
+        for name in dict.fromkeys(self.exact.quantities):
+            bound = accuracy.of(name)
+            assert bound is not None  # the compiler has refused it else
+            self.bounds[name] = bound
+        self._check_states()
+
+    def channels(self, quantity: str) -> list[int]:
+        """Return which channels are components of a quantity."""
+        return [i for i, own in enumerate(self.exact.quantities) if own == quantity]
+
+    def fields(self) -> list[Variant]:
+        """Return the choices of the sensor's fields whose errors can be measured and that change nothing that is written."""
+        known = [own for own in self.sensor.variants.fields if own.label not in self.left_out]
+        finest = known[-1] if known else None
+        if finest is not None and not finest.is_exact:
+            known = known[:-1]
+        found = [own for own in known if own.is_free]
+        is_finest = finest is not None and finest.is_own and not finest.is_exact
+        if not any(own.is_own for own in found) and not is_finest:
+            found.insert(0, Variant("as written", is_own=True))
+        if not found:
+            self._refuse_finest(self.sensor.variants.own.label)
+        return found
+
+    def levels(self, floors: Places) -> list[Level]:
+        """Return the ways to find distances to meshes, from coarse to fine, that change nothing that is written.
+
+        Args:
+            floors: Of objects that sensors without an accuracy feel too, which of the ways they have: none coarser is taken.
+        """
+        alternatives = query_alternatives()
+        known = [i for i, own in enumerate(alternatives) if own.label not in self.left_out]
+        finest, queried = alternatives[known[-1]], self.sensor.queried
+        if not finest.is_exact:
+            known = known[:-1]
+            if any(is_taken(spec, finest) for spec in queried.values()):
+                self._refuse_finest(finest.label)
+        free = {
+            name: [i for i in known if i >= floors.get(name, 0) and is_free(spec, alternatives[i])]
+            for name, spec in queried.items()
+        }
+        free = {name: own for name, own in free.items() if own}
+        found: dict[tuple[int, ...], Level] = {}
+        for i in known:
+            places = {name: next((j for j in own if j >= i), own[-1]) for name, own in free.items()}
+            found.setdefault(tuple(places.values()), level_of(places))
+        return list(found.values())
+
+    def outcome(self, variant: Variant) -> Outcome | None:
+        """Return a variant's errors; None if it cannot be had."""
+        if variant.label not in self.outcomes:
+            cost = self.cost(variant)
+            if cost is None:
+                return None
+            self._progress(f"{self.sensor.name}: {variant.label}, errors")
+            chosen, verified = self._errors(variant)
+            self.outcomes[variant.label] = Outcome(
+                variant,
+                cost,
+                chosen,
+                verified,
+                max(errors.rms.high / self.bounds[name].value for name, errors in chosen.items()),
+                max(errors.rms.value / self.bounds[name].value for name, errors in verified.items()),
+            )
+        return self.outcomes[variant.label]
+
+    def cost(self, variant: Variant) -> Cost | None:
+        """Return what a variant takes, counted; None if it cannot be had."""
+        if variant.label not in self._costs:
+            self._progress(f"{self.sensor.name}: {variant.label}")
+            try:
+                plan = self.sensor.plan(variant)
+            except TgdslError as error:
+                self.left_out[variant.label] = str(error)
+                return None
+            self._costs[variant.label] = cost_of(self.sensor.module(plan, torch.float32), 4)
+        return self._costs[variant.label]
+
+    def _errors(self, variant: Variant) -> Iterator[dict[str, Errors]]:
+        """Yield the errors of each quantity, in the environments that choose and in those that verify."""
+        touch, exact = self.sensor.module(self.sensor.plan(variant), torch.float32), self.exact
+        found = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
+        found = taken(found, rows_at(exact.module, touch, self.sensor.name))
+        for envs in halves(self.recording.num_envs):
+            errors = {}
+            for name, bound in self.bounds.items():
+                own = self.channels(name)
+                pair = (found[:, envs][..., own], exact.readings[:, envs][..., own])
+                errors[name] = errors_of(*pair, exact.magnitude.of(envs, own), is_relative=not bound.unit)
+            yield errors
+
+    def _check_states(self) -> None:
+        for envs in halves(self.recording.num_envs):
+            for name in self.bounds:
+                if not self.exact.magnitude.of(envs, self.channels(name)).active.any():
+                    what = f"its {name} never changes on these states ({self.recording.source}), so no error can be measured"
+                    hint = "give the scene keyframes `rest` and `squeeze` between which its links meet what they feel"
+                    raise LowerError(what, "accuracy", hint)
+
+    def _refuse_finest(self, label: str) -> None:
+        lacking = "".join(f"; {label}: {why}" for label, why in self.left_out.items())
+        what = f"what is written, {label}, is the finest there is: nothing is known that its error could be measured against"
+        raise LowerError(f"{what}{lacking}", "accuracy", "write a coarser one, or none")
+
+
+def level_of(places: Places) -> Level:
+    """Return the variant in which objects find distances in given ways."""
+    alternatives = query_alternatives()
+    changes = {f"objects.{name}.{key}": v for name, i in places.items() for key, v in alternatives[i].changes.items()}
+    labels = dict.fromkeys(alternatives[i].label for i in places.values())
+    each = [f"{name} {alternatives[i].label}" for name, i in places.items()]
+    return Level(Variant(next(iter(labels), "") if len(labels) < 2 else "; ".join(each), changes), places)
+
+
+def joined(fields: Variant, level: Level) -> Variant:
+    """Return the variant of a choice of fields and one of distances."""
+    if not level.places:
+        return fields
+    return level.variant if not fields.changes else fields.joined(level.variant)
+
+
+def cheapest(trial: Trial, fields: Sequence[Variant], levels: Sequence[Level]) -> tuple[Outcome, Level]:
+    """Return the cheapest variant that holds an accuracy, and how it finds distances: fewest operations, then fewest bytes.
+
+    Where there are choices of both, those that do not hold it beside the finest of the other kind are left out first.
+
+    Raises:
+        LowerError: If none does: it names the best.
+    """
+    fields, levels = list(fields), list(levels)
+    if len(fields) > 1 and len(levels) > 1:
+        fine = levels[-1]
+        fields = [own for own in fields if _is_near(trial, joined(own, fine))] or fields
+        finest = fields[-1]
+        levels = [own for own in levels if _is_near(trial, joined(finest, own))] or levels
+    options = [(joined(own, level), level) for own in fields for level in levels]
+    costs = {option[0].label: cost for option in options if (cost := trial.cost(option[0])) is not None}
+    options = [option for option in options if option[0].label in costs]
+    options.sort(key=lambda option: (costs[option[0].label].operations or 0, costs[option[0].label].constants))
+    for variant, level in options:
+        outcome = trial.outcome(variant)
+        if outcome is not None and outcome.is_held:
+            return outcome, level
+    raise _missed(trial)
+
+
+def _is_near(trial: Trial, variant: Variant) -> bool:
+    outcome = trial.outcome(variant)
+    return outcome is not None and outcome.is_held
+
+
+def _missed(trial: Trial) -> LowerError:
+    best = min(trial.outcomes.values(), key=lambda own: max(own.excess, own.verified_excess))
+    what = f"nothing that is free to choose holds {trial.accuracy}; best: {best.variant.label}, {shown_errors(trial, best)}"
+    lacking = [f"{label} cannot be had: {why}" for label, why in trial.left_out.items()]
+    return LowerError(
+        what, "accuracy", "; ".join([*_pinned(trial), *lacking, f"errors are against {trial.exact.variant.label}"])
+    )
+
+
+def _pinned(trial: Trial) -> list[str]:
+    written = written_fields(trial)
+    return [f"{listed(written)} stay{'s' if len(written) == 1 else ''} as written"] if written else []
+
+
+def written_fields(trial: Trial) -> list[str]:
+    """Return the fields that other choices would change if nobody had written them, by dotted path."""
+    sensor = trial.sensor
+    found = [f"sensors.{sensor.name}.{key}" for key in written_of(sensor.spec, sensor.kind.alternatives(sensor.spec))]
+    for name, spec in sensor.queried.items():
+        found += [f"objects.{name}.{key}" for key in written_of(spec, query_alternatives())]
+    return found
+
+
+def shown_errors(trial: Trial, outcome: Outcome) -> str:
+    """Return the errors of each quantity, in their bounds' units."""
+    parts = []
+    for name, bound in trial.bounds.items():
+        own = outcome.chosen[name].rms
+        apart = shown(outcome.verified[name].rms.value, bound)
+        parts.append(
+            f"RMS error of {name} {shown(own.value, bound)}, up to {shown(own.high, bound)} with 95 % confidence; "
+            f"{apart} in environments that took no part"
+        )
+    return "; ".join(parts)
+
+
+def shown(error: float, bound: Bound) -> str:
+    """Return an error in a bound's unit."""
+    return f"{brief(error)} {bound.unit}" if bound.unit else f"{brief(100 * error)} %"
+
+
+def brief(value: float) -> str:
+    """Return two digits of a number, and all before the point."""
+    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.2g}"

@@ -1,0 +1,213 @@
+"""A sensor's variants, compiled from its document with one thing changed, and their errors on recorded states.
+
+Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` numbers per row.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from tgdsl.compiler.pipeline import Document, compile_plan
+from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import TgdslError
+from tgdsl.module.accuracy.errors import Magnitude, magnitude_of
+from tgdsl.module.accuracy.states import readings_of, rows_at, taken
+from tgdsl.module.accuracy.variants import Variant, Variants, bare, queried_objects, variants_of
+from tgdsl.module.module import TactileModule
+from tgdsl.plan.plan import Plan
+from tgdsl.plan.sensors import PlannedReading
+from tgdsl.schema.load import load
+from tgdsl.schema.objects import ObjectSpec, query_alternatives
+from tgdsl.sensors.base import AnySensorSpec, Kind
+from tgdsl.sensors.known import known_kinds
+from tgdsl.sensors.noise.lower import quantity
+from tgdsl.tuning.recording import Recording
+
+
+class Cost(NamedTuple):
+    """What a module takes, counted.
+
+    Attributes:
+        operations: Elementary operations of one environment's call; None: not counted.
+        constants: Of all environments together [bytes].
+        state: What each environment carries from call to call [bytes].
+        output: What each environment's call returns [bytes].
+    """
+
+    operations: int | None
+    constants: int
+    state: int
+    output: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of a document, without imperfections, and how its variants are compiled.
+
+    Attributes:
+        document: The document.
+        overrides: What is other than in it, imperfections left out.
+        name: The sensor's name.
+        kind: Its kind.
+        spec: Its fields.
+        others: Kind and fields of all sensors that its Plan has: those that it reads, and itself.
+        queried: Of the objects with meshes that it feels, their fields.
+        own: The Plan of the document's own variant.
+        variants: The variants.
+        kinds: Kinds beside tgdsl's and those of installed packages.
+        plans: Plans that were made, by what they change.
+    """
+
+    document: Document
+    overrides: Mapping[str, Any]
+    name: str
+    kind: Kind
+    spec: AnySensorSpec
+    others: Mapping[str, tuple[Kind, AnySensorSpec]]
+    queried: Mapping[str, ObjectSpec]
+    own: Plan
+    variants: Variants
+    kinds: Sequence[Kind] = ()
+    plans: dict[str, Plan] = field(default_factory=dict)
+
+    @staticmethod
+    def of(document: Document, overrides: Mapping[str, Any], name: str, kinds: Sequence[Kind] = ()) -> Sensor:
+        """Return a sensor of a document.
+
+        Raises:
+            SpecError: What is wrong with the document.
+        """
+        changed, known = {**overrides, **bare(name)}, known_kinds(kinds)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            loaded = load(document, changed, known)
+        own, by_name = quiet_plan(document, changed, name, kinds), {kind.name: kind for kind in known}
+        others = {s.sensor: (by_name[s.kind], loaded.spec.sensors[s.sensor]) for s in own.sensors}
+        kind, spec = others[name]
+        queried = {target: loaded.spec.objects[target] for target in queried_objects(own)}
+        variants = variants_of(kind, name, spec, queried, query_alternatives())
+        return Sensor(document, changed, name, kind, spec, others, queried, own, variants, kinds)
+
+    @property
+    def reading(self) -> PlannedReading:
+        """Its reading."""
+        return self.own.readings()[self.name]
+
+    def plan(self, variant: Variant) -> Plan:
+        """Return the Plan of a variant.
+
+        Raises:
+            TgdslError: If it cannot be had.
+        """
+        if not variant.changes:
+            return self.own
+        key = repr(sorted(variant.changes.items()))
+        if key not in self.plans:
+            plan = quiet_plan(self.document, {**self.overrides, **variant.changes}, self.name, self.kinds)
+            self.module(plan, torch.float32)  # which may need a library that is missing
+            self.plans[key] = plan
+        return self.plans[key]
+
+    def module(self, plan: Plan, dtype: torch.dtype) -> TactileModule:
+        """Return the module of one of its Plans."""
+        return TactileModule(plan, known_kinds(self.kinds), dtype)
+
+
+def quiet_plan(document: Document, overrides: Mapping[str, Any], name: str, kinds: Sequence[Kind] = ()) -> Plan:
+    """Return the Plan of one sensor, without what compiling the whole document warns of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return compile_plan(document, overrides, kinds, sensors=[name])
+
+
+class Exact(NamedTuple):
+    """What errors of a sensor are measured against.
+
+    Attributes:
+        variant: The finest variant that can be had.
+        module: The document's own variant in float64, whose rows readings are compared at.
+        readings: The finest variant's, in float64, at those rows.
+        magnitude: What errors are relative to.
+        quantities: What each channel is a component of.
+        units: The unit of each channel.
+    """
+
+    variant: Variant
+    module: TactileModule
+    readings: Float[np.ndarray, "step env row channel"]
+    magnitude: Magnitude
+    quantities: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Progress = silent) -> Exact:
+    """Return what errors of a sensor are measured against.
+
+    Args:
+        sensor: The sensor.
+        finest: Its finest variant: see `finest_of`.
+        recording: States of the document's scene.
+        progress: Is told what is done.
+
+    Raises:
+        StateError: If the states are of another document.
+    """
+    progress(f"{sensor.name}: {finest.label}, float64")
+    own = sensor.module(sensor.own, torch.float64)
+    fine = sensor.module(sensor.plan(finest), torch.float64)
+    readings = taken(readings_of(fine, recording.for_module(fine.inputs), sensor.name), rows_at(own, fine, sensor.name))
+    quantities = tuple(quantity(channel) for channel in sensor.reading.channels)
+    return Exact(finest, own, readings, magnitude_of(readings, quantities), quantities, tuple(sensor.reading.units))
+
+
+def finest_of(sensor: Sensor, left_out: dict[str, str]) -> Variant:
+    """Return the finest variant: of its fields and of its queries the last that can be had.
+
+    Args:
+        sensor: The sensor.
+        left_out: Is told why finer ones cannot be had, by their labels.
+    """
+    found = [own for axis in (sensor.variants.fields, sensor.variants.queries) if (own := _last(sensor, axis, left_out))]
+    if not found:
+        return Variant(sensor.variants.own.label, is_own=True, is_exact=True)
+    return found[0] if len(found) == 1 else found[0].joined(found[1])
+
+
+def _last(sensor: Sensor, axis: Sequence[Variant], left_out: dict[str, str]) -> Variant | None:
+    for variant in reversed(axis):
+        if variant.label in left_out:
+            continue
+        try:
+            sensor.plan(variant)
+        except TgdslError as error:
+            left_out[variant.label] = str(error)
+        else:
+            return variant
+    return None
+
+
+def cost_of(touch: TactileModule, size: int) -> Cost:
+    """Return what a module takes, counted; its state is that of a single call.
+
+    Args:
+        touch: The module.
+        size: Bytes of a number that it returns.
+    """
+    state = touch.example_state(2)
+    with torch.no_grad():
+        touch(state)
+    kept = sum(buffer.numel() * buffer.element_size() for buffer in touch.memory.buffers()) // 2
+    touch.free()
+    return Cost(
+        operations=touch.operations_per_env(),
+        constants=sum(buffer.numel() * buffer.element_size() for buffer in touch.constants.buffers()),
+        state=kept,
+        output=size * sum(int(np.prod(output.shape)) for output in touch.outputs),
+    )
