@@ -56,6 +56,19 @@ def test_a_pitched_link_equals_an_upright_one(tmp_path, dtype, shift, tolerance)
         torch.testing.assert_close(pitched[name], upright[name], rtol=1e-6 if dtype == torch.float32 else 1e-12, atol=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_contacts_that_press_against_one_another_conduct_as_one_of_all_their_force(tmp_path, dtype):
+    """Their normals cancel: that of the first counts."""
+    place, one, other = (0.006, 0.004, -0.01), (0, 0, 1), (0, 0, -1)
+    module, found = heat_module(tmp_path, TIP, SENSOR, OBJECTS, dtype), []
+    for contacts in ([(place, one, 2.0), (place, other, 2.0)], [(place, one, 4.0)]):
+        module.reset()
+        state = heat_state(module, 0.05, {("tip", "ball"): contacts})
+        found.append(read(module, state.to("cpu", dtype))["heat"] - 22.0)
+    assert float(found[0].max()) > 0.05
+    torch.testing.assert_close(found[0], found[1], rtol=0, atol=3e-6 if dtype == torch.float32 else 1e-12)
+
+
 def test_the_step_may_change_from_call_to_call(tmp_path):
     """Two steps of 50 ms conduct what one of 100 ms does, whatever was called before."""
     module, found = heat_module(tmp_path, {"tip": [0.01] * 3}, {"cells": [3, 3, 3], "material": "steel"}), []

@@ -17,7 +17,7 @@ from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Scene
 from tgdsl.quantities.patches.part import PatchesPart, PatchesUse
 from tgdsl.quantities.patches.polygon import polygon_area
-from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects
+from tgdsl.quantities.patches.request import CANCELLED, ContactPatch, HeatOfObjects
 from tgdsl.quantities.patches.slots import slots_of
 
 
@@ -39,7 +39,7 @@ def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
     inverse = 1.0 / torch.where(total > 0, total, 1.0)
     share = [part * inverse for part in force]
     centre = _mean(share, [slot.pos for slot in slots])
-    normal = _unit(_mean(share, [slot.normal for slot in slots]))
+    normal = _direction(force, share, [slot.normal for slot in slots])
     area = polygon_area([planes.sub(slot.pos, centre) for slot in slots], normal, [part > 0 for part in force])
     turn = planes.rotation(scene.tensors["body_quat"][:, use.bodies])
     turn = planes.rot(part.to(scene.dtype)[..., None] for part in turn)
@@ -54,6 +54,15 @@ def _mean(share: Sequence[Tensor], of: Sequence[Vec]) -> Vec:
     """Return the sum of vectors, each times its share."""
     parts = [planes.scale(weight, vector) for weight, vector in zip(share, of, strict=True)]
     return reduce(planes.add, parts)
+
+
+def _direction(force: Sequence[Tensor], share: Sequence[Tensor], normals: Sequence[Vec]) -> Vec:
+    """Return the direction of the mean of normals, or of the first that counts where they cancel."""
+    mean, first = _mean(share, normals), normals[-1]
+    for weight, normal in zip(reversed(force[:-1]), reversed(normals[:-1]), strict=True):
+        first = planes.where(weight > 0, normal, first)
+    is_none = (planes.dot(mean, mean) < CANCELLED**2) & (sum(force[1:], start=force[0]) > 0)
+    return _unit(planes.where(is_none, first, mean))
 
 
 def _unit(vector: Vec) -> Vec:

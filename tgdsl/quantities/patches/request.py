@@ -49,11 +49,16 @@ class HeatOfObjects(NamedTuple):
     corner: Vec
 
 
+CANCELLED = 1e-3
+"""Length of the mean of unit normals below which it has no direction."""
+
+
 class ContactPatch(NamedTuple):
     """Patches between each body and each object, planes (env, body, object); all zero where they do not touch.
 
     Contacts count where their normal force is positive. The centre is that of these contacts, and the normal the direction of
-    the sum of their normals, both weighted by normal force.
+    the sum of their normals, both weighted by normal force; where the normals cancel, as of a link that is pinched from two
+    sides, that of the first of them.
 
     Attributes:
         force: Sum of the contacts' normal forces [N].
