@@ -84,7 +84,7 @@ EXPECTED = {
     "reset of one that is not there": ("StateError", "env_ids: found 999, expected indices from 0 to 1, or a mask of 2"),
     "reset of one from the end": ("StateError", "env_ids: found -1, expected indices from 0 to 1, or a mask of 2"),
     "reset by no index": ("StateError", "env_ids: found 0.5, expected indices from 0 to 1, or a mask of 2"),
-    "reset by a mask of another length": ("StateError", "env_ids: found True, False, True, expected "),
+    "reset by a mask of another length": ("StateError", "env_ids: found a mask of 3, expected "),
     "reset by a slice": ("StateError", "env_ids: found slice(0, 1, None), expected indices from 0 to 1, or a mask of 2"),
     "reset by a text": ("StateError", "env_ids: found '0', expected indices from 0 to 1, or a mask of 2"),
     "no state": (

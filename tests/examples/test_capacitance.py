@@ -104,3 +104,10 @@ def test_the_sensitivity_is_that_of_the_closed_form(build):
 def test_a_least_thickness_above_the_thickness_is_refused(build):
     with pytest.raises(SpecError, match=r"least_thickness 0\.003 m is above thickness 0\.002 m"):
         build(thickness=0.002, least_thickness=0.003)
+
+
+def test_a_rest_value_that_is_rounded_is_named():
+    rest = torch.tensor([1.25])
+    TestCapacitance()._assert_rests(rest.expand(3, 2, 1), rest, "rows")
+    with pytest.raises(AssertionError, match=r"^inactive taxels read \[1.5\], expected `rest`, which is \[1.25\] in float32"):
+        TestCapacitance()._assert_rests(torch.full((3, 2, 1), 1.5), rest, "inactive taxels")

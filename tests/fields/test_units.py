@@ -91,7 +91,7 @@ def test_a_bare_number_is_si(value):
         ("hot", "temperature", '"hot" is not a quantity, expected a number in degC or a string such as "4 degC"'),
         ("4 W/m/K", "conductivity", '"W/m/K" is not a unit of conductivity, expected one of W/(m*K)'),
         ("4 W/(m*K", "conductivity", '"W/(m*K" is not a unit of conductivity, expected one of W/(m*K)'),
-        ("4 m", "number", '"4 m" is not a quantity, expected a number'),
+        ("4 m", "number", '"4 m" has a unit, expected a plain number: 4, if m is meant'),
         (True, "number", "True is not a quantity, expected a number"),
         ([1], "time", '[1] is not a quantity, expected a number in s or a string such as "4 µs"'),
         (math.inf, "number", "inf is not finite, expected a number"),

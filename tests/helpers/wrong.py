@@ -207,7 +207,7 @@ WRONG = {
     ),
     "unit of an amplitude's part": (
         after("    noise: {white_noise: {depth: 1 mm}}\n"),
-        'hand.yaml:12:26: sensors.touch.noise.white_noise: depth: "1 mm" is not a quantity, expected a number',
+        'hand.yaml:12:26: sensors.touch.noise.white_noise: depth: "1 mm" has a unit, expected a plain number: 0.001, if m is meant',
     ),
     "rate of nothing": (
         after("    rate: 0\n"),

@@ -127,6 +127,8 @@ def test_files_that_are_no_artefacts(tmp_path):
     assert refused(tmp_path / "none.safetensors").startswith("cannot read this artefact: ")
     (tmp_path / "folder.safetensors").mkdir()
     assert refused(tmp_path / "folder.safetensors").startswith("cannot read this artefact: ")
+    (tmp_path / "hand.yaml").write_text("tgdsl: 1\n")
+    assert refused(tmp_path / "hand.yaml") == "this is a document, not an artefact; tgdsl.compile reads documents"
     (tmp_path / "foreign.safetensors").write_bytes(save({"weight": np.zeros(3)}, {"format": "pt"}))
     assert refused(tmp_path / "foreign.safetensors") == "this safetensors file was not written by tgdsl"
     (tmp_path / "bare.safetensors").write_bytes(save({"weight": np.zeros(3)}))
@@ -159,7 +161,7 @@ def test_a_kind_that_is_not_given(artifact, tmp_path):
     with pytest.raises(TgdslError) as caught:
         tgdsl.load(path)
     assert str(caught.value) == (
-        'sensor "touch" is of kind "kinematic_taxle", which is not given; did you mean "kinematic_taxel"?'
+        'sensor "touch" is of kind "kinematic_taxle", which is neither installed nor given as `kinds`; did you mean "kinematic_taxel"?'
     )
 
 

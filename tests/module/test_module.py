@@ -268,7 +268,7 @@ def test_kinds_of_your_own(document, tmp_path):
     touch = tgdsl.compile(document, kinds=[INVERSE])
     assert touch(touch.example_state(2))["mine"].shape == (2, 12, 1)
     tgdsl.save(touch, tmp_path / "mine.safetensors")
-    with pytest.raises(TgdslError, match='sensor "mine" is of kind "inverse", which is not given'):
+    with pytest.raises(TgdslError, match='sensor "mine" is of kind "inverse", which is neither installed nor given as `kinds`'):
         tgdsl.load(tmp_path / "mine.safetensors")
     again = tgdsl.load(tmp_path / "mine.safetensors", kinds=[INVERSE])
     state = touch.example_state(2)

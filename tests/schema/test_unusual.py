@@ -84,6 +84,9 @@ def test_in_a_layout_of_its_own_and_in_line(tmp_path):
     assert warned(write(tmp_path, layout=text)) == [
         'layout.yaml:5:52: resolutions.low.index_tip.radius: found 2 m, usually at most 0.1 m; was "2 cm" or "2 mm" meant?'
     ]
+    text = LAYOUT.replace("radius: 2 mm", "radius: 2 mm, region: {facing: [0, 0, 1], within: 30}", 1)
+    (message,) = warned(write(tmp_path, layout=text))
+    assert message.endswith('.region.within: found 30 rad, usually at most 3.14159 rad; was "30 deg" meant?')
     inline = DOCUMENT.replace("layout.yaml", "{resolutions: {low: {a: " + POISSON.replace("2 mm", "200 mm") + "}}}")
     (message,) = warned(write(tmp_path, inline.replace("links: tips", "links: a")))
     assert (
@@ -149,6 +152,21 @@ def test_units_as_they_are_spelled_elsewhere(text, dimension, meant):
     units.parse(meant, dimension)
     with pytest.raises(ValueError, match="expected"):
         units.parse("4^2", "number")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.05 mm", "expected a plain number: 5e-05, if m is meant"),
+        ("60 deg", "expected a plain number: 1.0472, if rad is meant"),
+        ("300 K", "expected a plain number: 26.85, if degC is meant"),
+        ("2 pF", "expected a plain number"),
+    ],
+)
+def test_a_unit_where_a_plain_number_is_expected(text, expected):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the whole message is compared
+        units.parse(text, "number")
+    assert str(caught.value) == f'"{text}" has a unit, {expected}'
 
 
 @pytest.mark.parametrize(("text", "pascal"), [("0.2 MPa", 2e5), ("200kPa", 2e5), ("200000 Pa", 2e5), (2e5, 2e5)])

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import BeforeValidator, Discriminator, Tag, model_validator
 
-from tgdsl.fields.models import Angle, Direction, Position, PositiveLength, Selector, SpecModel
+from tgdsl.fields.models import Angle, Direction, Position, PositiveLength, Selector, SpecModel, Usual
 
 
 class Facing(SpecModel):
@@ -14,7 +15,7 @@ class Facing(SpecModel):
 
     facing: Direction
     """Direction in the link frame; need not have unit length."""
-    within: Angle
+    within: Annotated[Angle, Usual("angle", high=math.pi)]
     """Largest angle between normal and direction [rad, or a string such as `60 deg`]."""
 
 

@@ -57,7 +57,9 @@ def parse(value: object, dimension: str) -> float:
         if plain != value and (match := _QUANTITY.match(plain)) and match[2] in known:
             raise ValueError(f'"{value}" is not a quantity; did you mean "{plain.strip()}"?')
         match = _QUANTITY.match(value)
-        if not match or (match[2] and not known):
+        if match and match[2] and not known:
+            raise ValueError(f'"{value}" has a unit, {_without_unit(float(match[1]), match[2])}')
+        if not match:
             raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
         if match[2] and match[2] not in known:
             raise ValueError(f'"{match[2]}" is not a unit of {dimension}, expected one of {", ".join(known)}')
@@ -86,6 +88,14 @@ def dimension_of(value: str, dimensions: Sequence[str]) -> str | None:
     """
     unit = unit_of(value.translate(_SPELLINGS))
     return next((dimension for dimension in dimensions if unit in UNITS[dimension]), None)
+
+
+def _without_unit(number: float, unit: str) -> str:
+    """Return what is expected where a plain number is, if one with a unit was found: in SI, if the unit is known."""
+    for known in UNITS.values():
+        if unit in known:
+            return f"expected a plain number: {number * known[unit] + ZEROS.get(unit, 0.0):g}, if {next(iter(known))} is meant"
+    return "expected a plain number"
 
 
 def _example(known: Mapping[str, float]) -> str:

@@ -43,6 +43,8 @@ def load_plan(path: str | PathLike[str], quantities: Sequence[Quantity] = QUANTI
             metadata = file.metadata() or {}
             arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
     except (SafetensorError, OSError) as error:
+        if isinstance(error, SafetensorError) and Path(path).suffix in (".yaml", ".yml"):
+            raise ArtifactError(f"{path}: this is a document, not an artefact; tgdsl.compile reads documents") from error
         raise ArtifactError(f"{path}: cannot read this artefact: {error}") from error
     if METADATA_KEY not in metadata:
         raise ArtifactError(f"{path}: this safetensors file was not written by tgdsl")

@@ -23,11 +23,21 @@ def warn_of_unusual(source: Source, spec: BaseModel) -> None:
     found = {}
     for path, usual, value in _marked(spec, ()):
         if (what := usual.doubt(value)) is not None:
-            while path and source.get(path) is None:
-                path = path[:-1]  # a number may stand for a range, and a region for a list of one
+            path = _place(source, path)
             found[path, what] = str(source.problem(path, *what))
     for message in found.values():
         warnings.warn(message, stacklevel=4)
+
+
+def _place(source: Source, path: Path) -> Path:
+    """Return where a value stands in the file: a number may stand for a range, and a region for a list of one."""
+    shorter = [path[:i] + path[i + 1 :] for i, part in enumerate(path) if isinstance(part, int)]
+    for place in (path, *reversed(shorter)):
+        if source.get(place) is not None:
+            return place
+    while path and source.get(path) is None:
+        path = path[:-1]
+    return path
 
 
 def _marked(value: object, path: Path) -> Iterator[tuple[Path, Usual, float]]:

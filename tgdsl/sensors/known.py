@@ -63,7 +63,7 @@ def kinds_by_sensor(kinds: Sequence[Kind], wanted: Mapping[str, str]) -> dict[st
     for sensor, name in wanted.items():
         if name not in known:
             hint = did_you_mean(name, known, "kinds")
-            raise TgdslError(f'sensor "{sensor}" is of kind "{name}", which is not given; {hint}')
+            raise TgdslError(f'sensor "{sensor}" is of kind "{name}", which is neither installed nor given as `kinds`; {hint}')
     return {sensor: known[name] for sensor, name in wanted.items()}
 
 

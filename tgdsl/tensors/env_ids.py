@@ -43,7 +43,9 @@ def env_indices(env_ids: EnvIds | None, num_envs: int, error: type[TgdslError] =
     )
     if found.size and not is_index:
         what = f"indices from 0 to {num_envs - 1}, or a mask of {num_envs}"
-        raise error(f"env_ids: found {listed([str(value) for value in found.ravel()])}, expected {what}")
+        is_mask = found.dtype == bool
+        seen = f"a mask of {' x '.join(map(str, found.shape))}" if is_mask else listed([str(value) for value in found.ravel()])
+        raise error(f"env_ids: found {seen}, expected {what}")
     return found.reshape(-1).astype(np.int64)
 
 
