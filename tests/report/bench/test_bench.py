@@ -198,3 +198,20 @@ def test_a_field_that_is_missing_is_told(work, report):
     recording.states[0].contact_found = None
     with pytest.raises(StateError, match="these states have no contact_found"):
         narrowed(recording.states[0], recording.names, touch.inputs)
+
+
+BLOCKS = (
+    "  sound: {kind: contact_audio, links: pad, feels: [cube], samples: 8, substeps: 5, modes: [{frequency: 500, decay: 10}]}"
+)
+
+
+def test_sensors_that_read_blocks_do_not_change_the_physics(tmp_path):
+    """Though other time steps than theirs are tried."""
+    path = bench_document(tmp_path)
+    text = path.read_text()
+    found = []
+    for document in (text, text.replace("observations:", f"{BLOCKS}\nobservations:")):
+        path.write_text(document)
+        subject = bench(Bench(path, sensors=("physics",), state_envs=4, steps=9, options=FEW)).subjects[0]
+        found.append([point.chosen for point in subject.points])
+    assert found[0] == found[1]
