@@ -1,9 +1,6 @@
-"""A plate that is pressed and rubbed by a ball as a test says, and what it sounds like."""
+"""How much a struck plate still rings."""
 
 from tgdsl.module.module import TactileModule
-from tgdsl.report.oracles.setups.sounds import MODES, STEP, plate, plate_document, pressed, ringing, sound
-
-__all__ = ["MODES", "STEP", "energy", "plate", "plate_document", "pressed", "ringing", "sound"]
 
 
 def energy(touch: TactileModule) -> float:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from held import assert_holds
-from ringing_bodies import ball, box, hollow, slabs, surface_of, thin_box
+from ringing_bodies import hollow, slabs, thin_box
 
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import MATERIALS, Material
@@ -14,6 +14,7 @@ from tgdsl.modal import spectrum as spectra
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.report.oracles import modes as oracles
+from tgdsl.report.oracles.setups.solids import ball, box, surface_of
 from tgdsl.surfaces.surface import Surface
 
 

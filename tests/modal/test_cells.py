@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
-from ringing_bodies import ball, box, hollow, slabs, surface_of, thin_box, turned
+from ringing_bodies import hollow, slabs, thin_box, turned
 
 from tgdsl.modal import cells, grid
 from tgdsl.modal.closed import closed
+from tgdsl.report.oracles.setups.solids import ball, box, surface_of
 from tgdsl.surfaces.surface import Surface
 
 

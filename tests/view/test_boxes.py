@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from heat_scenes import heat_module
 from matplotlib.colors import Normalize
 from scipy.spatial.transform import Rotation
 
 import tgdsl
+from tgdsl.report.oracles.setups.boxes import heat_module
 from tgdsl.view.boxes import boxes_of, is_boxed
 from tgdsl.view.overview import drawing as overview_drawing
 from tgdsl.view.overview import drawn_outputs, overview

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from struck_plate import plate, pressed
 
 from tgdsl.layout.layout import Layout
 from tgdsl.module.state import SHAPES
@@ -15,6 +14,7 @@ from tgdsl.quantities.loads.gathering import gather
 from tgdsl.quantities.loads.part import LoadsPart
 from tgdsl.quantities.loads.reference import reference
 from tgdsl.quantities.reference import ReferenceScene
+from tgdsl.report.oracles.setups.sounds import plate, pressed
 
 
 @pytest.fixture

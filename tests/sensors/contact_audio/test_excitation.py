@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
-from struck_plate import STEP, plate, pressed, sound
 
 from tgdsl.report.oracles import sound as oracles
-from tgdsl.report.oracles.setups.sounds import half_sine, struck
+from tgdsl.report.oracles.setups.sounds import STEP, half_sine, plate, pressed, sound, struck
 
 MODE = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}]
 

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import trimesh
-from ringing_bodies import box, slabs, surface_of, thin_box
-from struck_plate import plate_document
+from ringing_bodies import slabs, thin_box
 
 import tgdsl
 from tgdsl.errors import SpecError
 from tgdsl.modal import spectrum as spectra
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.spec import ShapeModes
+from tgdsl.report.oracles.setups.solids import box, surface_of
+from tgdsl.report.oracles.setups.sounds import plate_document
 
 SIDE, WALL = 0.1, 0.004
 WALLS = "".join(

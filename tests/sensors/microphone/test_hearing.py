@@ -6,10 +6,10 @@ import torch
 from held import assert_holds
 
 import tgdsl
-from tests.helpers.tone import TONE
 from tgdsl.errors import SpecError
 from tgdsl.report.oracles import hearing as oracles
 from tgdsl.report.oracles.setups.listening import RATE, SCENE, heard, listening
+from tgdsl.report.oracles.setups.tone import TONE
 
 
 @pytest.fixture

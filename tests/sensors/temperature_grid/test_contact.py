@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from heat_scenes import begin, cells_of, heat_module, heat_state
 from held import assert_holds
 
 from tgdsl.report.oracles import heat
+from tgdsl.report.oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 
 
 @pytest.mark.parametrize("steps", [500, 1000])

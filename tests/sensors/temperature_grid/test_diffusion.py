@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import torch
-from heat_scenes import begin, cells_of, heat_module, heat_state
 from held import assert_holds
 
 import tgdsl
 from tgdsl.report.oracles import heat
+from tgdsl.report.oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 
 
 @pytest.mark.parametrize("numbers", [(1, 0, 0), (0, 2, 0), (3, 1, 2), (4, 3, 5), (0, 0, 0)])

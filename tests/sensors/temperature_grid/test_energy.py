@@ -6,9 +6,9 @@ import jaxtyping
 import numpy as np
 import pytest
 import torch
-from heat_scenes import heat_module, heat_state
 
 from tgdsl.fields.materials import MATERIALS
+from tgdsl.report.oracles.setups.boxes import heat_module, heat_state
 
 LINKS = {"tip": [0.012, 0.01, 0.02], "thumb": [0.015, 0.01, 0.01]}
 OBJECTS = {

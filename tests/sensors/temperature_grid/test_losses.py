@@ -4,11 +4,11 @@ from functools import partial
 
 import pytest
 import torch
-from heat_scenes import heat_module, heat_state
 from held import assert_holds
 
 from tgdsl.report.oracles import cooling
 from tgdsl.report.oracles.cooling import SIDES
+from tgdsl.report.oracles.setups.boxes import heat_module, heat_state
 
 COMPARED = (
     cooling.newton, partial(cooling.newton, torch.float32), cooling.exposed_faces, cooling.radiation, cooling.both_losses,

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from tgdsl.errors import TgdslError
 from tgdsl.report.oracles import (
     bodies,
     cooling,
@@ -24,6 +23,7 @@ from tgdsl.report.oracles import (
 )
 from tgdsl.report.oracles.contact_mechanics import friction, half_space, layer, markers
 from tgdsl.report.oracles.results import Comparison, Oracle
+from tgdsl.report.sheets.run import Begun, Run, run_groups
 from tgdsl.report.sheets.sheet import Entry, Section, Sheet
 from tgdsl.view.style import FAINT, INK
 
@@ -55,33 +55,12 @@ ABOUT = (
 )
 
 
-def run(
-    fields: Mapping[str, tuple[Oracle, ...]] = FIELDS, begun: Callable[[str, int, int], None] | None = None
-) -> dict[str, tuple[list[Comparison], list[tuple[str, str]]]]:
-    """Return by field all comparisons, and what could not be computed here, and why.
-
-    Args:
-        fields: The oracles.
-        begun: Is told the field, and how many are done of how many.
-    """
-    found: dict[str, tuple[list[Comparison], list[tuple[str, str]]]] = {}
-    total, done = sum(map(len, fields.values())), 0
-    for field, oracles in fields.items():
-        comparisons, left_out = found.setdefault(field, ([], []))
-        for oracle in oracles:
-            if begun is not None:
-                begun(field, done, total)
-            try:
-                comparisons.append(oracle())
-            except TgdslError as error:  # such as an extra that is not installed
-                left_out.append((getattr(oracle, "__name__", str(getattr(oracle, "func", oracle))), str(error)))
-            done += 1
-    if begun is not None:
-        begun("", total, total)
-    return found
+def run(fields: Mapping[str, tuple[Oracle, ...]] = FIELDS, begun: Begun | None = None) -> Run[Comparison]:
+    """Return by field all comparisons, and what could not be computed here, and why: see `sheets.run`."""
+    return run_groups(fields, begun)
 
 
-def sheet_of(found: Mapping[str, tuple[list[Comparison], list[tuple[str, str]]]]) -> Sheet:
+def sheet_of(found: Run[Comparison]) -> Sheet:
     """Return what is reported of comparisons, by field."""
     sections = [
         Section(field, tuple(map(entry_of, comparisons)), tuple(left_out)) for field, (comparisons, left_out) in found.items()
