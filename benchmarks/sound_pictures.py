@@ -1,6 +1,6 @@
 """Pictures of docs/sound.md: what a microphone's interpolation and Doppler shift are off by, and the materials by ear.
 
-python benchmarks/sound.py [--out docs/images]
+python benchmarks/sound_pictures.py [--out docs/images]
 """
 
 from __future__ import annotations
