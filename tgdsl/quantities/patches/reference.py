@@ -10,7 +10,7 @@ from jaxtyping import Float
 from tgdsl.quantities.contacts.part import SLOT_FIELDS
 from tgdsl.quantities.contacts.reference import completed
 from tgdsl.quantities.patches.part import PatchesPart
-from tgdsl.quantities.patches.request import CANCELLED
+from tgdsl.quantities.patches.request import cancelled
 from tgdsl.quantities.patches.topology import Topology
 from tgdsl.quantities.reference import ReferenceScene
 
@@ -78,7 +78,7 @@ def _patch(scene: ReferenceScene, b: int, name: str, pair: int) -> Patch | None:
     weights = np.array([force for _, force, _ in pressing])
     pos = np.average([pos for pos, _, _ in pressing], axis=0, weights=weights)
     normal = np.average([normal for _, _, normal in pressing], axis=0, weights=weights)
-    if np.linalg.norm(normal) < CANCELLED:
+    if np.linalg.norm(normal) < cancelled():
         normal = pressing[0][2]
     normal = normal / np.linalg.norm(normal)
     area = polygon([point - pos for point, _, _ in pressing], normal)

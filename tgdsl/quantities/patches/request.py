@@ -49,8 +49,10 @@ class HeatOfObjects(NamedTuple):
     corner: Vec
 
 
-CANCELLED = 1e-3
-"""Length of the mean of unit normals below which it has no direction."""
+# A function, not a float of the module: under dynamic shapes torch.compile makes that an input of the graph.
+def cancelled() -> float:
+    """Return the length of the mean of unit normals below which it has no direction."""
+    return 1e-3
 
 
 class ContactPatch(NamedTuple):
