@@ -291,12 +291,14 @@ class Alternative(NamedTuple):
         unused: Fields that mean nothing then: who wrote one of them does not want this choice.
         is_exact: Whether it is exact but for rounding, so that errors of others may be measured against it and it may be chosen
             without one.
+        is_other: Whether what is read then has another shape, or other times: `accuracy` never chooses it.
     """
 
     label: str
     changes: Mapping[str, Any]
     unused: tuple[str, ...] = ()
     is_exact: bool = False
+    is_other: bool = False
 
 
 Warn = Callable[[str, Mapping[str, np.ndarray], Sequence[str], np.ndarray], Sequence[str]]

@@ -12,7 +12,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, TgdslError, listed
 from tgdsl.fields.accuracy import Accuracy, Bound
 from tgdsl.module.accuracy.errors import Errors, errors_of, halves
-from tgdsl.module.accuracy.states import readings_of, rows_at, taken
+from tgdsl.module.accuracy.states import common_of, readings_of
 from tgdsl.module.accuracy.variants import Variant, is_free, is_taken, written_of
 from tgdsl.schema.objects import query_alternatives
 from tgdsl.tuning.recording import Recording
@@ -158,7 +158,7 @@ class Trial:
         """Yield the errors of each quantity, in the environments that choose and in those that verify."""
         touch, exact = self.sensor.module(self.sensor.plan(variant), torch.float32), self.exact
         found = readings_of(touch, self.recording.for_module(touch.inputs), self.sensor.name)
-        found = taken(found, rows_at(exact.module, touch, self.sensor.name))
+        found = common_of(exact.module, touch, self.sensor.name).of_other(found)
         for envs in halves(self.recording.num_envs):
             errors = {}
             for name, bound in self.bounds.items():

@@ -18,7 +18,7 @@ from tgdsl.compiler.pipeline import Document, compile_plan
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.module.accuracy.errors import Magnitude, magnitude_of
-from tgdsl.module.accuracy.states import readings_of, rows_at, taken
+from tgdsl.module.accuracy.states import common_of, readings_of
 from tgdsl.module.accuracy.variants import Variant, Variants, bare, queried_objects, variants_of
 from tgdsl.module.module import TactileModule
 from tgdsl.plan.plan import Plan
@@ -162,7 +162,8 @@ def exact_of(sensor: Sensor, finest: Variant, recording: Recording, progress: Pr
     progress(f"{sensor.name}: {finest.label}, float64")
     own = sensor.module(sensor.own, torch.float64)
     fine = sensor.module(sensor.plan(finest), torch.float64)
-    readings = taken(readings_of(fine, recording.for_module(fine.inputs), sensor.name), rows_at(own, fine, sensor.name))
+    found = readings_of(fine, recording.for_module(fine.inputs), sensor.name)
+    readings = common_of(own, fine, sensor.name).of_other(found)
     quantities = tuple(quantity(channel) for channel in sensor.reading.channels)
     return Exact(finest, own, readings, magnitude_of(readings, quantities), quantities, tuple(sensor.reading.units))
 

@@ -61,6 +61,36 @@ def test_modes_that_are_not_heard_are_dropped_by_name(tmp_path):
         torch.testing.assert_close(touch(state)["s"], fewer(state)["s"], rtol=0, atol=0)
 
 
+def test_the_loudest_modes_are_those_of_most_energy(tmp_path):
+    """As if they alone were listed: g²/4d is 1, 2, 0.9 and 0.25 · 10⁻³ s/kg²."""
+    listed = [
+        {"frequency": 300.0, "decay": 250.0, "gain": 1.0},
+        {"frequency": 500.0, "decay": 500.0, "gain": -2.0},
+        {"frequency": 800.0, "decay": 25.0, "gain": 0.3},
+        {"frequency": 1300.0, "decay": 1000.0, "gain": 1.0},
+    ]
+    energy = [own["gain"] ** 2 / (4 * own["decay"]) for own in listed]
+    for count in (1, 2, 3):
+        chosen = sorted(sorted(range(4), key=lambda i: -energy[i])[:count])
+        few = plate(tmp_path, modes=listed, loudest=count, scrape=0)
+        alone = plate(tmp_path, modes=[listed[i] for i in chosen], scrape=0)
+        for force in (0.0, 2.0, 0.0, 0.0):
+            state = pressed(few, [force])
+            torch.testing.assert_close(few(state)["s"], alone(state)["s"], rtol=0, atol=0)
+
+
+def test_bands_are_the_same_whatever_is_left_out(tmp_path):
+    """The bands of modes that are not computed stay, silent."""
+    every, one = (plate(tmp_path, outputs="bands", loudest=count, scrape=0, substeps=1) for count in (None, 1))
+    assert every.outputs[0].channels == one.outputs[0].channels
+    for force in (0.0, 2.0, 0.0):
+        state = pressed(one, [force])
+        heard, few = every(state)["s"], one(state)["s"]
+    is_kept = few > 0
+    assert is_kept.sum() == 1 and (heard > 0).sum() == len(MODES)
+    torch.testing.assert_close(few[is_kept], heard[is_kept], rtol=1e-6, atol=0)
+
+
 def test_bodies_have_modes_of_their_own(tmp_path):
     """By name or wildcard; the first that matches counts."""
     own = {"oth*": MODES[:1], "*": MODES[1:]}

@@ -6,11 +6,11 @@ Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` num
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from tgdsl.errors import StateError, listed
 from tgdsl.module.module import TactileModule
@@ -75,14 +75,64 @@ def readings_of(touch: TactileModule, states: Sequence[SceneState], name: str) -
     return torch.stack(found).numpy()
 
 
-def rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:
-    """Return which rows of another module's reading are where each row of a module's is; None: they are the same rows.
+class Common(NamedTuple):
+    """What two modules' readings of a sensor have in common: readings at the same places, samples at the same times.
 
-    That is the row of the same link whose place is nearest; where several are as near, the reading is their mean.
+    Attributes:
+        here: Rows of the one's reading that the other has too; None: all.
+        there: Rows of the other's whose mean is at each of these; None: the same.
+        channels: Which channel of the other's each of the one's is; -1: it has none, which counts as 0; None: the same.
+    """
+
+    here: Int[np.ndarray, " row"] | None
+    there: Sequence[Int[np.ndarray, " row"]] | None
+    channels: Int[np.ndarray, " channel"] | None
+
+    def of_one(self, readings: Shaped[np.ndarray, "step env row channel"]) -> np.ndarray:
+        """Return the one's reading where there is one of the other's too."""
+        return readings if self.here is None else readings[:, :, self.here]
+
+    def of_other(self, readings: Float[np.ndarray, "step env row channel"]) -> np.ndarray:
+        """Return the other's reading there, in the one's channels."""
+        if self.there is not None:
+            readings = np.stack([readings[:, :, at].mean(axis=2) for at in self.there], axis=2)
+        if self.channels is not None:
+            readings = np.where(self.channels >= 0, readings[..., self.channels], 0.0)
+        return readings
+
+
+def common_of(own: TactileModule, other: TactileModule, name: str) -> Common:
+    """Return what another module's reading has in common with a module's.
+
+    Rows are compared with that of the same link whose place is nearest, or with the mean of several that are as near. Samples
+    of a block, the last of which is at its end, are compared where both have one. Channels go by their names.
 
     Raises:
         StateError: If rows differ and have no places.
     """
+    one, two = (next(output for output in touch.outputs if output.name == name) for touch in (own, other))
+    there = _rows_at(own, other, name)
+    channels = None
+    if one.channels != two.channels:
+        known = {channel: i for i, channel in enumerate(two.channels)}
+        channels = np.array([known.get(channel, -1) for channel in one.channels])
+    samples, more = (output.shape[0] if len(output.shape) > 2 else 1 for output in (one, two))
+    if samples == more:
+        return Common(None, there if there is None else _repeated(there, samples, two.shape[-2]), channels)
+    times = [(k, (k + 1) * more // samples - 1) for k in range(samples) if (k + 1) * more % samples == 0]
+    rows, width = one.shape[-2], two.shape[-2]
+    alone = [np.array([row]) for row in range(rows)] if there is None else there
+    here = np.concatenate([k * rows + np.arange(rows) for k, _ in times])
+    return Common(here, [j * width + at for _, j in times for at in alone], channels)
+
+
+def _repeated(there: Sequence[np.ndarray], samples: int, width: int) -> list[np.ndarray]:
+    """Return the rows of one sample for all samples of a block."""
+    return [k * width + at for k in range(samples) for at in there]
+
+
+def _rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.ndarray, " row"]] | None:
+    """Return which rows of another module's reading are where each row of a module's is; None: they are the same rows."""
     here, there = (touch.rows.get(name) for touch in (own, other))
     if here is None or there is None or (len(here) == len(there) and (here == there).all()):
         return None
@@ -95,8 +145,3 @@ def rows_at(own: TactileModule, other: TactileModule, name: str) -> list[Int[np.
         distance = np.linalg.norm(there["pos"][at] - pos, axis=1)
         found.append(at[distance <= distance.min() + TOGETHER])
     return found
-
-
-def taken(readings: Float[np.ndarray, "step env row channel"], rows: list[np.ndarray] | None) -> np.ndarray:
-    """Return readings at rows of `rows_at`."""
-    return readings if rows is None else np.stack([readings[:, :, at].mean(axis=2) for at in rows], axis=2)

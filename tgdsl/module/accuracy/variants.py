@@ -22,7 +22,7 @@ class Variant:
         label: What to call it.
         changes: What is other than in the document, by dotted path: `sensors.skin.operator`.
         is_own: Whether it is what the document says.
-        is_free: Whether it changes nothing that somebody wrote.
+        is_free: Whether it may be chosen: it changes nothing that somebody wrote, nor what is read.
         is_exact: Whether it is exact but for rounding.
     """
 
@@ -91,7 +91,9 @@ def is_taken(spec: Any, alternative: Alternative) -> bool:
 
 
 def is_free(spec: Any, alternative: Alternative) -> bool:
-    """Return whether an alternative changes nothing that somebody wrote, and uses all of it."""
+    """Return whether an alternative may be chosen: it changes nothing that is written, uses all of it, and reads the same."""
+    if alternative.is_other and not is_taken(spec, alternative):
+        return False
     changes = alternative.changes
     written = [key for key in spec.model_fields_set if key in changes or key in alternative.unused]
     return all(key in changes and _is_same(getattr(spec, key), changes[key]) for key in written)

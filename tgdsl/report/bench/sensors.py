@@ -19,7 +19,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.module.accuracy.errors import errors_of, halves, magnitude_of
 from tgdsl.module.accuracy.reference import ReferenceModule
-from tgdsl.module.accuracy.states import readings_of, rows_at, taken
+from tgdsl.module.accuracy.states import common_of, readings_of
 from tgdsl.module.accuracy.variants import Variant, queried_objects
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
@@ -144,10 +144,11 @@ def _errors(sensor: Sensor, way: Way, recording: Recording, exact: Exact, option
         found = readings_of(touch, recording.for_module(touch.inputs), sensor.name)
     if way.precision == "bfloat16 readings":
         found = torch.from_numpy(found).to(torch.bfloat16).double().numpy()
-    found = taken(found, rows_at(exact.module, touch, sensor.name))
-    channels = range(found.shape[-1])
+    common = common_of(exact.module, touch, sensor.name)
+    found, expected = common.of_other(found), common.of_one(exact.readings)
+    magnitude, channels = exact.magnitude._replace(active=common.of_one(exact.magnitude.active)), range(found.shape[-1])
     chosen, verified = (
-        errors_of(found[:, half], exact.readings[:, half], exact.magnitude.of(half, channels), seed=options.seed)
+        errors_of(found[:, half], expected[:, half], magnitude.of(half, channels), seed=options.seed)
         for half in halves(recording.num_envs)
     )
     size = 2 if way.precision == "bfloat16 readings" else torch.finfo(touch.dtype).bits // 8

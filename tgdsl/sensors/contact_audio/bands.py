@@ -7,6 +7,8 @@ Source: IEC 61260-1, base-ten system. Shapes: `row` bodies that ring, `mode` the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -16,9 +18,9 @@ def numbers(frequency: np.ndarray) -> np.ndarray:
     return np.round(10 * np.log10(np.where(frequency > 0, frequency, 1.0) / 1000.0)).astype(np.int64)
 
 
-def band_numbers(frequency: Float[np.ndarray, "row mode"]) -> list[int]:
+def band_numbers(frequency: Float[np.ndarray, " mode"]) -> list[int]:
     """Return the bands from that of the lowest mode to that of the highest."""
-    own = numbers(frequency[frequency > 0])
+    own = numbers(frequency)
     return list(range(int(own.min()), int(own.max()) + 1))
 
 
@@ -27,7 +29,7 @@ def middle(number: int) -> float:
     return 1000.0 * 10.0 ** (number / 10)
 
 
-def membership(frequency: Float[np.ndarray, "row mode"]) -> Float[np.ndarray, "row mode band"]:
+def membership(frequency: Float[np.ndarray, "row mode"], bands: Sequence[int]) -> Float[np.ndarray, "row mode band"]:
     """Return 1 for the band that each mode is in, else 0."""
-    is_in = numbers(frequency)[..., None] == np.array(band_numbers(frequency))
+    is_in = numbers(frequency)[..., None] == np.array(bands)
     return (is_in & (frequency > 0)[..., None]).astype(np.float64)

@@ -53,12 +53,12 @@ from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Channel, Constants, Context, Kind, Lowered, Memory, State, SurfaceOf, scalar
-from tgdsl.sensors.contact_audio.bands import band_numbers, membership, middle
+from tgdsl.sensors.contact_audio.bands import membership, middle
 from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
 from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
-from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
+from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, alternatives
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
 from tgdsl.surfaces.surface import Surface
@@ -86,10 +86,10 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
     constants |= {"is_paper": scalar(1.0)} if spec.model == "paper" else {}
     channels = (Channel("sound", "m/s"),)
     if spec.outputs == "bands":
-        constants["band"] = membership(modes.frequency)
+        constants["band"] = membership(modes.frequency, modes.bands)
         constants |= {"is_decibel": scalar(1.0)} if spec.scale == "decibel" else {}
         unit = "dB" if spec.scale == "decibel" else "m²/s²"
-        channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in band_numbers(modes.frequency))
+        channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in modes.bands)
     pairs = (len(layout.bodies), len(spec.feels))
     state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
     is_heard = spec.outputs == "samples"
@@ -179,5 +179,6 @@ CONTACT_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     retimed=retimed,
+    alternatives=alternatives,
     provides=SOUND,
 )

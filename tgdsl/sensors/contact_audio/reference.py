@@ -15,10 +15,10 @@ from tgdsl.quantities.loads import Loads
 from tgdsl.quantities.places import Places
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
-from tgdsl.sensors.contact_audio.bands import band_numbers, middle
+from tgdsl.sensors.contact_audio.bands import middle
 from tgdsl.sensors.contact_audio.impulses import reference_impulses
 from tgdsl.sensors.contact_audio.operators import GRAINS, highest, least, quiet, radiated
-from tgdsl.sensors.contact_audio.rows import ringing
+from tgdsl.sensors.contact_audio.rows import Ringing, ringing
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise.reference import normal_pair
 from tgdsl.sensors.upstream import PLACE, SAMPLES
@@ -61,7 +61,7 @@ def reference(
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
     after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
     if spec.outputs == "bands":
-        return _bands(spec, modes.frequency, amplitude), after
+        return _bands(spec, modes, amplitude), after
     return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
 
 
@@ -116,11 +116,11 @@ def _two_pole(
     return np.array(found), complex(real, last)
 
 
-def _bands(spec: ContactAudioSpec, frequency: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+def _bands(spec: ContactAudioSpec, modes: Ringing, amplitude: np.ndarray) -> np.ndarray:
     """Return ½ Σ (g |z|)² of the modes in each third octave (row, band) [m²/s²], or its level [dB]."""
-    found = np.zeros((len(frequency), len(band_numbers(frequency))))
-    for place, own in np.ndenumerate(frequency):
-        for b, number in enumerate(band_numbers(frequency)):
+    found = np.zeros((len(modes.frequency), len(modes.bands)))
+    for place, own in np.ndenumerate(modes.frequency):
+        for b, number in enumerate(modes.bands):
             if middle(number) * 10**-0.05 <= own < middle(number) * 10**0.05:
                 found[place[0], b] += 0.5 * amplitude[place] ** 2
     return 10 * np.log10(1 + found / quiet()) if spec.scale == "decibel" else found

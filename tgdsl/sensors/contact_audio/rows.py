@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from tgdsl.errors import LowerError, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.modal.modes import Modes
 from tgdsl.sensors.base import Axis, body_axis
+from tgdsl.sensors.contact_audio.bands import band_numbers
 from tgdsl.sensors.contact_audio.given_modes import modes_of
 from tgdsl.sensors.contact_audio.operators import HIGHEST, highest
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, ModesField
@@ -28,18 +29,20 @@ SurfaceByName = Callable[[str], Surface]
 
 
 class Ringing(NamedTuple):
-    """The modes of all rows that are heard; those that a row has fewer of than another are 0.
+    """The modes of all rows that are computed; those that a row has fewer of than another are 0.
 
     Attributes:
         frequency: [Hz].
         decay: [1/s].
         gain: [1/kg].
+        bands: Numbers of the third octaves from the lowest mode that is heard to the highest, whether computed or not.
         notes: What was left out, and why.
     """
 
     frequency: Float[np.ndarray, "row mode"]
     decay: Float[np.ndarray, "row mode"]
     gain: Float[np.ndarray, "row mode"]
+    bands: Sequence[int]
     notes: tuple[str, ...]
 
 
@@ -84,13 +87,25 @@ def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: Surfac
         each.append((modes, is_heard))
     for note in notes:
         warnings.warn(f"contact audio of {note}, and frequencies up to {HIGHEST:g} of it are heard", stacklevel=2)
-    most = max(int(is_heard.sum()) for _, is_heard in each)
+    bands = band_numbers(np.concatenate([modes.frequency[is_heard] for modes, is_heard in each]))
+    each = [(modes, _loudest(modes, is_heard, spec.loudest)) for modes, is_heard in each]
+    most = max(int(is_kept.sum()) for _, is_kept in each)
     frequency, decay, gain = np.zeros((3, len(rows), most))
-    for i, (modes, is_heard) in enumerate(each):
-        count = int(is_heard.sum())
+    for i, (modes, is_kept) in enumerate(each):
+        count = int(is_kept.sum())
         for table, own in ((frequency, modes.frequency), (decay, modes.decay), (gain, modes.gain)):
-            table[i, :count] = own[is_heard]
-    return Ringing(frequency, decay, gain, tuple(notes))
+            table[i, :count] = own[is_kept]
+    return Ringing(frequency, decay, gain, bands, tuple(notes))
+
+
+def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarray:
+    """Return which modes are computed: of those that are heard the ones that ring with most energy, ∫s² dt = g²/4d of f ≫ d."""
+    if count is None or count >= is_heard.sum():
+        return is_heard
+    energy = np.where(is_heard, modes.gain**2 / modes.decay, -1.0)
+    is_kept = np.zeros_like(is_heard)
+    is_kept[np.argsort(-energy, kind="stable")[:count]] = True
+    return is_kept
 
 
 def _given(spec: ContactAudioSpec, names: tuple[str, ...]) -> ModesField:

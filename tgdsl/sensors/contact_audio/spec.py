@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Discriminator, Field, StrictInt, Tag, mode
 
 from tgdsl.fields.models import Frequency, NonNegative, Number, Positive, Quantity, SpecModel, Usual
 from tgdsl.modal.spec import ShapeModes
-from tgdsl.sensors.base import ProbeSpec
+from tgdsl.sensors.base import Alternative, ProbeSpec
 
 Time = Annotated[float, Quantity("time", gt=0.0)]
 
@@ -60,6 +60,8 @@ class ContactAudioSpec(ProbeSpec):
     """Time that a physics step takes [s]; default: that of the scene."""
     settling: Annotated[Time, Usual("time", low=1e-4, high=1.0)] = 0.02
     """Time in which a load counts as steady, τ [s]: what presses more slowly makes no sound."""
+    loudest: Annotated[StrictInt, Field(ge=1)] | None = None
+    """Most modes of each body that are computed, those that ring with most energy, g²/4d; default: all that are heard."""
     scrape: NonNegative = 1e-5
     """Noise of sliding, m_s [kg]: with a normal force of 1 N at 1 m/s, variance of the impulses of one second [N²·s²]."""
     outputs: Literal["samples", "bands"] = "samples"
@@ -78,3 +80,21 @@ class ContactAudioSpec(ProbeSpec):
         if self.scale is not None and self.outputs != "bands":
             raise ValueError("`scale` is used by `outputs: bands` alone, expected it to be left out")
         return self
+
+
+def alternatives(spec: ContactAudioSpec) -> list[Alternative]:
+    """Return fewer samples, fewer modes, all modes, and twice as many samples.
+
+    Samples at common times are the same whatever their number, but for the modes that it holds. Of the paper's response they
+    are not, and so not compared.
+    """
+    given = [spec.modes, *spec.bodies.values()]
+    most = max(own.count if isinstance(own, ShapeModes) else len(own) for own in given)
+    few = sorted({num for num in (1, most // 4, most // 2) if 0 < num < most})
+    modes = [Alternative("the loudest mode" if num == 1 else f"the loudest {num} modes", {"loudest": num}) for num in few]
+    modes.append(Alternative("all modes", {"loudest": None}))
+    if spec.model == "paper":
+        return modes
+    coarse = [spec.samples // part for part in (4, 2) if spec.samples % part == 0]
+    samples = [Alternative(f"{num} samples", {"samples": num}, is_other=True) for num in (*coarse, 2 * spec.samples)]
+    return [*samples[:-1], *modes, samples[-1]]
