@@ -183,6 +183,17 @@ def test_a_group_that_matches_nothing_is_told_where_it_is_defined(folder):
     ]
 
 
+def test_a_group_with_a_mistake_is_told_once(folder):
+    """Neither that it is missing, nor that it holds no link, where others name it."""
+    assert problems(folder, ('tips: ["*_2"]', 'tips: {includ: ["*_2"]}')) == [
+        'd.yaml:6:7: robot.layout.groups.tips: missing key "include"',
+        'd.yaml:6:14: robot.layout.groups.tips.includ: unknown key "includ"; did you mean "include"?',
+    ]
+    assert problems(folder, ('tips: ["*_2"]', 'tips: ["*_tipp"]')) == [
+        'd.yaml:6:14: robot.layout.groups.tips[0]: no link matches "*_tipp"; did you mean "tips"?'
+    ]
+
+
 @pytest.mark.slow
 def test_the_xhand1_at_every_resolution():
     document = {

@@ -1,12 +1,17 @@
 """Quantities against powers of ten, and arbitrary text."""
 
 import math
+import re
+from typing import Annotated
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from tgdsl.fields import units
+from tgdsl.fields.models import Quantity, SpecModel, Usual
+from tgdsl.fields.units import Dimension, doubt
 
 RTOL = 4e-16  # one product in float64: two roundings of at most 2⁻⁵³
 
@@ -117,3 +122,40 @@ def test_anything_is_a_finite_float_or_a_value_error(value, dimension):
         return
     assert isinstance(found, float)
     assert math.isfinite(found)
+
+
+CAPACITANCE = Dimension("capacitance", {"F": 1.0, "nF": 1e-9, "pF": 1e-12})
+
+
+class Plate(SpecModel):
+    own: Annotated[float, Quantity(CAPACITANCE, gt=0.0), Usual(CAPACITANCE, high=1e-6)]
+
+
+@pytest.mark.parametrize(("written", "value"), [("4.7 pF", 4.7e-12), ("2nF", 2e-9), (3e-12, 3e-12), ("1e-3 nF", 1e-12)])
+def test_a_dimension_of_ones_own(written, value):
+    assert Plate(own=written).own == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("4 mm", '"mm" is not a unit of capacitance, expected one of F, nF, pF'),
+        ("much", 'expected a number in F or a string such as "4 pF"'),
+        ("-1 pF", "-1e-12 is out of range, expected more than 0"),
+    ],
+)
+def test_what_is_wrong_in_it_is_named(written, message):
+    with pytest.raises(ValidationError, match=re.escape(message)):
+        Plate(own=written)
+
+
+def test_its_schema_takes_its_units_and_doubt_names_them():
+    pattern = Plate.model_json_schema()["properties"]["own"]["anyOf"][1]["pattern"]
+    assert [bool(re.search(pattern, text)) for text in ("4.7 pF", "1e-9F", "4 mm")] == [True, True, False]
+    assert doubt(10.0, CAPACITANCE, 0.0, 1e-6) == ("found 10 F, usually at most 1e-06 F", 'was "10 nF" or "10 pF" meant?')
+
+
+@pytest.mark.parametrize("units", [{}, {"pF": 1e-12, "F": 1.0}, {"F": 1.0, "p F": 1e-12}, {"F": 1.0, "pF": 0.0}])
+def test_a_dimension_without_a_unit_inside_or_with_unreadable_ones_is_refused(units):
+    with pytest.raises(ValueError, match="the units of capacitance: found"):
+        Dimension("capacitance", units)

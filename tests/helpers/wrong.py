@@ -33,6 +33,16 @@ WRONG = {
         instead("kind: contact", "kind: contakt"),
         'hand.yaml:9:11: sensors.touch.kind: unknown kind "contakt"; did you mean "contact"?',
     ),
+    "kind of another package": (
+        instead("kind: contact", "kind: capacitance"),
+        'hand.yaml:9:11: sensors.touch.kind: unknown kind "capacitance"; known kinds: actuation_audio, contact, contact_audio, '
+        "contact_depth, elastomer, force_taxel, kinematic_taxel, link_contact, microphone, proximity, surface_distance, "
+        "temperature_grid; kinds of other packages are known once these are installed",
+    ),
+    "misspelt kind": (
+        instead("kind: contact", "knd: contact"),
+        'hand.yaml:8:3: sensors.touch: missing key "kind"; is "knd" meant to be it?',
+    ),
     "missing kind": (instead("kind: contact", "gate: geometric"), 'hand.yaml:8:3: sensors.touch: missing key "kind"'),
     "missing key": (instead("links: tips", "gate: geometric"), 'hand.yaml:8:3: sensors.touch: missing key "links"'),
     "missing layout": (

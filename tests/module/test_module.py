@@ -55,9 +55,12 @@ def test_what_is_missing_or_misshapen_is_named(touch):
     names = "body_pos, body_quat, body_linvel, body_angvel, contact_found"
     table = [
         ({"body_quat": None}, f"SceneState.body_quat is missing; this module wants {names}"),
-        ({"body_pos": good.body_pos[:, :1]}, "SceneState.body_pos has shape (3, 1, 3), expected (env, 2, 3)"),
+        ({"body_pos": good.body_pos[:, :1]}, "SceneState.body_pos has shape (3, 1, 3), expected (env, 2, 3); body: item, pad"),
         ({"body_quat": good.body_quat[:2]}, "SceneState.body_quat holds 2 environments, body_pos 3"),
-        ({"contact_found": good.contact_found[:, 0]}, "SceneState.contact_found has shape (3,), expected (env, 1)"),
+        (
+            {"contact_found": good.contact_found[:, 0]},
+            "SceneState.contact_found has shape (3,), expected (env, 1); pair: pad – item",
+        ),
         ({"body_pos": good.body_pos.half()}, "SceneState.body_pos is torch.float16, expected torch.float32 or torch.float64"),
         ({"body_pos": good.body_pos.to("meta")}, "SceneState.body_pos is on meta, the module on cpu"),
     ]

@@ -7,7 +7,7 @@ import torch
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.runtime.rollout import Recorder, Step, is_touched, recorded_controls, rollout, scripted_controls
+from tgdsl.runtime.rollout import Recorder, Step, is_touched, missed_loads, recorded_controls, rollout, scripted_controls
 from tgdsl.runtime.simulate import simulate
 
 SCENE = """
@@ -226,3 +226,34 @@ def test_what_is_flexible_may_touch_too(document, tmp_path, cube, is_contact):
     sim = simulate(touch, 1)
     assert sim.model.nflex == 1 and sim.model.geom(sim.model.ngeom - 1).bodyid == sim.model.body("cube").id
     assert is_touched(touch, sim) == is_contact
+
+
+@pytest.mark.parametrize(("x", "is_told"), [(0.0, False), (0.022, True)])
+def test_a_load_that_no_taxel_is_near_is_told(tmp_path, x, is_told):
+    """A cube at rest weighs m g, on the only two taxels or two centimetres beside them."""
+    scene = SCENE.replace(
+        '<joint name="lift" type="slide" axis="0 0 1"/><joint name="slide" type="slide" axis="1 0 0"/>', "<freejoint/>"
+    )
+    scene = (
+        scene.split("<actuator>")[0].replace('pos="0 0 .029"', f'pos="{x} 0 .0149"').replace(".02 .02 .02", ".005 .005 .005")
+        + "</mujoco>"
+    )
+    (tmp_path / "scene.xml").write_text(scene)
+    probes = [{"pos": [0.002 * i, 0, 0.01], "normal": [0, 0, 1]} for i in (-1, 0, 1)]
+    layout = {"resolutions": {"o": {"pad": {"method": "points", "points": probes, "radius": 0.002}}}}
+    sensor = {"kind": "force_taxel", "links": "pad", "feels": ["cube"]}
+    touch = tgdsl.compile(
+        {
+            "tgdsl": 1,
+            "robot": {"model": str(tmp_path / "scene.xml"), "layout": layout},
+            "objects": {"cube": {"body": "cube"}},
+            "sensors": {"load": sensor},
+        }
+    )
+    sim = simulate(touch, 1)
+    for _ in range(200):
+        sim.step()
+    told = missed_loads(touch, touch(sim.state()))
+    weight = f"{0.25 * 9.81:.3g}"
+    expected = f'"load" misses {weight} of {weight} N, which act where none of its taxels is'
+    assert told == ({"load/missed": expected} if is_told else {})

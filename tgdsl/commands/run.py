@@ -51,7 +51,7 @@ class Run:
     def run(self) -> None:
         """Step through the controls, show the table, write the files."""
         from tgdsl.files.write import check_writable, with_folder
-        from tgdsl.runtime.rollout import Recorder, is_touched
+        from tgdsl.runtime.rollout import Recorder, is_touched, missed_loads
         from tgdsl.view.cameras import ViewError, angles_of
 
         if self.temperatures is not None and not self.temperatures[0] < self.temperatures[1]:
@@ -70,6 +70,7 @@ class Run:
         readings = self._steps(touch, sim, controls, recorder)
         if touch.plan.objects and not is_touched(touch, sim):
             print("at the end nothing touches an object")
+        print("".join(f"at the end {what}: see {name}\n" for name, what in missed_loads(touch, readings).items()), end="")
         recorder.write(with_folder(files["readings"]), controls)
         print(f"readings: {files['readings']}")
         self._draw(touch, sim, readings, files)

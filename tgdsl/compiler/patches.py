@@ -54,12 +54,18 @@ def check_groups(layout: LoadedLayout, robot: Model, problems: list[Problem]) ->
 
 
 def reporter(owner: Loaded | LoadedLayout, path: Path, problems: list[Problem]) -> Report:
-    """Return a function that notes what is wrong with a pattern, at the place where the pattern stands."""
+    """Return a function that notes what is wrong with a pattern, at the place where the pattern stands.
+
+    That a pattern is the name of a group which was left out, as it has a mistake of its own, is no other mistake.
+    """
+    layout = owner.layout if isinstance(owner, Loaded) else owner
 
     def report(where: tuple[str, int], what: str, hint: str) -> None:
         written = owner.raw(path)  # `links: a` and `links: [a]` stand for `links: {include: [a]}`
         place = where if isinstance(written, dict) else where[1:] if isinstance(written, list) else ()
-        problems.append(owner.problem((*path, *place), what, hint))
+        pattern = owner.raw((*path, *place))
+        if layout is None or pattern in layout.spec.groups or layout.raw(("groups", str(pattern))) is None:
+            problems.append(owner.problem((*path, *place), what, hint))
 
     return report
 

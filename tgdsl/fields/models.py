@@ -46,13 +46,13 @@ class Quantity:
     """Marks a float that may also be written with a unit, bounded in SI units.
 
     Attributes:
-        dimension: A key of `units.UNITS`.
+        dimension: A key of `units.UNITS`, or a `units.Dimension` of one's own.
         ge: Least value.
         gt: Bound that the value must exceed.
         le: Largest value.
     """
 
-    dimension: str
+    dimension: str | units.Dimension
     ge: float | None = None
     gt: float | None = None
     le: float | None = None
@@ -70,7 +70,7 @@ class Quantity:
             number["minimum"] = self.ge
         if self.le is not None:
             number["maximum"] = self.le
-        names = "|".join(re.sub(r"([*()])", r"\\\1", name) for name in units.UNITS[self.dimension])
+        names = "|".join(re.sub(r"([*()])", r"\\\1", name) for name in units.units_of(self.dimension))
         return {"anyOf": [number, {"type": "string", "pattern": PATTERN % names}]} if names else number
 
     def _read(self, found: object) -> float:
@@ -111,12 +111,12 @@ class Usual:
     """Marks a field whose value was most likely meant in another unit beyond these bounds: a warning then says so.
 
     Attributes:
-        dimension: A key of `units.UNITS`.
+        dimension: A key of `units.UNITS`, or a `units.Dimension` of one's own.
         low: Least usual magnitude, in SI units; 0 is usual too.
         high: Largest usual magnitude.
     """
 
-    dimension: str
+    dimension: str | units.Dimension
     low: float = 0.0
     high: float = math.inf
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 UNITS: dict[str, dict[str, float]] = {
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6},
@@ -31,6 +32,33 @@ UNITS: dict[str, dict[str, float]] = {
 ZEROS: dict[str, float] = {"K": -273.15}
 """Where the scale of a unit begins, in the first unit of its dimension; all others begin at 0."""
 
+
+@dataclass(frozen=True, eq=False)
+class Dimension:
+    """A dimension that `UNITS` lacks, for kinds of sensors and tasks of one's own.
+
+    Attributes:
+        name: What it is called in messages.
+        units: Factor to SI of each of its units; the first is the one inside tgdsl, with a factor of 1.
+    """
+
+    name: str
+    units: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` if the first unit is not the one inside, or a unit cannot be written behind a number."""
+        if not self.units or next(iter(self.units.values())) != 1.0:
+            raise ValueError(f"the units of {self.name}: found {dict(self.units)}, expected one with the factor 1 first")
+        for unit, factor in self.units.items():
+            if unit_of(f"1 {unit}") != unit or not 0 < factor < math.inf:
+                raise ValueError(f'the units of {self.name}: found "{unit}": {factor}, expected a word and a factor above 0')
+
+
+def units_of(dimension: str | Dimension) -> Mapping[str, float]:
+    """Return the factor to SI of every unit of a dimension: a key of `UNITS`, or one's own."""
+    return dimension.units if isinstance(dimension, Dimension) else UNITS[dimension]
+
+
 _QUANTITY = re.compile(r"\s*+([-+]?(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][-+]?[0-9]++)?)\s*+([A-Za-zµ/][\w*/µ()]*+)?\s*+\Z")
 """A number and a unit; possessive, so that nothing is read twice and a long text takes no long time."""
 
@@ -38,17 +66,17 @@ _SPELLINGS = str.maketrans({"^": "", "²": "2", "³": "3", "°": "deg", "·": "*
 """How units may be spelled elsewhere, and how they are here."""
 
 
-def parse(value: object, dimension: str) -> float:
+def parse(value: object, dimension: str | Dimension) -> float:
     """Return a quantity in SI units; a temperature in °C.
 
     Args:
         value: A number (taken as SI, or °C) or a string such as `"4 mm"`.
-        dimension: A key of `UNITS`.
+        dimension: A key of `UNITS`, or one's own.
 
     Raises:
         ValueError: If the value is no finite number, or its unit is not one of the dimension.
     """
-    known = UNITS[dimension]
+    known = units_of(dimension)
     wanted = f'a number in {next(iter(known))} or a string such as "4 {_example(known)}"' if known else "a number"
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise ValueError(f"{value!r} is not a quantity, expected {wanted}")
@@ -62,7 +90,8 @@ def parse(value: object, dimension: str) -> float:
         if not match:
             raise ValueError(f'"{value}" is not a quantity, expected {wanted}')
         if match[2] and match[2] not in known:
-            raise ValueError(f'"{match[2]}" is not a unit of {dimension}, expected one of {", ".join(known)}')
+            name = dimension.name if isinstance(dimension, Dimension) else dimension
+            raise ValueError(f'"{match[2]}" is not a unit of {name}, expected one of {", ".join(known)}')
         value = float(match[1]) * known.get(match[2] or "", 1.0) + ZEROS.get(match[2] or "", 0.0)
     try:
         value = float(value)
@@ -103,18 +132,18 @@ def _example(known: Mapping[str, float]) -> str:
     return [unit for unit in known if unit not in ZEROS][-1]
 
 
-def doubt(value: float, dimension: str, low: float, high: float) -> tuple[str, str] | None:
+def doubt(value: float, dimension: str | Dimension, low: float, high: float) -> tuple[str, str] | None:
     """Return why a quantity was most likely meant in another unit, and in which; None if there is no doubt.
 
     Args:
         value: The quantity, in SI units.
-        dimension: A key of `UNITS`.
+        dimension: A key of `UNITS`, or one's own.
         low: Least usual magnitude; 0 is usual too.
         high: Largest usual magnitude.
     """
     if value == 0 or low <= abs(value) <= high:
         return None
-    known = UNITS[dimension]
+    known = units_of(dimension)
     si = f" {next(iter(known))}" if known else ""
     bound = f"usually at least {low:g}{si}" if abs(value) < low else f"usually at most {high:g}{si}"
     scales = {(factor, ZEROS.get(unit, 0.0)): unit for unit, factor in known.items()}

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from tgdsl.errors import StateError
+from tgdsl.errors import StateError, listed
 from tgdsl.plan.inputs import Inputs
 
 SHAPES: dict[str, tuple[str | int, ...]] = {
@@ -131,7 +131,7 @@ class SceneState:
             if value is None:
                 raise StateError(f"SceneState.{name} is missing; this module wants {', '.join(inputs.fields)}")
             if name != "dt":
-                tensors[name] = _checked(name, value, shape_of(name, inputs), device)
+                tensors[name] = _checked(name, value, inputs, device)
         num_envs = {name: value.shape[0] for name, value in tensors.items()}
         for name, count in num_envs.items():
             if count != num_envs["body_pos"]:
@@ -155,12 +155,14 @@ def shape_of(name: str, inputs: Inputs) -> tuple[int, ...]:
     return tuple([inputs.sizes[part] if isinstance(part, str) else part for part in SHAPES[name]])
 
 
-def _checked(name: str, value: Any, want: tuple[int, ...], device: torch.device) -> Tensor:
+def _checked(name: str, value: Any, inputs: Inputs, device: torch.device) -> Tensor:
+    want = shape_of(name, inputs)
     if not isinstance(value, Tensor):
         raise StateError(f"SceneState.{name} is a {type(value).__name__}, expected a torch tensor")
     if value.ndim != len(want) + 1 or tuple(value.shape[1:]) != want:
         expected = ", ".join(map(str, want))
-        raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected})")
+        names = "".join(f"; {axis}: {listed(own)}" for axis, own in inputs.names.items() if axis in SHAPES[name])
+        raise StateError(f"SceneState.{name} has shape {tuple(value.shape)}, expected (env, {expected}){names}")
     if value.device != device:
         raise StateError(f"SceneState.{name} is on {value.device}, the module on {device}")
     if name in CHOICES:

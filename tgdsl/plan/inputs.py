@@ -69,17 +69,21 @@ class Inputs:
     dt: float = 0.0
 
     @cached_property
+    def names(self) -> Mapping[str, tuple[str, ...]]:
+        """What stands at each place of each axis of the fields whose entries have names."""
+        return {
+            "body": self.bodies,
+            "pair": tuple(f"{pair.link} – {pair.object}" for pair in self.pairs),
+            "object": self.objects,
+            "heated": self.heated,
+            "joint": self.joints,
+            "actuator": self.actuators,
+        }
+
+    @cached_property
     def sizes(self) -> Mapping[str, int]:
         """How many there are along each named axis of the fields."""
-        return {
-            "body": len(self.bodies),
-            "pair": len(self.pairs),
-            "slot": self.slots,
-            "object": len(self.objects),
-            "heated": len(self.heated),
-            "joint": len(self.joints),
-            "actuator": len(self.actuators),
-        }
+        return {**{axis: len(names) for axis, names in self.names.items()}, "slot": self.slots}
 
     def parts_of(self, name: str) -> tuple[ContactPart, ...]:
         """Return the geoms whose contacts are an object's; no geom is in two of its parts."""

@@ -6,7 +6,7 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators, `taxel` 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,8 @@ from tgdsl.runtime.source import Simulator
 
 PLACES = ("link", "body", "pos", "normal", "area")
 """What is kept of each taxel, as `taxels.taxel_table` calls it."""
+MISSED = 0.9
+"""Part of a load that is missed of which a run speaks."""
 Controls = Float[np.ndarray, "step actuator"] | Float[np.ndarray, "step env actuator"]
 
 
@@ -167,6 +169,32 @@ def is_touched(touch: TactileModule, sim: BatchSimulation) -> bool:
         {rigid(int(model.geom_bodyid[geom])) if geom >= 0 else -1 for geom in c.geom} for c in data.contact if not c.exclude
     ]
     return any(len(bodies) == 2 and bodies & objects for bodies in ends)
+
+
+def missed_loads(touch: TactileModule, readings: Mapping[str, Tensor]) -> dict[str, str]:
+    """Return, by the report that says so, of which readings nearly all of the load is where no taxel is, and how much.
+
+    Loads are the sizes of forces by body, in the first environment: of what a body's taxels feel together, and of what it
+    misses. Readings with a history are left out.
+
+    Args:
+        touch: The module.
+        readings: Its readings.
+    """
+    found = {}
+    for output in touch.outputs:
+        report = f"{output.name}/missed"
+        missed = readings.get(report)
+        if missed is None or "force_x" not in output.channels or missed.ndim + len(output.shape) != 5:
+            continue
+        first, names = output.channels.index("force_x"), list(touch.rows[output.name]["body"])
+        force = readings[output.name][0, :, first : first + 3].double().cpu().numpy()
+        own = [np.add.reduce(force[[name == body for name in names]], axis=0) for body in output.bodies]
+        felt = float(np.linalg.norm(own, axis=1).sum())
+        lost = float(missed[0].double().norm(dim=-1).sum())
+        if lost > MISSED * (felt + lost):
+            found[report] = f'"{output.name}" misses {lost:.3g} of {felt + lost:.3g} N, which act where none of its taxels is'
+    return found
 
 
 class Recorder:

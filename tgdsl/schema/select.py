@@ -39,7 +39,8 @@ def select(
             means the link that is called so.
         report: Called for each pattern of the selection itself that matches nothing. Wildcards and groups in `exclude` may, so
             that one selection serves several robots; a plain name may not.
-        group: The selection's own name, if it is a group: that it contains itself is reported too.
+        group: The selection's own name, if it is a group: that it contains itself is reported too, and that another holds no
+            link is not where that one's own patterns match none.
         elsewhere: Names that no candidate has but something else, so that to exclude them is no mistake.
 
     Returns:
@@ -48,7 +49,8 @@ def select(
     known = [*groups, *(name for names in candidates for name in names)]
     for i, pattern in enumerate(selection.include):
         if pattern in groups and not _group(pattern, candidates, groups, ()) and pattern != group:
-            report(("include", i), f'group "{pattern}" holds no link', "")
+            if group is None or all(own in groups or _matched(own, candidates) for own in groups[pattern].include):
+                report(("include", i), f'group "{pattern}" holds no link', "")
         elif pattern not in groups and not _matched(pattern, candidates):
             report(("include", i), f'no link matches "{pattern}"', did_you_mean(pattern, known, "links"))
     for i, name in enumerate(selection.exclude):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any
 
 from pydantic import BaseModel, ValidationError
@@ -124,11 +125,16 @@ def _problem(
     if kind == "missing":
         return source.problem(full[:-1], f'missing key "{path[-1]}"', on_key=True)
     if kind == "union_tag_not_found":
-        return source.problem(full, f"missing key {context['discriminator']}".replace("'", '"'), on_key=True)
+        key = context["discriminator"].strip("'")
+        near = get_close_matches(key, map(str, found) if isinstance(found, dict) else (), 1)
+        return source.problem(full, f'missing key "{key}"', f'is "{near[0]}" meant to be it?' if near else "", on_key=True)
     if kind == "union_tag_invalid":
         key = context["discriminator"].strip("'")
         tags = [tag.strip(" '") for tag in context["expected_tags"].split(",")]
-        return source.problem((*full, key), f'unknown {key} "{context["tag"]}"', did_you_mean(context["tag"], tags, f"{key}s"))
+        hint = did_you_mean(context["tag"], tags, f"{key}s")
+        if key == "kind" and hint.startswith("known"):
+            hint += "; kinds of other packages are known once these are installed"
+        return source.problem((*full, key), f'unknown {key} "{context["tag"]}"', hint)
     if kind == "literal_error":
         return source.problem(full, f"found {_brief(found)}, expected {context['expected']}")
     if kind == "value_error":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from tgdsl.errors import TgdslError
@@ -46,5 +48,19 @@ def device_of(device: torch.device | str) -> torch.device:
     try:
         return torch.empty(0, device=device).device
     except (RuntimeError, AssertionError, TypeError) as error:
-        what = str(error).partition("\n")[0]
-        raise TgdslError(f'there is no device "{device}": {what}') from error
+        raise TgdslError(f'there is no device "{device}"{why_there_is_none(device, error)}') from error
+
+
+def why_there_is_none(device: object, error: Exception, known: Sequence[str] = ("cpu", "cuda")) -> str:
+    """Return what is to be said of a device that torch does not have: what is expected in place of it, or torch's own words.
+
+    Args:
+        device: The device.
+        error: What torch raised.
+        known: Types of devices of which one may be meant.
+    """
+    if str(device).partition(":")[0] in known:
+        return f": {str(error).partition(chr(10))[0]}"
+    if str(device).startswith("gpu") and "cuda" in known:
+        return '; did you mean "cuda"?'
+    return "; expected " + " or ".join(f'"{name}"' for name in known)

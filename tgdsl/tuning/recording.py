@@ -6,7 +6,7 @@ Shapes: `step` control steps, `env` environments, `actuator` actuators.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from torch import Tensor
 from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import StateError, TgdslError
 from tgdsl.files.write import atomic_open, with_folder
-from tgdsl.module.accuracy.states import names_of, narrowed
+from tgdsl.module.accuracy.states import narrowed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
@@ -46,7 +46,7 @@ class Recording:
     """
 
     states: tuple[SceneState, ...]
-    names: dict[str, list[str]]
+    names: Mapping[str, Sequence[str]]
     source: str
 
     @property
@@ -132,7 +132,7 @@ def record(
     sim.close()
     touch.free()
     what = f"{len(found)} steps of {1e3 * sim.control_step:g} ms in {num_envs} environments, seed {seed}"
-    return Recording(tuple(found), names_of(touch.inputs), f"scripted run: {what}")
+    return Recording(tuple(found), touch.inputs.names, f"scripted run: {what}")
 
 
 def _copy(state: SceneState) -> SceneState:

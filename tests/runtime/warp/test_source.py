@@ -42,7 +42,7 @@ def test_a_gpu_is_asked_for_by_its_device_alone(tmp_path, monkeypatch):
         ({"device": "cpu", "nconmax": 8}, r'^nconmax and njmax are for physics on a GPU; on "cpu" there is always room$'),
         ({"njmax": 8}, r"^nconmax and njmax are for physics on a GPU"),
         ({"device": "cuda", "threads": 2}, r'^threads is 2, but only physics on "cpu" has threads, and the device is "cuda"$'),
-        ({"device": "tpu"}, r'^there is no device "tpu" to run physics on'),
+        ({"device": "tpu"}, r'^there is no device "tpu" to run physics on; expected "cuda" or "cpu"$'),
     ],
 )
 def test_arguments_for_another_device(tmp_path, keys, message):

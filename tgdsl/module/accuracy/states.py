@@ -5,7 +5,7 @@ Shapes: `step` calls, `env` environments, `row` rows of a reading, `channel` num
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,35 +17,26 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
 
-AXES = ("body", "pair", "object", "heated", "joint", "actuator")
-"""Axes of the fields whose entries have names."""
 TOGETHER = 1e-6
 """Distances [m] that differ by less count as equal where a row is looked for by its place."""
 
 
-def names_of(inputs: Inputs) -> dict[str, list[str]]:
-    """Return what stands at each place of each named axis of a state's fields."""
-    pairs = [f"{pair.link} – {pair.object}" for pair in inputs.pairs]
-    own = (inputs.bodies, pairs, inputs.objects, inputs.heated, inputs.joints, inputs.actuators)
-    return {axis: list(names) for axis, names in zip(AXES, own, strict=True)}
-
-
-def narrowed(state: SceneState, have: dict[str, list[str]], inputs: Inputs) -> SceneState:
+def narrowed(state: SceneState, have: Mapping[str, Sequence[str]], inputs: Inputs) -> SceneState:
     """Return what a module wants of a state that has more.
 
     Args:
         state: The state.
-        have: What stands at its places: `names_of` the module that it was recorded for.
+        have: What stands at its places: `Inputs.names` of the module that it was recorded for.
         inputs: What is wanted.
 
     Raises:
         StateError: If it has less.
     """
-    want = names_of(inputs)
-    for axis in AXES:
+    want = inputs.names
+    for axis in want:
         if missing := [name for name in want[axis] if name not in have[axis]]:
             raise StateError(f"these states lack the {axis} {listed(missing)}: they are of another document")
-    places = {axis: torch.tensor([have[axis].index(name) for name in want[axis]], dtype=torch.int64) for axis in AXES}
+    places = {axis: torch.tensor([have[axis].index(name) for name in want[axis]], dtype=torch.int64) for axis in want}
     values: dict[str, Any] = {}
     for name in (name for name in inputs.fields if name in SHAPES):
         value = getattr(state, name)

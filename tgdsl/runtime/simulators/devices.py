@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from tgdsl.errors import SimulationError
+from tgdsl.tensors.devices import why_there_is_none
 
 
 def checked_device(device: str, supported: Sequence[str]) -> torch.device:
@@ -22,7 +23,8 @@ def checked_device(device: str, supported: Sequence[str]) -> torch.device:
     try:
         found = torch.empty(0, device=device).device
     except (RuntimeError, AssertionError) as error:
-        raise SimulationError(f'there is no device "{device}" to run physics on: {error}') from error
+        hint = why_there_is_none(device, error, supported)
+        raise SimulationError(f'there is no device "{device}" to run physics on{hint}') from error
     if found.type not in supported:
         expected = " or ".join(f'"{name}"' for name in supported)
         raise SimulationError(f'physics on "{device}" is not supported, expected {expected}')
