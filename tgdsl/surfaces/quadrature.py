@@ -118,6 +118,17 @@ def outer_surface(geoms: Sequence[SurfaceGeom], spacing: float) -> Pieces:
     return Pieces(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
+def extent(geoms: Sequence[SurfaceGeom]) -> Float[np.ndarray, "2 3"]:
+    """Return the least and the largest coordinates of an object's geoms in the body's frame, planes left out [m]."""
+    found = [np.zeros((0, 3))]
+    for felt in (felt for felt in geoms if felt.shape != "plane"):
+        geom = felt.geom
+        own = _triangles(felt.shape, geom.size, np.inf) if felt.surface is None else felt.surface.vertices
+        found.append(own.reshape(-1, 3) @ geom.rotation.T + geom.pos)
+    points = np.concatenate(found)
+    return np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else np.zeros((2, 3))
+
+
 @dataclass(frozen=True, eq=False)
 class _Geom:
     """A geom's triangles, signed distance and its gradient, all in the body's frame."""

@@ -159,6 +159,31 @@ def test_a_finer_tolerance_takes_more_bytes_and_has_smaller_errors():
     assert fine.values.nbytes > coarse.values.nbytes and fine.errors.first_rms < coarse.errors.first_rms
 
 
+def test_objects_of_metres_take_no_more_pieces_than_small_ones(monkeypatch):
+    """A table with a leg: its area in closed form, of as many pieces as that of a hundredth of it."""
+    counts = []
+
+    def counted(geoms, spacing):
+        found = outer_surface(geoms, spacing)
+        counts.append(len(found.area))
+        return found
+
+    monkeypatch.setattr(moments, "outer_surface", counted)
+    for size in (4.0, 0.3):
+        top, leg = felt("box", [size, size, size / 4]), felt("box", [size / 4] * 2 + [size], (0, 0, -size))
+        # The leg is hidden down to a quarter of the size, and hides as much of the top's underside as its own lower end has.
+        area = 8 * size**2 + 8 * size * size / 2 + 4 * (size / 2) * (7 / 4 * size)
+        assert surface_area([top, leg]) == pytest.approx(area, rel=1e-3)
+    assert counts[0] == counts[1] < 1e6
+
+
+def test_a_field_that_no_budget_holds_is_refused_before_anything_is_summed(monkeypatch):
+    """Two metres at a radius of 4 mm: 0.9 mm cells, 4 numbers of 4 bytes at each of 2250³ nodes."""
+    monkeypatch.setattr(moments, "outer_surface", None)
+    with pytest.raises(BakeError, match=r"at a radius of 4 mm needs about 1\.7\de\+05 MiB"):
+        bake_field([felt("box", [1.0, 1.0, 1.0])], 0.004)
+
+
 def test_what_cannot_be_computed():
     with pytest.raises(BakeError, match=r"at a radius of 10 mm needs about .* MiB \(\d+ bytes\), and the budget is 0.0954 MiB"):
         bake_field([BALL], R, TOLERANCE, budget=100_000)

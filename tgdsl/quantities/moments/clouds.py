@@ -15,15 +15,12 @@ from scipy.spatial import KDTree
 
 from tgdsl.errors import BakeError
 from tgdsl.files import cache
-from tgdsl.quantities.moments.fields import AREA_RADIUS, moments_key, surface_area
+from tgdsl.quantities.moments.fields import moments_key, spacing_of, surface_area
 from tgdsl.surfaces.geom import SurfaceGeom
 from tgdsl.surfaces.quadrature import outer_surface
 
 SLACK = 1e-6
 """By how much lists reach farther than the radius, for the rounding of a float32 [m]."""
-
-FINENESS = 200
-"""Pieces along a large object that points are drawn from: no more, so that their number stays bounded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +59,15 @@ def sample_points(geoms: Sequence[SurfaceGeom], count: int) -> tuple[Float[np.nd
     """
 
     def make() -> tuple[np.ndarray, float]:
-        pieces = outer_surface(geoms, max(AREA_RADIUS, max(map(_extent, geoms)) / FINENESS))
+        pieces = outer_surface(geoms, spacing_of(geoms))
         return pieces.random_by_side(count, seed=0).pos, surface_area(geoms)
 
     return cache.cached(
-        moments_key(geoms, b"points side by side", AREA_RADIUS, FINENESS, count),
+        moments_key(geoms, b"points side by side", spacing_of(geoms), count),
         make,
         lambda sampled: {"pos": sampled[0], "area": np.asarray(sampled[1])},
         lambda found: (found["pos"], float(found["area"])),
     )
-
-
-def _extent(felt: SurfaceGeom) -> float:
-    """Return about how long a geom is [m]."""
-    return float(np.ptp(felt.surface.vertices, axis=0).max() if felt.surface is not None else 2 * felt.geom.size.max())
 
 
 def sample_cloud(

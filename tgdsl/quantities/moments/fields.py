@@ -27,7 +27,7 @@ from tgdsl.files import cache
 from tgdsl.geometry.planes import split
 from tgdsl.quantities.moments.moments import MomentField, field_moments
 from tgdsl.surfaces.geom import SurfaceGeom
-from tgdsl.surfaces.quadrature import Pieces, Quadrature, outer_surface
+from tgdsl.surfaces.quadrature import Pieces, Quadrature, extent, outer_surface
 
 FORMAT = b"tgdsl moments 2"
 CHOICE_POINTS, REPORT_POINTS = 1024, 2048
@@ -39,8 +39,8 @@ GRADIENT_FINENESS = 24
 """Pieces along a radius where gradients have a tolerance; fewer where it is more than one over this."""
 BRICK = 6
 """Nodes along the side of a brick that is computed at once."""
-AREA_RADIUS = 1e-3
-"""Longest side of the pieces that an object's area is summed from [m]."""
+SPACING, PIECES = 1e-3, 200.0
+"""Longest side of the pieces that an area is summed from and points are drawn from [m]; but no more along a large object."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,17 @@ class BakedField:
     errors: FieldErrors
 
 
+def spacing_of(geoms: Sequence[SurfaceGeom]) -> float:
+    """Return the longest side of the pieces that an object's surface is cut into where no radius says how fine [m]."""
+    return max(SPACING, float(np.ptp(extent(geoms), axis=0).max()) / PIECES)
+
+
 def surface_area(geoms: Sequence[SurfaceGeom]) -> float:
     """Return the area of an object's outer surface, planes left out [m²]."""
+    spacing = spacing_of(geoms)
     return cache.cached(
-        moments_key(geoms, b"area", AREA_RADIUS),
-        lambda: float(outer_surface(geoms, AREA_RADIUS).area.sum()),
+        moments_key(geoms, b"area", spacing),
+        lambda: float(outer_surface(geoms, spacing).area.sum()),
         lambda area: {"area": np.asarray(area)},
         lambda found: float(found["area"]),
     )
@@ -177,17 +183,21 @@ def _bake(geoms: Sequence[SurfaceGeom], radius: float, limits: Limits, with_slop
     least = 4.0 if gradient_tolerance is None else float(np.clip(1 / gradient_tolerance, 4, GRADIENT_FINENESS))
     # The error of S1 is that of the quadrature, some (0.25 / k)² of spacings R/k, and that of the lattice.
     spacing = radius / float(np.clip(0.55 / np.sqrt(tolerance), least, 24))
+    channels = 8 if with_slope else 4
+    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be. That of
+    # S0's gradients falls as the cell: some 0.17 h/R.
+    cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
+    cell = cell if gradient_tolerance is None else min(cell, radius * gradient_tolerance / 0.17)
+    # Before anything is summed: what a budget holds also bounds how many pieces there are.
+    needed = 4 * channels * int(np.prod(_lattice(extent(geoms), radius, cell)[1]))
+    if needed > budget:
+        raise BakeError(_too_large(radius, limits, needed))
     pieces, fine = outer_surface(geoms, spacing), outer_surface(geoms, spacing / FINER)
     if not len(pieces.area):
         raise BakeError("there is no surface to bake moments of: planes are exact")
     coarse, exact = pieces.quadrature(spacing), fine.quadrature(spacing / FINER)
     held_back = _around(fine, radius, REPORT_POINTS, seed=2), _around(fine, radius, CHOICE_POINTS, seed=1)
     report, choice = (_truth(exact, pos, radius, gradient_tolerance is not None) for pos in held_back)
-    channels = 8 if with_slope else 4
-    # The error falls as the square of the cell or faster: a coarse lattice, some 0.4 (h/R)², tells how fine to be. That of
-    # S0's gradients falls as the cell: some 0.17 h/R.
-    cell = radius * float(np.clip(2 * np.sqrt(tolerance / 0.4), 0.05, 0.5))
-    cell = cell if gradient_tolerance is None else min(cell, radius * gradient_tolerance / 0.17)
     while True:
         origin, num = _lattice(coarse.pos, radius, cell)
         needed = 4 * channels * int(np.prod(num))
