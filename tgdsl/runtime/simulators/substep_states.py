@@ -39,7 +39,8 @@ class SubstepStates:
             SimulationError: If the module wants another number.
         """
         if substeps != self._wanted:
-            what = f"this module has sensors that are advanced at {self._wanted} physics steps per call"
+            steps = f"{self._wanted} physics step{'' if self._wanted == 1 else 's'}"
+            what = f"this module has sensors that are advanced at {steps} per call"
             raise SimulationError(
                 f"{what}, and this simulation makes {substeps} per control step; simulate with substeps={self._wanted}"
             )
