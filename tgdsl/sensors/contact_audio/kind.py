@@ -123,23 +123,33 @@ def forward(gathered: Gathered, context: Context, constants: Constants, state: S
     if "noise" in constants:
         strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
         struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
-    parts = torch.cat([state["phasors"], struck], dim=-1)
-    new["phasors"] = after = _turned(parts, turn_of(constants, context.step[0] + context.substep), constants)
-    if "heard" in constants:
-        made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
+    phasors, turn = state["phasors"], turn_of(constants, context.step[0] + context.substep)
+    new["phasors"] = after = _turned(phasors, struck, turn, constants)
+    if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
+        parts = torch.cat([phasors, struck], dim=-1).permute(1, 2, 0)
+        made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 1, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
 
-def _turned(parts: Tensor, turn: Tensor, constants: Constants) -> Tensor:
-    """Return the phasors at the end of a step, (env, row, part · mode) [N·s], of those at its start and what strikes them."""
-    (cosine, sine), modes = turn.unbind(), turn.shape[-1]
-    real, imag, struck = parts[..., :modes], parts[..., modes : 2 * modes], parts[..., 2 * modes :]
-    turned = torch.addcmul(real * cosine, imag, sine, value=-1), torch.addcmul(real * sine, imag, cosine)
-    after = torch.cat(turned, dim=-1)
+def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step, (env, row, part · mode) [N·s].
+
+    By products alone, not of a matrix: matrices may be multiplied in TF32, and phasors would then grow or decay by it.
+
+    Args:
+        phasors: Those at its start, real parts first [N·s].
+        struck: Impulses (env, row, grain) [N·s].
+        turn: What is left of each part, and what it has of the other, (2, row, part · mode).
+        constants: The sensor's.
+    """
+    (along, across), modes = turn.unbind(), phasors.shape[-1] // 2
+    crossed = torch.cat([phasors[..., modes:], phasors[..., :modes]], dim=-1)
+    after = torch.addcmul(phasors * along, crossed, across)
     for grain, own in enumerate(constants["struck"].unbind()):
-        after = torch.addcmul(after, struck[..., grain, None], own)
+        spread = struck[..., grain, None].expand_as(after).contiguous()  # eager, rows that are alike are multiplied faster
+        after = torch.addcmul(after, spread, own)
     return torch.nn.functional.hardshrink(after, least())
 
 

@@ -8,8 +8,8 @@ turned by the same rounded factor at every step drifts by 3e-8 a step. So in flo
 others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
 last place by which it is above the lower number. What is left are roundings that do not add up.
 
-Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `sample` samples of a block,
-`band` bands, `grain` times of impulses.
+Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `both` the real parts of all
+modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` times of impulses.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
         "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
-        **_rounded("turn", np.stack([np.real(turn), np.imag(turn)])),
+        **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
     }
     if scrape > 0:
         found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
@@ -123,8 +123,15 @@ def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{name}_low": low, f"{name}_high": high, f"{name}_share": (exact - low) / (high - low)}
 
 
-def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "part row mode"]:
-    """Return p as a step uses it, its real and imaginary parts: exact in float64, rounded down or up in float32.
+def _by_parts(name: str, turn: Float[np.ndarray, "2 row mode"]) -> Float[np.ndarray, "2 row both"]:
+    """Return what Re z′ and Im z′ have of their own part of z, Re p twice, and of the other part, −Im p and Im p."""
+    real, imag = turn
+    sign = 1.0 if name.endswith("share") else -1.0
+    return np.stack([np.concatenate([real, real], axis=-1), np.concatenate([sign * imag, imag], axis=-1)])
+
+
+def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 row both"]:
+    """Return p as a step uses it, for both parts of z: exact in float64, rounded down or up in float32.
 
     Args:
         constants: The module's.
