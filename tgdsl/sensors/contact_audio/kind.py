@@ -58,6 +58,7 @@ from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
 from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
+from tgdsl.sensors.contact_audio.shares import indices, shares, tables
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
@@ -73,7 +74,7 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
     def surface(name: str) -> Surface:
         return surface_of(name, ()) if spec.of == "link" else surface_of.of_object(name)
 
-    modes, rows = ringing(spec, layout, step, surface), axis_of(spec, layout)
+    modes, rows = ringing(spec, layout, step, surface, surface_of.progress), axis_of(spec, layout)
     constants = {
         "frequency": modes.frequency,
         "decay": modes.decay,
@@ -82,6 +83,7 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         "settling": scalar(spec.settling),
         "scrape": scalar(spec.scrape),
     }
+    constants |= tables(modes.shapes, modes.frequency.shape[1]) if modes.shapes else {}
     constants |= {"is_of_object": scalar(1.0)} if spec.of == "object" else {}
     constants |= {"is_paper": scalar(1.0)} if spec.model == "paper" else {}
     channels = (Channel("sound", "m/s"),)
@@ -92,12 +94,15 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in band_numbers(modes.frequency))
     pairs = (len(layout.bodies), len(spec.feels))
     state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
-    is_heard = spec.outputs == "samples"
+    if spec.model != "paper":
+        state["pending"] = Memory(shape=pairs)
+        state |= {"weighted": Memory(shape=(*pairs, modes.frequency.shape[1]))} if modes.shapes else {}
+    is_heard, loads = spec.outputs == "samples", Loads(spec.feels, slots=spec.slots, of=spec.of, has_center=bool(modes.shapes))
     return Lowered(
         channels=channels,
         constants=constants | operators(constants, step),
-        state=state | ({} if spec.model == "paper" else {"pending": Memory(shape=pairs)}),
-        requests=(Loads(spec.feels, slots=spec.slots, of=spec.of), *((_places(spec, layout),) if is_heard else ())),
+        state=state,
+        requests=(loads, *((_places(spec, layout),) if is_heard else ())),
         rows=rows,
         notes=(f"{spec.samples} samples per step of {step:g} s: {spec.samples / step:g} Hz", *modes.notes),
         substeps=spec.substeps,
@@ -117,16 +122,19 @@ def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the samples of a step (env, sample, 1, row) [m/s], or the energies of its bands (env, band, row)."""
-    loads = gathered[Loads]
-    impulse, new = impulses(loads.force, constants, state)
-    struck = _of_rows(impulse, constants)[..., None]
+    loads, share, sliding = gathered[Loads], None, gathered[Loads].sliding
+    if loads.center is not None and loads.along is not None and "shape_value" in constants:
+        share = shares(loads.center, loads.along, constants)
+        sliding = sliding[..., None] * (share * share)
+    impulse, new = impulses(loads.force, constants, state, share)
+    struck = _of_rows(impulse, constants).unsqueeze(2)
     if "noise" in constants:
-        strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
-        struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
+        strikes = _noise(_of_rows(sliding, constants), context, constants)
+        struck = torch.cat([strikes[:, :, :1] + struck, strikes[:, :, 1:]], dim=2)
     phasors, turn = state["phasors"], turn_of(constants, context.step[0] + context.substep)
     new["phasors"] = after = _turned(phasors, struck, turn, constants)
     if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
-        parts = torch.cat([phasors, struck], dim=-1).permute(1, 2, 0)
+        parts = torch.cat([phasors, struck.flatten(2)], dim=-1).permute(1, 2, 0)
         made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 1, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
@@ -140,7 +148,7 @@ def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants)
 
     Args:
         phasors: Those at its start, real parts first [N·s].
-        struck: Impulses (env, row, grain) [N·s].
+        struck: Impulses (env, row, grain) [N·s], or of each mode, (env, row, grain, mode).
         turn: What is left of each part, and what it has of the other, (2, row, part · mode).
         constants: The sensor's.
     """
@@ -148,26 +156,29 @@ def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants)
     crossed = torch.cat([phasors[..., modes:], phasors[..., :modes]], dim=-1)
     after = torch.addcmul(phasors * along, crossed, across)
     for grain, own in enumerate(constants["struck"].unbind()):
-        spread = struck[..., grain, None].expand_as(after).contiguous()  # eager, rows that are alike are multiplied faster
+        one = struck[:, :, grain]
+        # Eager, tensors that are alike are multiplied faster than those that broadcast.
+        spread = torch.cat([one, one], dim=-1) if one.ndim == 3 else one[..., None].expand_as(after).contiguous()
         after = torch.addcmul(after, spread, own)
     return torch.nn.functional.hardshrink(after, least())
 
 
 def _of_rows(pairs: Tensor, constants: Constants) -> Tensor:
-    """Return the sum over what touches each body (or object) that rings, (env, row)."""
+    """Return the sum over what touches each body (or object) that rings, (env, row, *mode), of (env, body, object, *mode)."""
     dim = 1 if "is_of_object" in constants else 2
     return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
 
 
 def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
-    """Return the impulses of sliding (env, row, grain) [N·s]."""
+    """Return the impulses of sliding (env, row, grain, *mode) [N·s], of its power (env, row, *mode) [W]."""
     assert context.stream is not None
     rows, grains = sliding.shape[1], constants["struck"].shape[0]
     count = (grains + 1) // 2
     index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
     pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)
     normals = torch.stack(pair, dim=-1).view(-1, rows, 2 * count)[..., :grains]
-    return (constants["noise"] * planes.safe_sqrt(sliding))[..., None] * normals
+    size = (constants["noise"] * planes.safe_sqrt(sliding)).unsqueeze(2)
+    return size * (normals if size.ndim == 3 else normals[..., None])
 
 
 def _level(energy: Tensor) -> Tensor:
@@ -189,5 +200,6 @@ CONTACT_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     retimed=retimed,
+    indices=indices,
     provides=SOUND,
 )

@@ -76,7 +76,8 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
 
     Args:
         constants: `frequency` [Hz], `decay` [1/s], `gain` [1/kg], each (row, mode), 0 where a row has fewer; `samples`;
-            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands.
+            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands; `shape_value`
+            where each mode has impulses of its own.
         step: The time step.
     """
     samples, is_paper, scrape = int(constants["samples"]), "is_paper" in constants, float(constants["scrape"])
@@ -106,11 +107,10 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return found | {"energy": np.concatenate([energy, energy], axis=1)}
     free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
-    parts = [
-        gain[..., None] * np.imag(free),
-        gain[..., None] * np.real(free),
-        (gain[..., None, None] * np.imag(of_impulses)).sum(axis=1),
-    ]
+    own = gain[..., None, None] * np.imag(of_impulses)
+    by_mode = own.swapaxes(1, 2).reshape(len(own), -1, own.shape[-1])  # grain by grain
+    strikes = by_mode if "shape_value" in constants else own.sum(axis=1)
+    parts = [gain[..., None] * np.imag(free), gain[..., None] * np.real(free), strikes]
     return found | {"heard": np.concatenate(parts, axis=1)}
 
 
