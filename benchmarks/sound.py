@@ -10,7 +10,7 @@
 per mode, sample by sample, as printed by Chung et al., all environments, links and modes at once, struck by the same impulses.
 Both write their state in place, once eager and once compiled; in turn, in CPU time of the thread. `products` are the fewest
 multiply-adds that a block takes, as part of a product of large matrices: its bound on this machine. `module` is a whole call,
-contacts and noise included. `gpu` times the whole call, compiled.
+contacts and noise included, with mean gains and with those at the contact. `gpu` times the whole call, compiled.
 """
 
 from __future__ import annotations
@@ -46,6 +46,10 @@ CASES: dict[str, dict[str, Any]] = {
     "without noise": {"scrape": 0.0},
     "bands": {"outputs": "bands"},
     "five steps": {"substeps": 5},
+    "at contacts": {
+        "modes": {"material": {"like": "steel", "youngs_modulus": 1e9}, "count": MODES},
+        "gains": "contact",
+    },
 }
 """What the sensor is given."""
 
@@ -123,7 +127,7 @@ def run_cpu(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     with TemporaryDirectory() as scratch:
         silent = tgdsl.compile(document(Path(scratch), scrape=0.0))
-        whole = tgdsl.compile(document(Path(scratch)))
+        whole, placed = (tgdsl.compile(document(Path(scratch), **CASES[name])) for name in ("one step", "at contacts"))
     constants = {
         name: value.to(torch.float32) if value.is_floating_point() else value
         for name, value in ((key, silent.constants[f"sensors/s/{key}"]) for key in silent.plan.sensors[0].constants)
@@ -150,13 +154,14 @@ def run_cpu(options: argparse.Namespace) -> None:
         "loop, compiled": lambda: compiled[1](force),
         "products": lambda: large @ large,
         "module": lambda: [whole(one) for one in states],
+        "module, at contacts": lambda: [placed(one) for one in states],
     }
     with torch.no_grad():
         taken = timed(calls, options.repeats, options.calls)
-    taken["module"] = [own / len(states) for own in taken["module"]]
+    taken |= {name: [own / len(states) for own in taken[name]] for name in ("module", "module, at contacts")}
     taken["products"] = [own * n * LINKS * 2 * MODES * (SAMPLES + 2) / 512**3 for own in taken["products"]]
     for name, own in taken.items():
-        print(f"{name:<18}{1e3 * statistics.median(own):9.3f} ms")
+        print(f"{name:<20}{1e3 * statistics.median(own):9.3f} ms")
     for ending in ("", ", compiled"):
         ratio = [slow / fast for slow, fast in zip(taken[f"loop{ending}"], taken[f"block{ending}"], strict=True)]
         print(f"loop / block{ending}: {statistics.median(ratio):.1f} ({min(ratio):.1f} to {max(ratio):.1f})")

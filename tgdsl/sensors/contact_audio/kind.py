@@ -19,6 +19,11 @@ Impulses u act at four times of each step, t_n = (0, ¼, ½, ¾) Δt:
   m_s [kg] the variance of the impulses of one second at 1 N and 1 m/s [N²·s²]. The energy that it brings is a fixed part of
   that of friction, and the level grows by 10 dB with ten times the force or ten times the speed.
 
+`gains: contact` weights what a contact brings by the mode shapes φ_i there: J and W of a contact count for mode i as s_i J and
+s_i² W, with its share s_i = φ_i(x) · n / a_i of the centre x of a pair's contacts, the mean n of their normals into the body,
+and the root mean square a_i of φ_i along the normal over the surface; see `shares`. So s_i² is 1 in the mean over the surface,
+and g_i stays. An impulse is weighted by where its load acted while it grew. What is heard remains a mean over the surface.
+
 `outputs: bands` reads instead, at the end of each step, the mean square of what is heard of the modes in each third octave:
 
     E_b = ½ Σ_(i in b) g_i² |z_i|²   [m²/s²],   or   10 lg(1 + E_b/E₀), E₀ = (1 µm/s)²   [dB]
@@ -35,7 +40,8 @@ u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is t
 Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; noise by the power of friction as in van den
 Doel, Kry and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
 
-Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it.
+Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it. A load that is
+spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does.
 """
 
 from __future__ import annotations
