@@ -22,6 +22,8 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from tgdsl.tensors.fusion import materialised
+
 GRAINS = 4
 """Times within a physics step at which noise strikes: the same for any number of samples, so that the noise is."""
 HIGHEST = 0.45
@@ -140,4 +142,5 @@ def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 
     low, high, share = (constants[f"turn_{name}"] for name in ("low", "high", "share"))
     if low.dtype == torch.float64:
         return low + share * (high - low)
-    return torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
+    found = torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
+    return found if found.is_cuda else materialised(found)  # on a CPU it is else chosen anew for each environment
