@@ -7,8 +7,10 @@
 `LINKS` links of `MODES` modes each, `SAMPLES` samples per physics step, each link touching the one object or not.
 
 `cpu`: `block` is what `contact_audio` does from loads to samples, without noise; `loop` does the same with a two-pole resonator
-per mode, sample by sample, as printed by Chung et al., all environments, links and modes at once. Both eager, both compiled; in
-turn, in CPU time of the thread. `module` is a whole call, contacts and noise included. `gpu` times the whole call, compiled.
+per mode, sample by sample, as printed by Chung et al., all environments, links and modes at once, struck by the same impulses.
+Both write their state in place, once eager and once compiled; in turn, in CPU time of the thread. `products` are the fewest
+multiply-adds that a block takes, as part of a product of large matrices: its bound on this machine. `module` is a whole call,
+contacts and noise included, with mean gains and with those at the contact. `gpu` times the whole call, compiled.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 from tgdsl.quantities.base import Gathered
 from tgdsl.quantities.loads import Loads, PairLoads
+from tgdsl.quantities.places import Places
 from tgdsl.sensors.base import Context
 from tgdsl.sensors.contact_audio.impulses import impulses
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
@@ -43,6 +46,10 @@ CASES: dict[str, dict[str, Any]] = {
     "without noise": {"scrape": 0.0},
     "bands": {"outputs": "bands"},
     "five steps": {"substeps": 5},
+    "at contacts": {
+        "modes": {"material": {"like": "steel", "youngs_modulus": 1e9}, "count": MODES},
+        "gains": "contact",
+    },
 }
 """What the sensor is given."""
 
@@ -97,18 +104,21 @@ class Loop:
             last, before = now, last
         return torch.stack(found, dim=1), last, before, new["steady"], new["pending"]
 
-    def __call__(self, step: Callable[..., tuple[Tensor, ...]], force: Tensor) -> None:
-        """Advance by a physics step."""
-        _, last, before, steady, pending = step(force, self.last, self.before)
+    def advance(self, force: Tensor) -> Tensor:
+        """Advance by a physics step: return samples (env, sample, row)."""
+        found, last, before, steady, pending = self.step(force, self.last, self.before)
         for old, new in ((self.last, last), (self.before, before)):
             old.copy_(new)
         self.state["steady"].copy_(steady)
         self.state["pending"].copy_(pending)
+        return found
 
 
 def block(force: Tensor, context: Context, constants: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[Tensor, dict]:
     """Return the samples of `contact_audio` and its new state."""
-    found, new = CONTACT_AUDIO.forward(Gathered({Loads: PairLoads(force, force, None)}), context, constants, state)
+    still = torch.zeros(1, LINKS)
+    gathered = Gathered({Loads: PairLoads(force, force, None), Places: (still, still, still)})
+    found, new = CONTACT_AUDIO.forward(gathered, context, constants, state)
     return found["signal"], dict(new)
 
 
@@ -117,7 +127,7 @@ def run_cpu(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     with TemporaryDirectory() as scratch:
         silent = tgdsl.compile(document(Path(scratch), scrape=0.0))
-        whole = tgdsl.compile(document(Path(scratch)))
+        whole, placed = (tgdsl.compile(document(Path(scratch), **CASES[name])) for name in ("one step", "at contacts"))
     constants = {
         name: value.to(torch.float32) if value.is_floating_point() else value
         for name, value in ((key, silent.constants[f"sensors/s/{key}"]) for key in silent.plan.sensors[0].constants)
@@ -128,24 +138,30 @@ def run_cpu(options: argparse.Namespace) -> None:
     force, loop = torch.rand(n, LINKS, 1), Loop(constants, n)
     state = {name: torch.zeros(n, *part.shape) for name, part in silent.plan.sensors[0].state.items()}
     states = [whole.example_state(n, seed=seed, dtype=torch.float32) for seed in range(3)]
-    compiled: list[Any] = [torch.compile(one, fullgraph=True) for one in (block, loop.step)]
 
-    def advance(step: Callable[..., Any]) -> None:
-        for name, value in step(force, context, constants, state)[1].items():
+    def advance(force: Tensor) -> Tensor:
+        found, new = block(force, context, constants, state)
+        for name, value in new.items():
             state[name].copy_(value)
+        return found
 
+    compiled: list[Any] = [torch.compile(one, fullgraph=True) for one in (advance, loop.advance)]
+    large = torch.rand(512, 512)
     calls: dict[str, Callable[[], Any]] = {
-        "block": lambda: advance(block),
-        "loop": lambda: loop(loop.step, force),
-        "block, compiled": lambda: advance(compiled[0]),
-        "loop, compiled": lambda: loop(compiled[1], force),
+        "block": lambda: advance(force),
+        "loop": lambda: loop.advance(force),
+        "block, compiled": lambda: compiled[0](force),
+        "loop, compiled": lambda: compiled[1](force),
+        "products": lambda: large @ large,
         "module": lambda: [whole(one) for one in states],
+        "module, at contacts": lambda: [placed(one) for one in states],
     }
     with torch.no_grad():
         taken = timed(calls, options.repeats, options.calls)
-    taken["module"] = [own / len(states) for own in taken["module"]]
+    taken |= {name: [own / len(states) for own in taken[name]] for name in ("module", "module, at contacts")}
+    taken["products"] = [own * n * LINKS * 2 * MODES * (SAMPLES + 2) / 512**3 for own in taken["products"]]
     for name, own in taken.items():
-        print(f"{name:<18}{1e3 * statistics.median(own):9.3f} ms")
+        print(f"{name:<20}{1e3 * statistics.median(own):9.3f} ms")
     for ending in ("", ", compiled"):
         ratio = [slow / fast for slow, fast in zip(taken[f"loop{ending}"], taken[f"block{ending}"], strict=True)]
         print(f"loop / block{ending}: {statistics.median(ratio):.1f} ({min(ratio):.1f} to {max(ratio):.1f})")

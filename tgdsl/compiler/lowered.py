@@ -75,9 +75,9 @@ class LoweredSensor:
 class Surfaces:
     """The triangles of a document's links and objects: a `sensors.base.SurfaceOf`."""
 
-    def __init__(self, resolved: Resolved):
-        """Be those of a document."""
-        self._resolved = resolved
+    def __init__(self, resolved: Resolved, progress: Progress):
+        """Be those of a document; `progress` is told what kinds do with them that takes long."""
+        self._resolved, self.progress = resolved, progress
 
     def __call__(self, link: str, region: Sequence[RegionPart]) -> Surface:
         """Return the triangles of a link, or of a region of it, in its body's frame [m]."""
@@ -106,7 +106,7 @@ def lowered_sensors(loaded: Loaded, resolved: Resolved, kinds: Sequence[Kind], p
     for name, spec in loaded.spec.sensors.items():
         progress(f"lowering sensor {name}")
         try:
-            sensors += _ways(loaded, resolved, name, by_name[spec.kind])  # type: ignore[attr-defined]
+            sensors += _ways(loaded, resolved, name, by_name[spec.kind], progress)  # type: ignore[attr-defined]
         except LowerError as error:
             path: Path = ("sensors", name, *([error.field] if error.field else []))
             loaded.problems.append(loaded.problem(path, error.what, error.hint))
@@ -228,11 +228,11 @@ def _with_timestep(spec: AnySensorSpec, resolved: Resolved) -> AnySensorSpec:
     return spec.model_copy(update={field: float(resolved.scene.compiled.opt.timestep)})
 
 
-def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind) -> list[LoweredSensor]:
+def _ways(loaded: Loaded, resolved: Resolved, name: str, kind: Kind, progress: Progress) -> list[LoweredSensor]:
     """Return a sensor's measured and clean reading, computed together if noise comes after the equation alone."""
     spec = _with_timestep(loaded.spec.sensors[name], resolved)
     taxels, layout = resolved.layout_on(name)
-    surfaces = Surfaces(resolved)
+    surfaces = Surfaces(resolved, progress)
     clean = kind.lower(spec, layout, surfaces)
     check_lowered(kind, clean, spec)
     _check_accuracy(loaded, name, clean)

@@ -16,13 +16,16 @@ is in the damping only as far as it is in its source.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError
 from tgdsl.fields.materials import Material
-from tgdsl.modal.modes import Modes, SurfaceGains
+from tgdsl.modal.modes import Modes, ModeShapes, SurfaceGains
 from tgdsl.modal.spec import ShapeModes
-from tgdsl.modal.spectrum import spectrum
+from tgdsl.modal.spectrum import Spectrum, spectrum
 from tgdsl.surfaces.surface import Surface
 
 WANTED = {
@@ -36,7 +39,7 @@ MAX_POISSON = 0.4999
 """Poisson's ratio from which on the elements no longer follow what is incompressible."""
 
 
-def analysed(name: str, surface: Surface, given: ShapeModes, below: float) -> Modes:
+def analysed(name: str, surface: Surface, given: ShapeModes, below: float, progress: Progress = silent) -> Modes:
     """Return the modes of a solid: those that ring and are wanted, or else the lowest one.
 
     Args:
@@ -44,6 +47,7 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float) -> Mo
         surface: Its surface, in its frame; of several geoms, all of theirs.
         given: What the document says of its modes.
         below: Frequency beyond which no mode is wanted [Hz].
+        progress: Is told what is done.
 
     Raises:
         LowerError: If the surface encloses no solid that can be analysed, the material is not known well enough, or none of its
@@ -52,7 +56,8 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float) -> Mo
     material = given.material
     youngs_modulus, poissons_ratio, mass_damping, stiffness_damping = _known(name, material)
     try:
-        shape, size, middle = spectrum(surface, poissons_ratio, given.count)
+        tell = partial(_told, progress, name)
+        shape, size, middle = spectrum(surface, poissons_ratio, given.count, progress=tell)
     except LowerError as error:
         raise LowerError(f'modes of "{name}": {error.what}', field="modes", hint=error.hint) from error
     omega = shape.wave_number * np.sqrt(youngs_modulus / material.density) / size
@@ -70,7 +75,19 @@ def analysed(name: str, surface: Surface, given: ShapeModes, below: float) -> Mo
         decay=decay[kept],
         gain=shape.gain[kept] / mass,
         at=SurfaceGains(shape.pos * size + middle, shape.share[:, kept]),
+        shapes=_shapes(shape, size, middle).of(kept),
     )
+
+
+def _told(progress: Progress, name: str, what: str) -> None:
+    """Say what is done, and of which body."""
+    progress(f"modes of {name}: {what}")
+
+
+def _shapes(found: Spectrum, size: float, middle: np.ndarray) -> ModeShapes:
+    """Return mode shapes in metres of the body's frame."""
+    low = found.grid.low * size + found.axes @ middle
+    return ModeShapes(found.axes, low, found.grid.step * size, found.grid.num, found.grid.value, found.owner, found.grid.error)
 
 
 def _known(name: str, material: Material) -> tuple[float, float, float, float]:

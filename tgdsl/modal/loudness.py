@@ -10,7 +10,11 @@ point x makes all of them ring in phase, at amplitudes φ(x) J; the root mean sq
 For a single mode these are |φ(x)| a J and a² J, where a² is the mean of φ². Groups that hardly move the surface along its
 normal, such as torsion of a ball, are left out: they are neither struck nor heard.
 
-Shapes: `x` points of the surface, `mode` modes, `group` groups of modes of one frequency.
+How much more a group is struck at x than in the mean, its share, is φ/a of a single mode, with its sign; of several it is
+√Σ f_k², with as many fields f = Λ^(1/2) Vᵀ φ/g, M = V Λ Vᵀ, as it has modes. Fields are sums of mode shapes, and so vectors
+throughout the body.
+
+Shapes: `x` points of the surface, `mode` modes, `group` groups of modes of one frequency, `field` fields of all groups.
 """
 
 from __future__ import annotations
@@ -36,13 +40,28 @@ class Loudness:
         wave_number: ω L/c, root mean square of each group.
         multiplicity: How many modes it has.
         gain: g, per mass of the body: dimensionless.
-        share: √(φᵀ M φ)/g at points of the surface; of a single mode φ/a with its sign.
+        mixture: Of the mode shapes of unit modal mass, what makes the fields.
+        owner: The group of each field, ascending.
     """
 
     wave_number: Float[np.ndarray, " group"]
     multiplicity: Int[np.ndarray, " group"]
     gain: Float[np.ndarray, " group"]
-    share: Float[np.ndarray, "x group"]
+    mixture: Float[np.ndarray, "mode field"]
+    owner: Int[np.ndarray, " field"]
+
+    def share(self, normal: Float[np.ndarray, "x mode"]) -> Float[np.ndarray, "x group"]:
+        """Return how much more each group is struck at points than in the mean, of the mode shapes along a direction there."""
+        return of_groups(normal @ self.mixture, self.owner, len(self.gain))
+
+
+def of_groups(
+    fields: Float[np.ndarray, "*point field"], owner: Int[np.ndarray, " field"], count: int
+) -> Float[np.ndarray, "*point group"]:
+    """Return the share of each of so many groups: its field, or of several the root of the sum of their squares."""
+    own = [fields[..., owner == group] for group in range(count)]
+    found = [part[..., 0] if part.shape[-1] == 1 else np.sqrt((part**2).sum(axis=-1)) for part in own]
+    return np.stack(found, axis=-1) if found else fields[..., :0]
 
 
 def groups(wave_number: Float[np.ndarray, " mode"]) -> list[slice]:
@@ -67,26 +86,32 @@ def loudness(
         mass: The body's.
     """
     found = groups(wave_number)[:-1]
-    gain, share = np.zeros(len(found)), np.zeros((len(area), len(found)))
+    gain, mixtures = np.zeros(len(found)), []
     for i, own in enumerate(found):
-        shape = normal[:, own] * np.sqrt(mass)
+        shape, mixture = normal[:, own] * np.sqrt(mass), np.zeros((len(wave_number), own.stop - own.start))
         products = (shape * area[:, None]).T @ shape / area.sum()
         gain[i] = np.linalg.norm(products)
-        if shape.shape[1] == 1:
-            share[:, i] = signed(shape[:, 0]) / np.sqrt(gain[i]) if gain[i] > 0 else 0.0
+        if gain[i] > 0 and mixture.shape[1] == 1:
+            mixture[own] = sign_of(shape[:, 0]) / np.sqrt(gain[i])
         elif gain[i] > 0:
-            share[:, i] = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", shape, products, shape), 0.0)) / gain[i]
+            square, vector = np.linalg.eigh(products)
+            mixture[own] = vector * np.sqrt(np.maximum(square, 0.0)) / gain[i]
+        mixtures.append(np.sqrt(mass) * mixture)
     square = np.array([np.mean(wave_number[own] ** 2) for own in found])
     multiplicity = np.array([own.stop - own.start for own in found], np.int64)
     heard = gain > INAUDIBLE * gain.max(initial=0.0)
-    return Loudness(np.sqrt(square)[heard], multiplicity[heard], gain[heard], share[:, heard])
+    mixture = np.concatenate(
+        [np.zeros((len(wave_number), 0)), *(own for own, is_own in zip(mixtures, heard, strict=True) if is_own)], axis=1
+    )
+    owner = np.repeat(np.arange(int(heard.sum())), multiplicity[heard])
+    return Loudness(np.sqrt(square)[heard], multiplicity[heard], gain[heard], mixture, owner)
 
 
-def signed(shape: Float[np.ndarray, " x"]) -> Float[np.ndarray, " x"]:
-    """Return a mode shape with the sign that makes it positive at the first of its points that are about the largest."""
+def sign_of(shape: Float[np.ndarray, " x"]) -> float:
+    """Return the sign that makes a mode shape positive at the first of its points that are about the largest."""
     size = np.abs(shape)
     first = int(np.argmax(size > (1 - 1e-6) * size.max(initial=0.0)))
-    return shape if not len(shape) or shape[first] >= 0 else -shape
+    return 1.0 if not len(shape) or shape[first] >= 0 else -1.0
 
 
 def picked(crossings: Crossings) -> Int[np.ndarray, " x"]:

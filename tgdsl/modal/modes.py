@@ -9,15 +9,19 @@ with the frequency f_i [Hz], the decay rate d_i of the amplitude [1/s], and the 
 normal, and s the pseudo-velocity ω q of the surface: its displacement q times ω = 2πf, which has the amplitude of its velocity
 and no jump at the impulse.
 
-Shapes: `mode` modes of one body, `point` points of its surface.
+Shapes: `mode` modes of one body, `point` points of its surface, `node` nodes of a grid, z running fastest, `field` fields of
+its modes, one of each, and as many as there are mode shapes where symmetry makes these one mode, see `loudness.py`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
+
+from tgdsl.modal.loudness import of_groups
+from tgdsl.modal.shapes import interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +38,45 @@ class SurfaceGains:
 
 
 @dataclass(frozen=True, eq=False)
+class ModeShapes:
+    """Mode shapes on a grid through the body, as vectors, over the root mean square of what is normal to the surface.
+
+    Attributes:
+        axes: The grid's axes, as rows, of the body's frame.
+        low: Place of its first node along these axes [m].
+        step: Spacing of its nodes along each [m].
+        num: Number of its nodes along each, two or more.
+        value: Fields at the nodes, along the grid's axes [1].
+        owner: The mode of each field, ascending.
+        error: Root mean square over the surface of what interpolation is off by, of each field [1].
+    """
+
+    axes: Float[np.ndarray, "3 3"]
+    low: Float[np.ndarray, " 3"]
+    step: Float[np.ndarray, " 3"]
+    num: Int[np.ndarray, " 3"]
+    value: Float[np.ndarray, "node 3 field"]
+    owner: Int[np.ndarray, " field"]
+    error: Float[np.ndarray, " field"]
+
+    def share(self, pos: Float[np.ndarray, "point 3"], along: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point mode"]:
+        """Return by how much more or less than by its gain each mode is struck at points, along a direction there [1].
+
+        Args:
+            pos: The points, in the body's frame [m].
+            along: The direction, of unit length, in the body's frame.
+        """
+        found = interpolated(self.low, self.step, self.num, self.value, pos @ self.axes.T)
+        return of_groups(np.einsum("xif,xi->xf", found, along @ self.axes.T), self.owner, int(self.owner.max()) + 1)
+
+    def of(self, kept: Bool[np.ndarray, " mode"]) -> ModeShapes:
+        """Return those of some modes."""
+        mine = kept[self.owner]
+        number = np.cumsum(kept) - 1
+        return replace(self, value=self.value[:, :, mine], owner=number[self.owner[mine]], error=self.error[mine])
+
+
+@dataclass(frozen=True, eq=False)
 class Modes:
     """Modes of a body, by ascending frequency.
 
@@ -42,9 +85,11 @@ class Modes:
         decay: Rate d at which its amplitude decays [1/s].
         gain: Amplitude of s per impulse, g [1/kg].
         at: How strongly each is struck at points of the surface; None: alike everywhere.
+        shapes: The same anywhere, and along any direction; None: alike everywhere.
     """
 
     frequency: Float[np.ndarray, " mode"]
     decay: Float[np.ndarray, " mode"]
     gain: Float[np.ndarray, " mode"]
     at: SurfaceGains | None = None
+    shapes: ModeShapes | None = None

@@ -3,7 +3,7 @@
 Frequencies of similar bodies are as √(E/ρ)/L, and mode shapes of unit modal mass as 1/√m. So all that follows from the shape is
 computed in units of the body's size L, with E = 1 and ρ = 1, and scaled exactly.
 
-Shapes: `group` modes of distinct frequency, `point` points of the surface.
+Shapes: `group` modes of distinct frequency, `point` points of the surface, `field` fields of mode shapes.
 """
 
 from __future__ import annotations
@@ -15,15 +15,17 @@ import igl
 import numpy as np
 from jaxtyping import Float, Int
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.files import cache
 from tgdsl.modal import cells, grid
 from tgdsl.modal.closed import closed, enclosed, refused
 from tgdsl.modal.elasticity import Elements
 from tgdsl.modal.loudness import loudness, picked
+from tgdsl.modal.shapes import ShapeGrid, on_grid
 from tgdsl.modal.vibration import vibration
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl modes 2"
+FORMAT = b"tgdsl modes 3"
 """To be changed with anything that changes what is computed."""
 UNKNOWNS = 25_000
 """Number of unknowns that the cells are made small for."""
@@ -59,6 +61,9 @@ class Spectrum:
         pos: Points of the surface, from the middle of the bounding box and over L.
         share: How strongly each mode is struck at them, over its root mean square over the surface.
         unknowns: Size of the eigenproblem.
+        axes: The grid's axes, as rows, of the body's.
+        owner: The group that each field of the mode shapes belongs to, see `loudness.py`.
+        grid: The fields, in the grid's axes, from the middle of the bounding box and over L.
     """
 
     wave_number: Float[np.ndarray, " group"]
@@ -68,10 +73,13 @@ class Spectrum:
     pos: Float[np.ndarray, "point 3"]
     share: Float[np.ndarray, "point group"]
     unknowns: int
+    axes: Float[np.ndarray, "3 3"]
+    owner: Int[np.ndarray, " field"]
+    grid: ShapeGrid
 
 
 def spectrum(
-    surface: Surface, poissons_ratio: float, count: int, unknowns: int | None = None
+    surface: Surface, poissons_ratio: float, count: int, unknowns: int | None = None, progress: Progress = silent
 ) -> tuple[Spectrum, float, Float[np.ndarray, " 3"]]:
     """Return the lowest modes of a shape, from the cache if they are there; its size L [m]; and the middle of its box [m].
 
@@ -80,42 +88,54 @@ def spectrum(
         poissons_ratio: Less than 1/2.
         count: Most modes of distinct frequency.
         unknowns: Number of unknowns that the cells are made small for; default: `UNKNOWNS`.
+        progress: Is told what is done.
 
     Raises:
         LowerError: If the surface has no inside, the body falls into parts, or needs more cells than are allowed.
     """
     unknowns = UNKNOWNS if unknowns is None else unknowns
+    progress("closing its surface")
     vertices, faces = closed(surface)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     size, middle = float((high - low).max()), (low + high) / 2
     vertices = np.round((vertices - middle) / size, DIGITS) + 0.0
     key = cache.digest(FORMAT, [vertices, faces, np.array(poissons_ratio), np.array([count, unknowns])])
-    found = cache.cached(key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns), _packed, _unpacked)
+    found = cache.cached(key, lambda: _computed(vertices, faces, poissons_ratio, count, unknowns, progress), _packed, _unpacked)
     return found, size, middle
 
 
-def _computed(vertices: np.ndarray, faces: np.ndarray, poissons_ratio: float, count: int, unknowns: int) -> Spectrum:
+def _computed(
+    vertices: np.ndarray, faces: np.ndarray, poissons_ratio: float, count: int, unknowns: int, progress: Progress
+) -> Spectrum:
     turned = grid.axes(vertices, faces)
     placed = vertices @ turned.T
-    filled, crossings = cells.filled(placed, faces, _lines(placed, faces, unknowns), SIGHT, SLIVER)
+    progress(f"a grid of cells for {unknowns} unknowns")
+    lines = _lines(placed, faces, unknowns)
+    filled, crossings = cells.filled(placed, faces, lines, SIGHT, SLIVER)
     elements, crossings = _whole(Elements.of(filled), crossings)
+    progress(f"stiffness and mass of {len(elements.nodes)} cells")
     stiffness, mass = elements.matrices(poissons_ratio)
+    progress(f"eigenproblem of {3 * len(elements.pos)} unknowns")
     # A few more than asked for: some are one, and the last group may lack some of its modes.
     found = vibration(stiffness, mass, count + 8)
+    progress("mode shapes on a grid")
     displacement = elements.displacement(crossings.cell, crossings.pos, found.shape)
     normal = np.einsum("xim,xi->xm", displacement, crossings.normal)
     volume = float(elements.filled.volume.sum())
     heard = loudness(found.wave_number, normal, crossings.area, volume)
-    kept = slice(None, count)
-    at = picked(crossings)
+    kept, at = slice(None, count), picked(crossings)
+    wanted = heard.owner < count
     return Spectrum(
         wave_number=_rounded(heard.wave_number[kept]),
         multiplicity=heard.multiplicity[kept],
         gain=_rounded(heard.gain[kept]),
         volume=volume,
         pos=crossings.pos[at] @ turned,
-        share=np.round(heard.share[at][:, kept], 6),
+        share=np.round(heard.share(normal[at])[:, kept], 6),
         unknowns=3 * len(elements.pos),
+        axes=turned,
+        owner=heard.owner[wanted],
+        grid=on_grid(elements, crossings, lines, found.shape @ heard.mixture[:, wanted]),
     )
 
 
@@ -173,9 +193,11 @@ def _whole(elements: Elements, crossings: cells.Crossings) -> tuple[Elements, ce
 
 
 def _packed(found: Spectrum) -> Mapping[str, np.ndarray]:
-    return {name: np.asarray(getattr(found, name)) for name in Spectrum.__dataclass_fields__}
+    own = {name: np.asarray(getattr(found, name)) for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    return own | {f"grid_{name}": getattr(found.grid, name) for name in ShapeGrid.__dataclass_fields__}
 
 
 def _unpacked(arrays: Mapping[str, np.ndarray]) -> Spectrum:
-    found = {name: arrays[name] for name in Spectrum.__dataclass_fields__}
-    return Spectrum(**{**found, "volume": float(found["volume"]), "unknowns": int(found["unknowns"])})
+    found = {name: arrays[name] for name in Spectrum.__dataclass_fields__ if name != "grid"}
+    on_nodes = ShapeGrid(**{name: arrays[f"grid_{name}"] for name in ShapeGrid.__dataclass_fields__})
+    return Spectrum(**{**found, "volume": float(found["volume"]), "unknowns": int(found["unknowns"])}, grid=on_nodes)

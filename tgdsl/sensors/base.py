@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, UInt64
 from pydantic import Field
 from torch import Tensor
 
+from tgdsl.console.progress import Progress
 from tgdsl.fields.accuracy import AccuracyField
 from tgdsl.fields.history import History
 from tgdsl.fields.models import Frequency, Selector, SpecModel, Usual
@@ -270,6 +271,11 @@ class SurfaceOf(Protocol):
 
     def of_object(self, name: str) -> Surface:
         """Return the triangles of an object's geoms, by its name, in its body's frame [m]; of several variants the first."""
+        ...
+
+    @property
+    def progress(self) -> Progress:
+        """Is told what is done with them, where that takes long."""
         ...
 
 

@@ -49,6 +49,8 @@ def test_random_contacts_are_the_definitions(touch, center):
         np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-12)
     expected = np.stack([own.center for own in defined])
     np.testing.assert_allclose(torch.stack(found.center, dim=-1), expected, rtol=0, atol=1e-13)
+    expected = np.stack([own.along for own in defined])
+    np.testing.assert_allclose(torch.stack(found.along, dim=-1), expected, rtol=0, atol=1e-13)
 
 
 def test_by_hand(touch):
@@ -56,7 +58,7 @@ def test_by_hand(touch):
     found, _ = loads(touch, pressed(touch, [5.0], 0.2))
     np.testing.assert_allclose(found.force, [[[5.0], [0.0]]], rtol=1e-13)
     np.testing.assert_allclose(found.sliding, [[[1.0], [0.0]]], rtol=1e-13)
-    assert found.center is None
+    assert found.center is None and found.along is None
 
 
 def test_a_ball_that_rolls_does_not_slide(touch):
@@ -99,3 +101,6 @@ def test_the_center_is_in_the_frame_of_what_rings(touch):
     found, _ = loads(touch, state, "link")
     np.testing.assert_allclose([float(part[0, 0, 0]) for part in found.center], 0.25 * places[0] + 0.75 * places[1], atol=1e-14)
     assert [float(part[0, 1, 0]) for part in found.center] == [0, 0, 0]
+    normal = turn.inv().apply(state.contact_normal[0, pair, 0].numpy())
+    np.testing.assert_allclose([float(part[0, 0, 0]) for part in found.along], normal, atol=1e-14)
+    assert [float(part[0, 1, 0]) for part in found.along] == [0, 0, 0]

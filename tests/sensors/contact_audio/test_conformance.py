@@ -1,9 +1,16 @@
 """The suite that every kind passes, for samples and bands, links and objects, and the paper's response."""
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from tgdsl.compiler.lowered import Surfaces
+from tgdsl.modal.modes import Modes, ModeShapes
+from tgdsl.sensors.contact_audio import given_modes
+from tgdsl.sensors.contact_audio import reference as definition
 from tgdsl.sensors.contact_audio.kind import CONTACT_AUDIO
+from tgdsl.surfaces.surface import Surface
 from tgdsl.testing import SCENE, KindConformance, assert_agrees
 
 MODES = [
@@ -108,3 +115,36 @@ def test_another_time_step_is_the_references_too(tmp_path, other):
         else:
             found = module(state)["s"]
         assert_agrees(found, reference, state, 1e-12)
+
+
+NOTHING = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0, np.int64), ())
+
+
+def shaped(name, surface, given, below, progress):
+    """Modes of no body in particular: on a grid of 3 × 2 × 4 nodes, turned in its frame; two fields of the second mode."""
+    rng = np.random.default_rng(len(name))
+    axes = Rotation.random(random_state=len(name)).as_matrix()
+    low, step, num = np.array([-0.05, -0.04, -0.06]), np.array([0.05, 0.09, 0.04]), np.array([3, 2, 4])
+    value = rng.standard_normal((24, 3, 4)).astype(np.float32)
+    shapes = ModeShapes(axes, low, step, num, value, np.array([0, 1, 1, 2]), np.full(4, 0.01))
+    return Modes(*(np.array([mode[key] for mode in MODES]) for key in ("frequency", "decay", "gain")), shapes=shapes)
+
+
+class TestAtContacts(TestSamples):
+    parameters = {**COMMON, "modes": "steel", "gains": "contact"}
+
+    @pytest.fixture(autouse=True)
+    def own_shapes(self, monkeypatch):
+        monkeypatch.setattr(given_modes, "analysed", shaped)
+        monkeypatch.setattr(definition, "_no_surface", lambda name: NOTHING)
+        monkeypatch.setattr(Surfaces, "of_object", lambda own, name: NOTHING)  # the suite's floor has none
+
+
+class TestOfObjectsAtContacts(TestAtContacts):
+    parameters = {**TestAtContacts.parameters, "of": "object", "substeps": 2}
+    test_compiled_equals_eager = None
+
+
+class TestPaperAtContacts(TestAtContacts):
+    parameters = {**TestAtContacts.parameters, "model": "paper", "samples": 8}
+    test_compiled_equals_eager = None

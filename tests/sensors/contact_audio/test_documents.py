@@ -104,7 +104,7 @@ def test_a_shape_is_analysed_in_its_bodys_frame(tmp_path, monkeypatch, of):
     """Modal analysis gets the surface of what rings, and up to where modes are heard."""
     asked = []
 
-    def analysed(name, surface, given, below):
+    def analysed(name, surface, given, below, progress):
         asked.append((name, np.ptp(surface.vertices, axis=0).round(6).tolist(), given.material.name, below))
         return Modes(np.array([700.0]), np.array([3.0]), np.array([1.0]))
 

@@ -31,11 +31,13 @@ def _loads(use: LoadsUse[Tensor], state: Mapping[str, Tensor], dtype: torch.dtyp
     across = planes.sub(apart, planes.scale(planes.dot(apart, found.normal), found.normal))
     speed = planes.safe_sqrt(planes.dot(across, across))
     force, sliding = pressed.sum(dim=-1), (pressed * speed).sum(dim=-1)
-    center = None
+    center = along = None
     if use.center:
         bodies, spread = (use.bodies, _of_link) if use.center == "link" else (use.objects, _of_object)
-        center = planes.vec(part.to(dtype) for part in _center(state, bodies, found, pressed, spread))
-    return PairLoads(force.to(dtype), sliding.to(dtype), center)
+        sign = 1.0 if use.center == "link" else -1.0
+        center, normal = _middle(state, bodies, found, pressed, spread)
+        center, along = (planes.vec(part.to(dtype) for part in own) for own in (center, planes.vec(sign * n for n in normal)))
+    return PairLoads(force.to(dtype), sliding.to(dtype), center, along)
 
 
 def _of_link(plane: Tensor) -> Tensor:
@@ -57,19 +59,23 @@ def _velocity(
     return planes.add(linvel, planes.cross(angvel, _away(found, pos)))
 
 
-def _center(
+def _middle(
     state: Mapping[str, Tensor],
     bodies: Int[Tensor, " own"],
     found: PairContacts,
     pressed: Tensor,
     spread: Callable[[Tensor], Tensor],
-) -> Vec:
-    """Return the centre of each pair's contacts, weighted by their forces, in the frames of some bodies [m]."""
+) -> tuple[Vec, Vec]:
+    """Return centre [m] and mean normal of each pair's contacts, weighted by their forces, in the frames of some bodies."""
     total = pressed.sum(dim=-1, keepdim=True)
     share = pressed / torch.where(total > 0, total, 1.0)
     away = _away(found, planes.vec(map(spread, planes.split(state["body_pos"][:, bodies]))))
     rotation = planes.rot(map(spread, planes.rotation(state["body_quat"][:, bodies])))
-    return planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, away))
+    normal = planes.vec(torch.where(found.is_used, part, 0.0) for part in found.normal)
+    center, mean = (
+        planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, own)) for own in (away, normal)
+    )
+    return center, mean
 
 
 def _away(found: PairContacts, pos: Vec) -> Vec:

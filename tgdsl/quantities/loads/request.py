@@ -29,11 +29,14 @@ class PairLoads(NamedTuple):
         sliding: Normal force times sliding speed, W [W]; times a coefficient of friction it is the power of friction.
         center: Centre of the contacts weighted by F, in the frame of the body or object that was asked for [m]; zero where they
             do not touch. None if it was not asked for.
+        along: Mean of the contacts' normals weighted by F, in that frame, into this body or object; zero where they do not
+            touch. None if the centre was not asked for.
     """
 
     force: Tensor
     sliding: Tensor
     center: Vec | None
+    along: Vec | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,7 @@ class Loads(Request[PairLoads]):
     Attributes:
         slots: Contacts per body and object that are read.
         of: Whose loads they are to be summed up for: geoms that two objects share load a link once, but both objects.
-        has_center: Whether the centre of the contacts is wanted, in the frame of what they are of.
+        has_center: Whether the centre and the mean normal of the contacts are wanted, in the frame of what they are of.
     """
 
     slots: int = 4

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.modal.analysis import analysed
 from tgdsl.modal.modes import Modes
 from tgdsl.modal.spec import ShapeModes
@@ -13,7 +14,7 @@ from tgdsl.sensors.contact_audio.spec import ModesField
 from tgdsl.surfaces.surface import Surface
 
 
-def modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below: float) -> Modes:
+def modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below: float, progress: Progress = silent) -> Modes:
     """Return the modes of a body.
 
     Args:
@@ -21,12 +22,13 @@ def modes_of(given: ModesField, name: str, surface: Callable[[], Surface], below
         name: What the body is called in messages.
         surface: Returns its surface in its frame; called where its shape is wanted.
         below: Frequency beyond which a mode is not heard [Hz]. Those that are listed are returned all the same.
+        progress: Is told what is done.
 
     Raises:
         LowerError: If its shape gives none.
     """
     if isinstance(given, ShapeModes):
-        return analysed(name, surface(), given, below)
+        return analysed(name, surface(), given, below, progress)
     ordered = sorted(given, key=lambda mode: mode.frequency)
     return Modes(
         frequency=np.array([mode.frequency for mode in ordered]),

@@ -9,7 +9,10 @@ from all of its impulse. So what a load F exceeds a steady load F̄ by is summed
 A collision of the duration T ≪ τ strikes with its impulse ∫F dt, whatever the number of steps; a load that takes much longer
 than τ to rise by ΔF, at the rate R, with R τ² alone; a steady one not at all. The first load of an episode counts as steady.
 
-Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects.
+With mode shapes each mode i has an A_i of its own, which grows by s_i (F − F̄)₊ Δt with the mode's share s_i of what strikes
+where the load acts, and is kept and passed on when A is: so it is weighted by where the load was when it grew.
+
+Shapes: `env` environments, `body` bodies that carry the sensor, `object` felt objects, `mode` modes.
 """
 
 from __future__ import annotations
@@ -26,43 +29,61 @@ UNKNOWN = 1e30
 """Steady load at the beginning of an episode [N]: no first load exceeds it, and the second finds the first."""
 
 
-def impulses(force: Load, constants: Constants, state: State) -> tuple[Load, dict[str, Tensor]]:
-    """Return the impulses that strike at the start of this step [N·s], and what is remembered."""
+def impulses(
+    force: Load, constants: Constants, state: State, share: Float[Tensor, "env body object mode"] | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Return the impulses that strike at the start of this step [N·s], and what is remembered.
+
+    Args:
+        force: F [N].
+        constants: The sensor's.
+        state: What was remembered.
+        share: Of each mode, s; the impulses are then those of each mode, (env, body, object, mode).
+    """
     above, kept = force - state["steady"], constants["kept"]
     grown = above.clamp(min=0.0) * constants["step"]
     if "is_paper" in constants:
-        return grown, {"steady": force}
+        return grown if share is None else grown[..., None] * share, {"steady": force}
     pending = state["pending"].clone()  # derivatives by constants look at it once the state has gone on
     is_over = grown <= constants["leaked"] * pending
     impulse = torch.where(is_over, pending, 0.0 * grown)  # not-a-number strikes at once
     after = torch.where(is_over, force, torch.addcmul(force, above, kept, value=-1))
-    return impulse, {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
+    new = {"pending": torch.where(is_over, 0.0, torch.addcmul(grown, pending, kept)), "steady": after}
+    if share is None:
+        return impulse, new
+    own, each = grown[..., None] * share, state["weighted"].clone()
+    new["weighted"] = torch.where(is_over[..., None], 0.0, torch.addcmul(own, each, kept))
+    return torch.where(is_over[..., None], each, 0.0 * own), new
 
 
 def reference_impulses(
     force: Float[np.ndarray, "body object"],
-    before: tuple[np.ndarray, np.ndarray],
+    before: tuple[np.ndarray, np.ndarray, np.ndarray],
+    share: Float[np.ndarray, "body object mode"],
     step: float,
     settling: float,
     is_paper: bool,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return J, and F̄ and A after it, of one environment: pair by pair.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the impulses of each mode, and F̄, A and A_i after them, of one environment: pair by pair.
 
     Args:
         force: F [N].
-        before: F̄ [N] and A [N·s].
+        before: F̄ [N], A [N·s] and A_i of each mode [N·s].
+        share: s_i; of one mode, 1, where all have the same.
         step: Δt [s].
         settling: τ [s].
         is_paper: Whether each rise of the force strikes by itself.
     """
-    impulse, (steady, pending) = np.zeros_like(force), (part.copy() for part in before)
+    impulse, (steady, pending, weighted) = np.zeros_like(share), (part.copy() for part in before)
     kept = np.exp(-step / settling)
     for place, load in np.ndenumerate(force):
         grown = max(0.0, load - steady[place]) * step
         if is_paper:
-            impulse[place], steady[place] = grown, load
+            impulse[place], steady[place] = grown * share[place], load
         elif grown <= (1 - kept) * pending[place]:
-            impulse[place], pending[place], steady[place] = pending[place], 0.0, load
+            impulse[place], weighted[place] = weighted[place], 0.0
+            pending[place], steady[place] = 0.0, load
         else:
+            weighted[place] = kept * weighted[place] + grown * share[place]
             pending[place], steady[place] = kept * pending[place] + grown, load + kept * (steady[place] - load)
-    return impulse, steady, pending
+    return impulse, steady, pending, weighted

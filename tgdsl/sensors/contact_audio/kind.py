@@ -19,6 +19,11 @@ Impulses u act at four times of each step, t_n = (0, ¼, ½, ¾) Δt:
   m_s [kg] the variance of the impulses of one second at 1 N and 1 m/s [N²·s²]. The energy that it brings is a fixed part of
   that of friction, and the level grows by 10 dB with ten times the force or ten times the speed.
 
+`gains: contact` weights what a contact brings by the mode shapes φ_i there: J and W of a contact count for mode i as s_i J and
+s_i² W, with its share s_i = φ_i(x) · n / a_i of the centre x of a pair's contacts, the mean n of their normals into the body,
+and the root mean square a_i of φ_i along the normal over the surface; see `shares`. So s_i² is 1 in the mean over the surface,
+and g_i stays. An impulse is weighted by where its load acted while it grew. What is heard remains a mean over the surface.
+
 `outputs: bands` reads instead, at the end of each step, the mean square of what is heard of the modes in each third octave:
 
     E_b = ½ Σ_(i in b) g_i² |z_i|²   [m²/s²],   or   10 lg(1 + E_b/E₀), E₀ = (1 µm/s)²   [dB]
@@ -35,7 +40,8 @@ u[1] = Δt (F − F_before)₊ and noise at each sample; how loud an impact is t
 Source: Chung et al., *Tactile Genesis*, appendix, "Contact and Actuation Audio"; noise by the power of friction as in van den
 Doel, Kry and Pai, *FoleyAutomatic* (SIGGRAPH 2001). Departures: the response and the impulses above, see `model: paper`.
 
-Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it.
+Limits: modes are linear and do not see what else the body touches: a hand that holds a glass does not damp it. A load that is
+spread over a body's surface strikes at its centre alone; friction strikes along the normal, as pressing does.
 """
 
 from __future__ import annotations
@@ -58,6 +64,7 @@ from tgdsl.sensors.contact_audio.impulses import UNKNOWN, impulses
 from tgdsl.sensors.contact_audio.operators import least, operators, quiet, radiated, turn_of
 from tgdsl.sensors.contact_audio.reference import reference
 from tgdsl.sensors.contact_audio.rows import axis_of, ringing
+from tgdsl.sensors.contact_audio.shares import indices, shares, tables
 from tgdsl.sensors.contact_audio.spec import ContactAudioSpec, alternatives
 from tgdsl.sensors.noise import random
 from tgdsl.sensors.upstream import PLACE, SAMPLES, SOUND
@@ -73,7 +80,7 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
     def surface(name: str) -> Surface:
         return surface_of(name, ()) if spec.of == "link" else surface_of.of_object(name)
 
-    modes, rows = ringing(spec, layout, step, surface), axis_of(spec, layout)
+    modes, rows = ringing(spec, layout, step, surface, surface_of.progress), axis_of(spec, layout)
     constants = {
         "frequency": modes.frequency,
         "decay": modes.decay,
@@ -82,6 +89,7 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         "settling": scalar(spec.settling),
         "scrape": scalar(spec.scrape),
     }
+    constants |= tables(modes.shapes, modes.frequency.shape[1]) if modes.shapes else {}
     constants |= {"is_of_object": scalar(1.0)} if spec.of == "object" else {}
     constants |= {"is_paper": scalar(1.0)} if spec.model == "paper" else {}
     channels = (Channel("sound", "m/s"),)
@@ -92,12 +100,15 @@ def lower(spec: ContactAudioSpec, layout: Layout, surface_of: SurfaceOf) -> Lowe
         channels = tuple(Channel(f"band_{middle(number):.0f}", unit) for number in modes.bands)
     pairs = (len(layout.bodies), len(spec.feels))
     state = {"phasors": Memory(shape=(rows.size, 2 * modes.frequency.shape[1])), "steady": Memory(UNKNOWN, pairs)}
-    is_heard = spec.outputs == "samples"
+    if spec.model != "paper":
+        state["pending"] = Memory(shape=pairs)
+        state |= {"weighted": Memory(shape=(*pairs, modes.frequency.shape[1]))} if modes.shapes else {}
+    is_heard, loads = spec.outputs == "samples", Loads(spec.feels, slots=spec.slots, of=spec.of, has_center=bool(modes.shapes))
     return Lowered(
         channels=channels,
         constants=constants | operators(constants, step),
-        state=state | ({} if spec.model == "paper" else {"pending": Memory(shape=pairs)}),
-        requests=(Loads(spec.feels, slots=spec.slots, of=spec.of), *((_places(spec, layout),) if is_heard else ())),
+        state=state,
+        requests=(loads, *((_places(spec, layout),) if is_heard else ())),
         rows=rows,
         notes=(f"{spec.samples} samples per step of {step:g} s: {spec.samples / step:g} Hz", *modes.notes),
         substeps=spec.substeps,
@@ -117,47 +128,63 @@ def _places(spec: ContactAudioSpec, layout: Layout) -> Places:
 
 def forward(gathered: Gathered, context: Context, constants: Constants, state: State) -> tuple[dict[str, Tensor], State]:
     """Return the samples of a step (env, sample, 1, row) [m/s], or the energies of its bands (env, band, row)."""
-    loads = gathered[Loads]
-    impulse, new = impulses(loads.force, constants, state)
-    struck = _of_rows(impulse, constants)[..., None]
+    loads, share, sliding = gathered[Loads], None, gathered[Loads].sliding
+    if loads.center is not None and loads.along is not None and "shape_value" in constants:
+        share = shares(loads.center, loads.along, constants)
+        sliding = sliding[..., None] * (share * share)
+    impulse, new = impulses(loads.force, constants, state, share)
+    struck = _of_rows(impulse, constants).unsqueeze(2)
     if "noise" in constants:
-        strikes = _noise(_of_rows(loads.sliding, constants), context, constants)
-        struck = torch.cat([strikes[..., :1] + struck, strikes[..., 1:]], dim=-1)
-    parts = torch.cat([state["phasors"], struck], dim=-1)
-    new["phasors"] = after = _turned(parts, turn_of(constants, context.step[0] + context.substep), constants)
-    if "heard" in constants:
-        made = torch.bmm(parts.transpose(0, 1), constants["heard"]).permute(1, 2, 0)
+        strikes = _noise(_of_rows(sliding, constants), context, constants)
+        struck = torch.cat([strikes[:, :, :1] + struck, strikes[:, :, 1:]], dim=2)
+    phasors, turn = state["phasors"], turn_of(constants, context.step[0] + context.substep)
+    new["phasors"] = after = _turned(phasors, struck, turn, constants)
+    if "heard" in constants:  # environments last: libraries multiply few rows by many columns faster
+        parts = torch.cat([phasors, struck.flatten(2)], dim=-1).permute(1, 2, 0)
+        made = torch.bmm(constants["heard"].transpose(1, 2), parts).permute(2, 1, 0)
         return {"signal": made[:, :, None], SAMPLES: radiated() * made, PLACE: torch.stack(gathered[Places], dim=1)}, new
     energy = torch.bmm((after * after).transpose(0, 1), constants["energy"]).permute(1, 2, 0)
     return {"signal": _level(energy) if "is_decibel" in constants else energy}, new
 
 
-def _turned(parts: Tensor, turn: Tensor, constants: Constants) -> Tensor:
-    """Return the phasors at the end of a step, (env, row, part · mode) [N·s], of those at its start and what strikes them."""
-    (cosine, sine), modes = turn.unbind(), turn.shape[-1]
-    real, imag, struck = parts[..., :modes], parts[..., modes : 2 * modes], parts[..., 2 * modes :]
-    turned = torch.addcmul(real * cosine, imag, sine, value=-1), torch.addcmul(real * sine, imag, cosine)
-    after = torch.cat(turned, dim=-1)
+def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants) -> Tensor:
+    """Return the phasors at the end of a step, (env, row, part · mode) [N·s].
+
+    By products alone, not of a matrix: matrices may be multiplied in TF32, and phasors would then grow or decay by it.
+
+    Args:
+        phasors: Those at its start, real parts first [N·s].
+        struck: Impulses (env, row, grain) [N·s], or of each mode, (env, row, grain, mode).
+        turn: What is left of each part, and what it has of the other, (2, row, part · mode).
+        constants: The sensor's.
+    """
+    (along, across), modes = turn.unbind(), phasors.shape[-1] // 2
+    crossed = torch.cat([phasors[..., modes:], phasors[..., :modes]], dim=-1)
+    after = torch.addcmul(phasors * along, crossed, across)
     for grain, own in enumerate(constants["struck"].unbind()):
-        after = torch.addcmul(after, struck[..., grain, None], own)
+        one = struck[:, :, grain]
+        # Eager, tensors that are alike are multiplied faster than those that broadcast.
+        spread = torch.cat([one, one], dim=-1) if one.ndim == 3 else one[..., None].expand_as(after).contiguous()
+        after = torch.addcmul(after, spread, own)
     return torch.nn.functional.hardshrink(after, least())
 
 
 def _of_rows(pairs: Tensor, constants: Constants) -> Tensor:
-    """Return the sum over what touches each body (or object) that rings, (env, row)."""
+    """Return the sum over what touches each body (or object) that rings, (env, row, *mode), of (env, body, object, *mode)."""
     dim = 1 if "is_of_object" in constants else 2
     return pairs.squeeze(dim) if pairs.shape[dim] == 1 else pairs.sum(dim=dim)
 
 
 def _noise(sliding: Tensor, context: Context, constants: Constants) -> Tensor:
-    """Return the impulses of sliding (env, row, grain) [N·s]."""
+    """Return the impulses of sliding (env, row, grain, *mode) [N·s], of its power (env, row, *mode) [W]."""
     assert context.stream is not None
     rows, grains = sliding.shape[1], constants["struck"].shape[0]
     count = (grains + 1) // 2
     index = torch.arange(rows * count, dtype=torch.int32, device=sliding.device)
     pair = random.normal_pair(random.words(context.stream, index), sliding.dtype)
     normals = torch.stack(pair, dim=-1).view(-1, rows, 2 * count)[..., :grains]
-    return (constants["noise"] * planes.safe_sqrt(sliding))[..., None] * normals
+    size = (constants["noise"] * planes.safe_sqrt(sliding)).unsqueeze(2)
+    return size * (normals if size.ndim == 3 else normals[..., None])
 
 
 def _level(energy: Tensor) -> Tensor:
@@ -179,6 +206,7 @@ CONTACT_AUDIO = Kind(
     is_timed=True,
     is_random=True,
     retimed=retimed,
+    indices=indices,
     alternatives=alternatives,
     provides=SOUND,
 )

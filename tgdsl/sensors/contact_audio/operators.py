@@ -8,8 +8,8 @@ turned by the same rounded factor at every step drifts by 3e-8 a step. So in flo
 others, such that its mean is exact: up at step n where the fractional part of n (√5 − 1)/2 is below the share of a unit in the
 last place by which it is above the lower number. What is left are roundings that do not add up.
 
-Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `sample` samples of a block,
-`band` bands, `grain` times of impulses.
+Shapes: `row` bodies that ring, `mode` modes of the one with most, `part` real and imaginary part, `both` the real parts of all
+modes, then their imaginary ones, `sample` samples of a block, `band` bands, `grain` times of impulses.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
+
+from tgdsl.tensors.fusion import materialised
 
 GRAINS = 4
 """Times within a physics step at which noise strikes: the same for any number of samples, so that the noise is."""
@@ -76,7 +78,8 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
 
     Args:
         constants: `frequency` [Hz], `decay` [1/s], `gain` [1/kg], each (row, mode), 0 where a row has fewer; `samples`;
-            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands.
+            `settling` [s]; `scrape` [kg]; `is_paper` of the paper's response; `band` (row, mode, band) of bands; `shape_value`
+            where each mode has impulses of its own.
         step: The time step.
     """
     samples, is_paper, scrape = int(constants["samples"]), "is_paper" in constants, float(constants["scrape"])
@@ -98,7 +101,7 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         "leaked": np.asarray(1.0 - kept),
         "step": np.asarray(step),
         "struck": np.concatenate([np.real(added), np.imag(added)], axis=2),
-        **_rounded("turn", np.stack([np.real(turn), np.imag(turn)])),
+        **{name: _by_parts(name, part) for name, part in _rounded("turn", np.stack([np.real(turn), np.imag(turn)])).items()},
     }
     if scrape > 0:
         found["noise"] = np.asarray(math.sqrt(scrape * step / len(strikes)))
@@ -106,11 +109,10 @@ def operators(constants: Arrays, step: float) -> dict[str, np.ndarray]:
         energy = 0.5 * (gain**2)[..., None] * constants["band"]
         return found | {"energy": np.concatenate([energy, energy], axis=1)}
     free, of_impulses = factors(times), begun[..., None, None] * factors(times - strikes[:, None])
-    parts = [
-        gain[..., None] * np.imag(free),
-        gain[..., None] * np.real(free),
-        (gain[..., None, None] * np.imag(of_impulses)).sum(axis=1),
-    ]
+    own = gain[..., None, None] * np.imag(of_impulses)
+    by_mode = own.swapaxes(1, 2).reshape(len(own), -1, own.shape[-1])  # grain by grain
+    strikes = by_mode if "shape_value" in constants else own.sum(axis=1)
+    parts = [gain[..., None] * np.imag(free), gain[..., None] * np.real(free), strikes]
     return found | {"heard": np.concatenate(parts, axis=1)}
 
 
@@ -123,8 +125,15 @@ def _rounded(name: str, exact: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{name}_low": low, f"{name}_high": high, f"{name}_share": (exact - low) / (high - low)}
 
 
-def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "part row mode"]:
-    """Return p as a step uses it, its real and imaginary parts: exact in float64, rounded down or up in float32.
+def _by_parts(name: str, turn: Float[np.ndarray, "2 row mode"]) -> Float[np.ndarray, "2 row both"]:
+    """Return what Re z′ and Im z′ have of their own part of z, Re p twice, and of the other part, −Im p and Im p."""
+    real, imag = turn
+    sign = 1.0 if name.endswith("share") else -1.0
+    return np.stack([np.concatenate([real, real], axis=-1), np.concatenate([sign * imag, imag], axis=-1)])
+
+
+def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "2 row both"]:
+    """Return p as a step uses it, for both parts of z: exact in float64, rounded down or up in float32.
 
     Args:
         constants: The module's.
@@ -133,4 +142,5 @@ def turn_of(constants: Mapping[str, Tensor], count: Tensor) -> Float[Tensor, "pa
     low, high, share = (constants[f"turn_{name}"] for name in ("low", "high", "share"))
     if low.dtype == torch.float64:
         return low + share * (high - low)
-    return torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
+    found = torch.where(torch.frac(count.double() * golden()).to(low.dtype) < share, high, low)
+    return found if found.is_cuda else materialised(found)  # on a CPU it is else chosen anew for each environment

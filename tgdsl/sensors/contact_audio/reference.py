@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from tgdsl.layout.layout import Layout
 from tgdsl.quantities.loads import Loads
+from tgdsl.quantities.loads.reference import ReferenceLoads
 from tgdsl.quantities.places import Places
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceAnswer, ReferenceContext, ReferenceState
@@ -38,18 +39,21 @@ def reference(
     loads, step = gathered[Loads], context.dt
     modes = ringing(spec, layout, spec.timestep or step, _no_surface)
     is_paper, below = spec.model == "paper", highest(spec.samples, step)
-    before = loads.force if context.is_first else state["steady"]
+    before, share = loads.force if context.is_first else state["steady"], _shares(spec, modes, loads)
     pending = state.get("pending", np.zeros_like(before))
-    impulse, steady, pending = reference_impulses(loads.force, (before, pending), step, spec.settling, is_paper)
+    weighted = state.get("weighted", np.zeros_like(share) if is_paper or spec.gains == "contact" else pending[..., None])
+    own = (before, pending, weighted)
+    impulse, steady, pending, weighted = reference_impulses(loads.force, own, share, step, spec.settling, is_paper)
     axis = 1 if spec.of == "link" else 0
-    struck, rubbed = impulse.sum(axis=axis), loads.sliding.sum(axis=axis)
+    struck, rubbed = impulse.sum(axis=axis), (loads.sliding[..., None] * share**2).sum(axis=axis)
     num = len(struck)
     phasors, heard = state["phasors"].copy(), np.zeros((spec.samples, num))
     half = modes.frequency.shape[1]
     amplitude = np.zeros((num, half))
     for row in range(num):
-        strikes = _strikes(spec, context, row, num, float(struck[row]), float(rubbed[row]))
         for m in range(half):
+            of = m if spec.gains == "contact" else 0
+            strikes = _strikes(spec, context, row, num, float(struck[row, of]), float(rubbed[row, of]))
             frequency, decay, gain = (float(table[row, m]) for table in (modes.frequency, modes.decay, modes.gain))
             if not 0 < frequency <= below * (1 + 1e-12):
                 phasors[row, [m, half + m]] = 0.0
@@ -60,9 +64,22 @@ def reference(
             phasors[row, [m, half + m]] = [part if abs(part) > least() else 0.0 for part in (after.real, after.imag)]
             amplitude[row, m] = gain * abs(complex(phasors[row, m], phasors[row, half + m]))
     after = {"phasors": phasors, "steady": steady} | ({} if is_paper else {"pending": pending})
+    after |= {"weighted": weighted} if spec.gains == "contact" and not is_paper else {}
     if spec.outputs == "bands":
         return _bands(spec, modes, amplitude), after
     return heard[..., None], after, {SAMPLES: radiated() * heard, PLACE: gathered[Places].T}
+
+
+def _shares(spec: ContactAudioSpec, modes: Ringing, loads: ReferenceLoads) -> Float[np.ndarray, "body object mode"]:
+    """Return by how much more or less than by its gain each load strikes each mode of what it acts on."""
+    if spec.gains == "mean":
+        return np.ones((*loads.force.shape, 1))
+    found = np.zeros((*loads.force.shape, modes.frequency.shape[1]))
+    for b, o in np.ndindex(loads.force.shape):
+        shapes = modes.shapes[b if spec.of == "link" else o]
+        own = shapes.share(loads.center[b, o][None], loads.along[b, o][None])[0]
+        found[b, o, : len(own)] = own
+    return found
 
 
 def _no_surface(name: str) -> Surface:

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import LowerError, listed
 from tgdsl.layout.layout import Layout
-from tgdsl.modal.modes import Modes
+from tgdsl.modal.modes import Modes, ModeShapes
 from tgdsl.sensors.base import Axis, body_axis
 from tgdsl.sensors.contact_audio.bands import band_numbers
 from tgdsl.sensors.contact_audio.given_modes import modes_of
@@ -36,7 +37,8 @@ class Ringing(NamedTuple):
         decay: [1/s].
         gain: [1/kg].
         bands: Numbers of the third octaves from the lowest mode that is heard to the highest, whether computed or not.
-        notes: What was left out, and why.
+        notes: What was left out, and why; and how exact mode shapes are, if those are wanted.
+        shapes: Mode shapes of each row; none if they are not wanted.
     """
 
     frequency: Float[np.ndarray, "row mode"]
@@ -44,6 +46,7 @@ class Ringing(NamedTuple):
     gain: Float[np.ndarray, "row mode"]
     bands: Sequence[int]
     notes: tuple[str, ...]
+    shapes: tuple[ModeShapes, ...] = ()
 
 
 def axis_of(spec: ContactAudioSpec, layout: Layout) -> Axis:
@@ -59,7 +62,9 @@ def names_of(spec: ContactAudioSpec, layout: Layout) -> list[tuple[str, tuple[st
     return [(names[0], (*names, body)) for names, body in zip(own, layout.bodies, strict=True)]
 
 
-def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: SurfaceByName) -> Ringing:
+def ringing(
+    spec: ContactAudioSpec, layout: Layout, step: float, surface: SurfaceByName, progress: Progress = silent
+) -> Ringing:
     """Return the modes of what rings.
 
     Args:
@@ -67,9 +72,11 @@ def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: Surfac
         layout: Its links.
         step: The time step [s].
         surface: Returns surfaces.
+        progress: Is told what is done.
 
     Raises:
-        LowerError: If a pattern matches nothing, or a body has no mode that is heard at the sample rate.
+        LowerError: If a pattern matches nothing, a body has no mode that is heard at the sample rate, or mode shapes are wanted
+            of listed modes.
     """
     rows = names_of(spec, layout)
     for pattern in spec.bodies:
@@ -78,12 +85,15 @@ def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: Surfac
             raise LowerError(what, field="bodies", hint=f"it has {listed([name for name, _ in rows])}")
     below, each, notes = highest(spec.samples, step), [], []
     for name, names in rows:
-        modes = modes_of(_given(spec, names), name, lambda own=name: surface(own), below)
+        modes = modes_of(_given(spec, names), name, lambda own=name: surface(own), below, progress)
         is_heard = modes.frequency <= below * (1 + 1e-12)
         if not is_heard.any():
             raise _unheard(name, modes, spec, step)
         if not is_heard.all():
             notes.append(f"{name}: {_dropped(modes.frequency[~is_heard])}: the sample rate is {spec.samples / step:g} Hz")
+        if spec.gains == "contact" and modes.shapes is None:
+            what = f'`gains: contact` wants mode shapes, and the modes of "{name}" are listed'
+            raise LowerError(what, "gains", "give `modes: {material: …}`, or `gains: mean`")
         each.append((modes, is_heard))
     for note in notes:
         warnings.warn(f"contact audio of {note}, and frequencies up to {HIGHEST:g} of it are heard", stacklevel=2)
@@ -95,7 +105,12 @@ def ringing(spec: ContactAudioSpec, layout: Layout, step: float, surface: Surfac
         count = int(is_kept.sum())
         for table, own in ((frequency, modes.frequency), (decay, modes.decay), (gain, modes.gain)):
             table[i, :count] = own[is_kept]
-    return Ringing(frequency, decay, gain, bands, tuple(notes))
+    shapes = []
+    for (name, _), (modes, is_kept) in zip(rows, each, strict=True):
+        if spec.gains == "contact" and modes.shapes is not None:
+            shapes.append(modes.shapes.of(is_kept))
+            notes.append(f"{name}: {_told(shapes[-1])}")
+    return Ringing(frequency, decay, gain, bands, tuple(notes), tuple(shapes))
 
 
 def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarray:
@@ -106,6 +121,12 @@ def _loudest(modes: Modes, is_heard: np.ndarray, count: int | None) -> np.ndarra
     is_kept = np.zeros_like(is_heard)
     is_kept[np.argsort(-energy, kind="stable")[:count]] = True
     return is_kept
+
+
+def _told(shapes: ModeShapes) -> str:
+    """Return what an account says of mode shapes."""
+    num = " × ".join(str(count) for count in shapes.num.tolist())
+    return f"mode shapes on {num} nodes; interpolated within {shapes.error.max():.1%} of a mode's mean on the surface"
 
 
 def _given(spec: ContactAudioSpec, names: tuple[str, ...]) -> ModesField:

@@ -52,6 +52,9 @@ class ContactAudioSpec(ProbeSpec):
     """Modes of what rings: a list of frequency, decay and gain; `{material: steel}` or `steel` for those of its shape."""
     bodies: dict[str, ModesField] = {}
     """Other modes, by names of links (of objects with `of: object`) or shell wildcards; the first that matches counts."""
+    gains: Literal["mean", "contact"] = "mean"
+    """How strongly a contact strikes each mode: `mean`, by its gain, wherever it is; `contact`, by its mode shape there and
+    along the contact's normal too, over that in the mean. That needs modes of the shape."""
     samples: Annotated[StrictInt, Field(ge=1)] = 16
     """Samples per physics step, K: the sample rate is K over the time step."""
     substeps: Annotated[StrictInt, Field(ge=1)] = 1
