@@ -5,7 +5,8 @@ several colliders and values of `solimp`'s d. A contact with the elliptic cone i
 
     f / r = 1 / ((1 − d) t² A)        d: impedance [1], t: time constant of `solref` [s], A: inverse inertia [1/kg]
 
-(MuJoCo's documentation, Computation, Constraint model), whatever the number of contacts of a pair: n of them are n times as stiff.
+(MuJoCo's documentation, Computation, Constraint model), whatever the number of contacts of a pair: n of them are n times as
+stiff.
 Where their compliance exceeds the drives', the load depends on n: on the algorithm that finds contacts.
 
 - `load_%`: of the object, median over states of the ratio to that with meshes of the same cone and d;

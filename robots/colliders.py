@@ -7,8 +7,9 @@ the inner sides and the tips. What is written is checked anew by `deviations`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import igl
@@ -33,6 +34,8 @@ CONE = 60.0
 """Largest angle between a surface's normal and a direction that objects come from [deg]."""
 NUM_SAMPLES = 1500
 MOST_STEPS = 40
+OUTSIDE = 0.05 * MM
+"""A point so far above a mesh that is inside of another one is on no outer surface [m]."""
 STRAY, STRAY_TURN = 8.0, 30.0
 """How far the fit may move a primitive's numbers from the table's [mm], [deg]."""
 _LINE = np.linspace(-1, 1, 9)
@@ -75,6 +78,8 @@ class Link:
         region: Lower and upper corner of what is touched [mm].
         lateral: Axis that the link is symmetric along, as an index; None: it is not.
         middle: Where its plane of symmetry is on that axis [mm].
+        count: Points of its surface that are fitted.
+        is_hollow: Whether its surface, and not only its convex hull, bounds the boxes' edges.
     """
 
     primitives: tuple[Primitive, ...]
@@ -82,6 +87,8 @@ class Link:
     region: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1e3,) * 3, (1e3,) * 3)  # type: ignore
     lateral: int | None = None
     middle: float = 0.0
+    count: int = NUM_SAMPLES
+    is_hollow: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +102,13 @@ class Samples:
 # ---- the surface
 
 
-def samples(surface: Surface, link: Link, count: int = NUM_SAMPLES, seed: int = 0) -> Samples:
-    """Return points spread over a link's surface, the same ones every time."""
+def samples(surface: Surface, link: Link, count: int, seed: int = 0) -> Samples:
+    """Return points spread over a link's surface, the same ones every time; of several meshes on the outside of their union."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     pos, face, *_ = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    return Samples(np.asarray(pos), touched(np.asarray(pos), surface.face_normals[face], link))
+    pos, normal = np.asarray(pos), surface.face_normals[face]
+    outer = np.asarray(igl.fast_winding_number(surface.vertices, surface.faces, pos + OUTSIDE * normal)) < 0.5
+    return Samples(pos[outer], touched(pos[outer], normal[outer], link))
 
 
 def _hull_planes(surface: Surface) -> np.ndarray:
@@ -206,7 +215,8 @@ def distance(placed: Sequence[Collider], pos: np.ndarray) -> np.ndarray:
 
 def fitted(link: Link, surface: Surface) -> list[Collider]:
     """Return a link's primitives, fitted to its surface."""
-    points, planes = samples(surface, link), _hull_planes(surface)
+    points = samples(surface, link, link.count)
+    height = partial(signed_heights, surface) if link.is_hollow else partial(_above, _hull_planes(surface))
     scale = np.where(points.is_touched, TOUCHED_SCALE, REST_SCALE) * MM
     start = [_numbers(primitive) for primitive in link.primitives]
     free = np.concatenate([_is_free(primitive, link) for primitive in link.primitives])
@@ -220,7 +230,7 @@ def fitted(link: Link, surface: Surface) -> list[Collider]:
     def residuals(chosen: np.ndarray, power: float) -> np.ndarray:
         placed = all_placed(link, numbers(chosen))
         found = distance(placed, points.pos).min(axis=0) / scale
-        edges = sharp(placed, planes) / (TOUCHED_SCALE * MM)
+        edges = sharp(placed, height) / (TOUCHED_SCALE * MM)
         return np.concatenate([np.sign(found) * np.abs(found) ** np.where(points.is_touched, power, 2), edges**power])
 
     chosen = np.concatenate(start)[free]
@@ -233,14 +243,30 @@ def fitted(link: Link, surface: Surface) -> list[Collider]:
     return all_placed(link, [np.round(own, 2) for own in numbers(chosen)])
 
 
-def sharp(placed: Sequence[Collider], planes: np.ndarray) -> np.ndarray:
-    """Return how far points of the boxes' edges stick out of a convex hull and of the other primitives [m], or less."""
+def _above(planes: np.ndarray, pos: np.ndarray) -> np.ndarray:
+    """Return how far points are outside of planes, (plane, normal and offset) [m]."""
+    return (pos @ planes[:, :3].T - planes[:, 3]).max(axis=1)
+
+
+def signed_heights(surface: Surface, pos: np.ndarray) -> np.ndarray:
+    """Return the heights of points above a surface, of several meshes above their union [m]."""
+    sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    return np.asarray(igl.signed_distance(pos, surface.vertices, surface.faces, sign_type=sign)[0])
+
+
+def sharp(placed: Sequence[Collider], height: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return how far points of the boxes' edges stick out of a link and of the other primitives [m], or less.
+
+    Args:
+        placed: The primitives.
+        height: The heights of points above the link, or less [m].
+    """
     found = []
     for i, own in enumerate(placed):
         if own.type != "box":
             continue
         pos = EDGES * own.size @ Rotation.from_quat(own.quat, scalar_first=True).as_matrix().T + own.pos
-        outside = (pos @ planes[:, :3].T - planes[:, 3]).max(axis=1)
+        outside = height(pos)
         others = [other for j, other in enumerate(placed) if j != i]
         if others:
             outside = np.minimum(outside, distance(others, pos).min(axis=0))
@@ -273,7 +299,7 @@ def deviations(
     points = samples(surface, link, count, seed)
     found = distance(placed, points.pos).min(axis=0)
     outer = exterior(placed, max(count // len(placed), 500), seed)
-    height = np.asarray(igl.signed_distance(outer, surface.vertices, surface.faces)[0])
+    height = signed_heights(surface, outer)
     _, face, nearest = igl.point_mesh_squared_distance(outer, surface.vertices, surface.faces)
     is_touched = touched(np.asarray(nearest), surface.face_normals[np.asarray(face)], link)
     made = []
@@ -330,8 +356,12 @@ def _number(value: float) -> str:
 
 
 def meshes(robot: Model) -> dict[str, str]:
-    """Return the mesh of each body that has one which collides."""
-    return {geom.body: geom.mesh for geom in robot.geoms if geom.is_colliding and geom.mesh}
+    """Return the mesh of each body that has one which collides, of several the first."""
+    found: dict[str, str] = {}
+    for geom in robot.geoms:
+        if geom.is_colliding and geom.mesh:
+            found.setdefault(geom.body, geom.mesh)
+    return found
 
 
 def surface_of(robot: Model, mesh: str) -> Surface:
