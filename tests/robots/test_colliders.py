@@ -25,7 +25,6 @@ class Hand:
         task: The sensors' document of a task.
         quick: A mesh that is fitted in no time.
         at_worst: Of links with a few points that are further away [m].
-        elsewhere: How far primitives may be on backs and flanks, which only have to keep things out [m].
     """
 
     name: str
@@ -34,7 +33,6 @@ class Hand:
     task: str
     quick: str
     at_worst: dict[str, float] = field(default_factory=dict)
-    elsewhere: float = 10e-3
 
     @property
     def folder(self):
@@ -46,12 +44,14 @@ class Hand:
 
 
 HANDS = (
-    # On the thumb's first link at the rim beside a joint, beyond the taxels.
+    # The thumb's first link at the rim beside a joint, beyond the taxels; the Sharpa Wave's palm in creases of its hollow.
     Hand("xhand1", 13, "xhand1_palm.yaml", "palm.yaml", "index_bend", {"thumb_link1": 1.8e-3}),
-    Hand("sharpa", 29, "tasks/sharpa_palm.yaml", "sharpa_palm.yaml", "thumb_dp"),
+    Hand("sharpa", 30, "tasks/sharpa_palm.yaml", "sharpa_palm.yaml", "thumb_dp", {"palm_base": 1.8e-3}),
 )
 TOLERANCE = 1e-3
 """How far primitives may be from the surface where objects touch it [m]."""
+ELSEWHERE = 10e-3
+"""The same on backs and flanks, which only have to keep things out [m]."""
 
 pytestmark = pytest.mark.slow
 
@@ -87,8 +87,8 @@ def test_where_objects_touch_a_link_primitives_are_within_a_millimetre(hand, rob
         far = np.abs(fit.distance(own, points.pos).min(axis=0)[points.is_touched]) > TOLERANCE
         assert not link.touched or far.mean() <= (0.01 if mesh in hand.at_worst else 0.0), mesh
         assert touched.mean <= 0.35e-3, mesh
-        assert max(rest.gap, rest.excess) <= hand.elsewhere, mesh
-        assert sum(collider.is_core for collider in own) == 1, mesh
+        assert max(rest.gap, rest.excess) <= ELSEWHERE, mesh
+        assert any(collider.is_core for collider in own), mesh
 
 
 def test_every_taxel_of_every_layout_is_near_a_primitive(hand, colliders):
@@ -110,7 +110,7 @@ def test_no_mesh_collides_and_bodies_weigh_what_they_did(hand, robot, colliders)
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     assert is_mesh.sum() == hand.num_meshes and not (model.geom_contype[is_mesh] | model.geom_conaffinity[is_mesh]).any()
     for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat", "jnt_range", "exclude_signature"):
-        np.testing.assert_array_equal(getattr(model, name), getattr(robot.compiled, field))
+        np.testing.assert_array_equal(getattr(model, name), getattr(robot.compiled, name))
     assert len(model.mesh_graph) == 0  # no hull is made that nobody needs
 
 
