@@ -2,12 +2,14 @@
 
     python benchmarks/colliders.py speed --device cuda --envs 8192 --out out/colliders --limit 240
     python benchmarks/colliders.py error --out out/colliders                     # on a CPU, one thread
+    python benchmarks/colliders.py load --states 256 --out out/colliders         # how colliders load what links hold, on a CPU
     python benchmarks/colliders.py pairs                                        # which pairs of links come near, on a CPU
 
 `speed`, in MuJoCo Warp, with the drives, random actions and randomisation of the task: milliseconds of a control step's physics
 (a CUDA graph; from the same states, blocks alternate between variants, medians), Newton's rounds in the last substep (mean, and
 of the slowest environment, which all wait for), contacts, pairs that pass the broad phase, and rows of constraints, of each
-environment. `error` and `pairs` are explained in colliders_error.py.
+environment. `error` and `pairs` are explained in colliders_error.py, `load` in
+colliders_load.py.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import colliders_error
+import colliders_load
 import torch
 from colliders_error import COLLISIONS, CONES, Variant
 
@@ -43,7 +46,7 @@ SPEED_OPTIONS: tuple[dict[str, float], ...] = (
 )
 """Options of MuJoCo in place of the scene's; the first are the scene's own."""
 ERROR_OPTIONS = (*SPEED_OPTIONS, {"tolerance": 1e-6}, {"tolerance": 1e-3}, {"ls_iterations": 10})
-PARTS = ("speed", "error", "pairs")
+PARTS = ("speed", "error", "load", "pairs")
 
 
 # ---- speed
@@ -187,7 +190,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--blocks", type=int, default=7)
     parser.add_argument("--steps", type=int, default=5, help="control steps of a block")
     parser.add_argument("--limit", type=float, default=240.0, help="after so many seconds no other cone is begun [s]")
-    parser.add_argument("--states", type=int, default=64, help="of `error` and `pairs`")
+    parser.add_argument("--states", type=int, default=64, help="of `error`, `load` and `pairs`")
     parser.add_argument("--ahead", type=int, default=160, help="control steps that each of them is followed for")
     parser.add_argument("--quick", action="store_true", help="only a few options")
     parser.add_argument("--out", type=Path, help="writes OUT_PART.json")
@@ -199,7 +202,7 @@ def arguments(given: Sequence[str] | None = None) -> argparse.Namespace:
 
 def main() -> None:
     options = arguments()
-    parts = {"speed": speed, "error": colliders_error.error, "pairs": colliders_error.pairs}
+    parts = {"speed": speed, "error": colliders_error.error, "load": colliders_load.load, "pairs": colliders_error.pairs}
     rows = parts[options.part](options)
     if options.part == "speed":
         print(table(rows))

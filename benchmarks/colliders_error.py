@@ -109,7 +109,7 @@ def instants(scenes: Scenes, count: int, ahead: int, seed: int = 0) -> list[Inst
         model = scenes.model(reference, i % 16)
         data = mujoco.MjData(model)
         mujoco.mj_resetDataKeyframe(model, data, 0)
-        moved = np.array([j for j in range(model.nu) if "thumb" in model.actuator(j).name or "_mid_" in model.actuator(j).name])
+        moved = np.array([j for j in range(model.nu) if "thumb" in model.actuator(j).name or "_mid" in model.actuator(j).name])
         own = model.body(scenes.body).jntadr[0]
         place = int(model.jnt_qposadr[own])
         data.qpos[place : place + 2] += rng.uniform(-0.01, 0.01, 2)

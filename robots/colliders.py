@@ -2,14 +2,14 @@
 
 Each link starts from primitives of a table; their numbers then minimise the fourth power of the distance between the link's
 surface and the union of the primitives' (Levenberg–Marquardt on its square), most where objects touch the link: on
-the inner sides and the tips. What is written is checked anew by `deviations`.
+the inner sides and the tips. What is written (`colliders_file.py`) is checked anew by `deviations`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 
 import igl
 import numpy as np
@@ -18,9 +18,6 @@ import trimesh
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from robots.reflection import Mirror
-from tgdsl.formats.model import Model
-from tgdsl.formats.robot import load_model
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.plan.scene import Collider
 from tgdsl.surfaces.convex import hull_planes
@@ -33,8 +30,12 @@ CONE = 60.0
 """Largest angle between a surface's normal and a direction that objects come from [deg]."""
 NUM_SAMPLES = 1500
 MOST_STEPS = 40
+OUTSIDE = 0.05 * MM
+"""A point so far above a mesh that is inside of another one is on no outer surface [m]."""
 STRAY, STRAY_TURN = 8.0, 30.0
 """How far the fit may move a primitive's numbers from the table's [mm], [deg]."""
+CACHED = 64
+"""Primitives, with what was found of them, that the fit remembers."""
 _LINE = np.linspace(-1, 1, 9)
 EDGES = np.unique(
     np.concatenate([np.roll([[t, a, b] for t in _LINE for a in (-1, 1) for b in (-1, 1)], k, axis=1) for k in range(3)]), axis=0
@@ -75,6 +76,8 @@ class Link:
         region: Lower and upper corner of what is touched [mm].
         lateral: Axis that the link is symmetric along, as an index; None: it is not.
         middle: Where its plane of symmetry is on that axis [mm].
+        count: Points of its surface that are fitted.
+        is_hollow: Whether its surface, and not only its convex hull, bounds the boxes' edges.
     """
 
     primitives: tuple[Primitive, ...]
@@ -82,6 +85,8 @@ class Link:
     region: tuple[tuple[float, float, float], tuple[float, float, float]] = ((-1e3,) * 3, (1e3,) * 3)  # type: ignore
     lateral: int | None = None
     middle: float = 0.0
+    count: int = NUM_SAMPLES
+    is_hollow: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +100,13 @@ class Samples:
 # ---- the surface
 
 
-def samples(surface: Surface, link: Link, count: int = NUM_SAMPLES, seed: int = 0) -> Samples:
-    """Return points spread over a link's surface, the same ones every time."""
+def samples(surface: Surface, link: Link, count: int, seed: int = 0) -> Samples:
+    """Return points spread over a link's surface, the same ones every time; of several meshes on the outside of their union."""
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     pos, face, *_ = trimesh.sample.sample_surface(mesh, count, seed=seed)
-    return Samples(np.asarray(pos), touched(np.asarray(pos), surface.face_normals[face], link))
+    pos, normal = np.asarray(pos), surface.face_normals[face]
+    outer = np.asarray(igl.fast_winding_number(surface.vertices, surface.faces, pos + OUTSIDE * normal)) < 0.5
+    return Samples(pos[outer], touched(pos[outer], normal[outer], link))
 
 
 def _hull_planes(surface: Surface) -> np.ndarray:
@@ -206,7 +213,11 @@ def distance(placed: Sequence[Collider], pos: np.ndarray) -> np.ndarray:
 
 def fitted(link: Link, surface: Surface) -> list[Collider]:
     """Return a link's primitives, fitted to its surface."""
-    points, planes = samples(surface, link), _hull_planes(surface)
+    points = samples(surface, link, link.count)
+    height = partial(signed_heights, surface) if link.is_hollow else partial(_above, _hull_planes(surface))
+    apart = lru_cache(CACHED)(lambda own: distance([own], points.pos)[0])  # a step of one number moves one primitive
+    rise = lru_cache(CACHED)(lambda box: height(edges(box)))
+    between = lru_cache(CACHED**2)(lambda own, box: distance([own], edges(box))[0])
     scale = np.where(points.is_touched, TOUCHED_SCALE, REST_SCALE) * MM
     start = [_numbers(primitive) for primitive in link.primitives]
     free = np.concatenate([_is_free(primitive, link) for primitive in link.primitives])
@@ -219,9 +230,9 @@ def fitted(link: Link, surface: Surface) -> list[Collider]:
 
     def residuals(chosen: np.ndarray, power: float) -> np.ndarray:
         placed = all_placed(link, numbers(chosen))
-        found = distance(placed, points.pos).min(axis=0) / scale
-        edges = sharp(placed, planes) / (TOUCHED_SCALE * MM)
-        return np.concatenate([np.sign(found) * np.abs(found) ** np.where(points.is_touched, power, 2), edges**power])
+        found = np.min([apart(own) for own in placed], axis=0) / scale
+        corners = sharp(placed, rise, between) / (TOUCHED_SCALE * MM)
+        return np.concatenate([np.sign(found) * np.abs(found) ** np.where(points.is_touched, power, 2), corners**power])
 
     chosen = np.concatenate(start)[free]
     low, high = (np.concatenate([_bound(own, sign) for own in link.primitives])[free] for sign in (-1, 1))
@@ -233,18 +244,39 @@ def fitted(link: Link, surface: Surface) -> list[Collider]:
     return all_placed(link, [np.round(own, 2) for own in numbers(chosen)])
 
 
-def sharp(placed: Sequence[Collider], planes: np.ndarray) -> np.ndarray:
-    """Return how far points of the boxes' edges stick out of a convex hull and of the other primitives [m], or less."""
+def _above(planes: np.ndarray, pos: np.ndarray) -> np.ndarray:
+    """Return how far points are outside of planes, (plane, normal and offset) [m]."""
+    return (pos @ planes[:, :3].T - planes[:, 3]).max(axis=1)
+
+
+def signed_heights(surface: Surface, pos: np.ndarray) -> np.ndarray:
+    """Return the heights of points above a surface, of several meshes above their union [m]."""
+    sign = igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+    return np.asarray(igl.signed_distance(pos, surface.vertices, surface.faces, sign_type=sign)[0])
+
+
+def edges(box: Collider) -> np.ndarray:
+    """Return points of a box's edges [m]."""
+    return EDGES * box.size @ Rotation.from_quat(box.quat, scalar_first=True).as_matrix().T + box.pos
+
+
+def sharp(
+    placed: Sequence[Collider],
+    rise: Callable[[Collider], np.ndarray],
+    between: Callable[[Collider, Collider], np.ndarray],
+) -> np.ndarray:
+    """Return how far points of the boxes' edges stick out of a link and of the other primitives [m], or less.
+
+    Args:
+        placed: The primitives.
+        rise: The heights of a box's edges above the link, or less [m].
+        between: The distances of the second one's edges, a box's, from the first one [m].
+    """
     found = []
-    for i, own in enumerate(placed):
-        if own.type != "box":
-            continue
-        pos = EDGES * own.size @ Rotation.from_quat(own.quat, scalar_first=True).as_matrix().T + own.pos
-        outside = (pos @ planes[:, :3].T - planes[:, 3]).max(axis=1)
-        others = [other for j, other in enumerate(placed) if j != i]
-        if others:
-            outside = np.minimum(outside, distance(others, pos).min(axis=0))
-        found.append(np.clip(outside, 0, None))
+    for i, box in enumerate(placed):
+        if box.type == "box":
+            others = [between(own, box) for j, own in enumerate(placed) if j != i]
+            found.append(np.clip(np.min([rise(box), *others], axis=0), 0, None))
     return np.concatenate(found) if found else np.zeros(0)
 
 
@@ -273,7 +305,7 @@ def deviations(
     points = samples(surface, link, count, seed)
     found = distance(placed, points.pos).min(axis=0)
     outer = exterior(placed, max(count // len(placed), 500), seed)
-    height = np.asarray(igl.signed_distance(outer, surface.vertices, surface.faces)[0])
+    height = signed_heights(surface, outer)
     _, face, nearest = igl.point_mesh_squared_distance(outer, surface.vertices, surface.faces)
     is_touched = touched(np.asarray(nearest), surface.face_normals[np.asarray(face)], link)
     made = []
@@ -301,79 +333,3 @@ def exterior(placed: Sequence[Collider], count: int, seed: int) -> np.ndarray:
         others = [other for j, other in enumerate(placed) if j != i]
         found.append(pos[distance(others, pos).min(axis=0) > 0] if others else pos)
     return np.concatenate(found)
-
-
-# ---- writing
-
-
-HEADER = """\
-# Generated by robots/{folder}/make_colliders.py: run it again to change this. Capsules, spheres and boxes in place of convex
-# hulls of meshes, for `collision: primitive`; metres, quaternions w, x, y, z. Other links meet the `core` ones alone.
-"""
-
-
-def text(placed: Mapping[str, Sequence[Collider]], folder: str) -> str:
-    """Return the primitives of bodies as YAML."""
-    lines = [HEADER.format(folder=folder) + "tgdsl: 1\nbodies:"]
-    for body, own in placed.items():
-        lines.append(f"  {body}:")
-        for part in own:
-            size, pos, quat = (", ".join(_number(v) for v in values) for values in (part.size, part.pos, part.quat))
-            place = f"pos: [{pos}]" + ("" if part.quat[0] == 1.0 else f", quat: [{quat}]")
-            lines.append(f"    - {{type: {part.type}, size: [{size}], {place}{', core: true' if part.is_core else ''}}}")
-    return "\n".join(lines) + "\n"
-
-
-def _number(value: float) -> str:
-    shown = f"{value:.6f}".rstrip("0").rstrip(".")
-    return "0" if shown in ("-0", "") else shown
-
-
-def meshes(robot: Model) -> dict[str, str]:
-    """Return the mesh of each body that has one which collides."""
-    return {geom.body: geom.mesh for geom in robot.geoms if geom.is_colliding and geom.mesh}
-
-
-def surface_of(robot: Model, mesh: str) -> Surface:
-    """Return the surface of the first link that has a mesh."""
-    body = next(body for body, own in meshes(robot).items() if own == mesh)
-    return robot.surface(robot.touchable(body))
-
-
-def row(name: str, placed: Sequence[Collider], made: Sequence[Deviation]) -> str:
-    """Return a line of the report."""
-    numbers = [[own.mean, own.gap, own.excess] for own in made]
-    shown = "   ".join(" ".join(f"{value / MM:7.2f}" for value in own) for own in numbers)
-    return f"{name:<14} {len(placed):6d}  {shown}"
-
-
-def write(model: Path, links: Mapping[str, Link]) -> None:
-    """Fit the primitives of a hand's links, print how well they fit, and write them beside its model.
-
-    Args:
-        model: The hand's model.
-        links: How the links with each mesh are fitted.
-    """
-    robot = load_model(model)
-    found: dict[str, list[Collider]] = {}
-    print(f"{'mesh':<14} number  touched: mean, gap, excess [mm]  elsewhere")
-    for name, link in links.items():
-        found[name] = fitted(link, surface_of(robot, name))
-        print(row(name, found[name], deviations(link, found[name], surface_of(robot, name))))
-    save(found, robot, model.parent)
-
-
-def save(found: Mapping[str, Sequence[Collider]], robot: Model, folder: Path) -> None:
-    """Write the colliders of the links with each mesh, and those of the left hand, into a folder."""
-    placed = {body: found[mesh] for body, mesh in meshes(robot).items() if mesh in found}
-    mirror = Mirror()
-    others = {mirror.renamed(body): [mirrored(own, mirror) for own in parts] for body, parts in placed.items()}
-    for name, bodies in (("colliders.yaml", placed), ("colliders_left.yaml", others)):
-        (folder / name).write_text(text(bodies, folder.name), encoding="utf-8")
-
-
-def mirrored(own: Collider, mirror: Mirror) -> Collider:
-    """Return the mirror image of a primitive: its frame R is turned to M R M."""
-    x, y, z = (float(value * sign) for value, sign in zip(own.pos, mirror.polar, strict=True))
-    turn = tuple(float(value * sign) for value, sign in zip(own.quat[1:], mirror.axial, strict=True))
-    return replace(own, pos=(x, y, z), quat=(own.quat[0], *turn))  # type: ignore[arg-type]

@@ -10,7 +10,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # as a script, this sees only its own folder
 
-from robots.colliders import Link, Primitive, write
+from robots.colliders import Link, Primitive
+from robots.colliders_file import write
 
 FOLDER = Path(__file__).resolve().parent
 FRONT, END = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)

@@ -10,12 +10,14 @@ from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 
-TASK = Path(__file__).parents[2] / "examples" / "tasks" / "in_palm_rotate.yaml"
+TASKS = Path(__file__).parents[2] / "examples" / "tasks"
+TASK = TASKS / "in_palm_rotate.yaml"
 GIVEN = {"physics.collision": "primitive", "physics.ls_tolerance": 0.05, "physics.iterations": 20, "physics.tolerance": 1e-6}
 
 
-def test_colliders_and_options_reach_the_simulation():
-    env = TouchEnv(TASK, 2, overrides=GIVEN | {"touch": "none"}, threads=1)
+@pytest.mark.parametrize(("task", "palm"), [(TASK.name, "right_hand_link"), ("in_hand_repose_sharpa.yaml", "right_hand_C_MC")])
+def test_colliders_and_options_reach_the_simulation(task, palm):
+    env = TouchEnv(TASKS / task, 2, overrides=GIVEN | {"touch": "none"}, threads=1)
     model = env.sim.model
     is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     assert is_mesh.any() and not model.geom_contype[is_mesh].any() and not model.geom_conaffinity[is_mesh].any()
@@ -23,7 +25,7 @@ def test_colliders_and_options_reach_the_simulation():
     for _ in range(20):
         made = env.step(torch.zeros(2, env.num_actions))
     assert not made.info.faults.any()
-    contacts = env.sim.env_model(0).geom("tgdsl/right_hand_link/collider/0").contype[0]
+    contacts = env.sim.env_model(0).geom(f"tgdsl/{palm}/collider/0").contype[0]
     assert contacts  # the palm's core
     env.close()
 

@@ -1,0 +1,49 @@
+"""Contacts of the tasks' objects with the hand resist twisting, and the policies that are kept still act in these scenes."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tgdsl.rl.load import load_task
+from tgdsl.rl.playing.policy import check_card
+from tgdsl.rl.sensed import compile_sensed
+from tgdsl.scene.scene import Choice, SceneModels
+
+ROOT = Path(__file__).parents[2]
+TASKS = ROOT / "examples" / "tasks"
+LIMITS = {
+    "in_palm_rotate": ("item", 0.002),
+    "in_hand_repose": ("item", 0.002),
+    "in_hand_repose_sharpa": ("item", 0.0015),
+    "screwdriver": ("screwdriver", 0.002),
+    "grip_force": ("item", 0.005),
+}
+"""Of each task the object, and its torsional friction: the largest torque over the normal force [m]."""
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize("task", LIMITS)
+def test_every_variant_of_an_object_resists_twisting(task):
+    name, limit = LIMITS[task]
+    loaded = load_task(TASKS / f"{task}.yaml", {"touch": "none"})
+    sensed = compile_sensed(loaded, "cpu")
+    scene = sensed.touch.plan.scene
+    models = SceneModels(scene, loaded.spec.physics.options)
+    (own,) = [found for found in scene.objects if found.name == name]
+    for number in range(len(own.variants)):
+        model = models.model({name: Choice(number)})
+        geoms = [i for i in range(model.ngeom) if model.body(int(model.geom_bodyid[i])).name == sensed.object]
+        colliding = [i for i in geoms if model.geom_contype[i] or model.geom_conaffinity[i]]
+        assert colliding
+        for i in colliding:
+            assert model.geom_condim[i] == 4 and model.geom_friction[i, 1] == limit
+            assert model.geom_priority[i] > max(model.geom_priority[j] for j in range(model.ngeom) if j not in geoms)
+
+
+@pytest.mark.parametrize("policy", ["in_palm_rotate_cube", "grip_force"])
+def test_kept_policies_act_in_them(policy):
+    card = json.loads((ROOT / "policies" / f"{policy}.json").read_text(encoding="utf-8"))
+    sensed = compile_sensed(load_task(TASKS / f"{policy}.yaml"), "cpu")
+    check_card(card, ROOT / "policies" / f"{policy}.pt", card["joints"], sensed.touch.taxels_id)
