@@ -45,6 +45,11 @@ class HandSource(Source, Protocol):
         """Return what the hand said at the end of the last step."""
         ...
 
+    @property
+    def age_s(self) -> float | None:
+        """How old that is at most, now [s]; None where nothing runs in real time."""
+        ...
+
     def resume(self) -> None:
         """Allow a hand that was made passive by an error to move again."""
         ...
@@ -71,6 +76,11 @@ class HandConnection(Connection):
     def is_over(self) -> bool:
         """Whether a log is at its end."""
         return self._hand.is_over
+
+    @property
+    def age_s(self) -> float | None:
+        """How old what the hand said is at most, now [s]."""
+        return self._hand.age_s
 
     def read(self) -> dict[str, Float[Tensor, "env feature"]]:
         """Observe what the hand said at the end of the last step."""

@@ -178,6 +178,11 @@ class XHand1Source:
             raise StaleReadingError("the last step or reset gave no reading; step or reset again")
         return self._sample
 
+    @property
+    def age_s(self) -> float | None:
+        """How old the sample is at most, now [s]."""
+        return self.sample().reading.age_s()
+
     def state(self) -> SceneState:
         """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
 
