@@ -69,7 +69,7 @@ def connect(
         TgdslError: If there is no such source, or it has no such option.
     """
     name = str(source)
-    kind = _kind_of(name)
+    kind = kind_of(name)
     if taxels is not None:
         check_taxels(touch, taxels)
     if num_envs != 1 and "num_envs" not in kind.options:
@@ -82,7 +82,7 @@ def connect(
     return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **own)
 
 
-def _kind_of(source: str) -> SourceKind:
+def kind_of(source: str) -> SourceKind:
     """Return the kind of the source that a user named.
 
     Raises:

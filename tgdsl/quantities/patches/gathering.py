@@ -61,7 +61,7 @@ def _direction(force: Sequence[Tensor], share: Sequence[Tensor], normals: Sequen
     mean, first = _mean(share, normals), normals[-1]
     for weight, normal in zip(reversed(force[:-1]), reversed(normals[:-1]), strict=True):
         first = planes.where(weight > 0, normal, first)
-    is_none = (planes.dot(mean, mean) < cancelled()**2) & (sum(force[1:], start=force[0]) > 0)
+    is_none = (planes.dot(mean, mean) < cancelled() ** 2) & (sum(force[1:], start=force[0]) > 0)
     return _unit(planes.where(is_none, first, mean))
 
 

@@ -11,7 +11,7 @@ from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SourceKind
 from tgdsl.runtime.stepped_scene import SteppedScene, refuse_other_steps
 from tgdsl.runtime.xhand1.calibration import Calibration
-from tgdsl.runtime.xhand1.connect import HandConnection, JointTargets, given_calibration
+from tgdsl.runtime.xhand1.connect import HandConnection, JointTargets, given_calibration, refuse_unfit_steps
 from tgdsl.runtime.xhand1.emulator.simulated_body import SimulatedBody
 from tgdsl.runtime.xhand1.emulator.simulated_tips import SimulatedTips
 from tgdsl.runtime.xhand1.emulator.source import EmulatedSource
@@ -39,6 +39,8 @@ def _open(
     if scene is None:
         scene = SteppedScene(touch, simulate_at(touch, 1, control_step, keyframe, Watch(joints=hand_joints(touch))))
     refuse_other_steps(scene, control_step)
+    if not lockstep:
+        refuse_unfit_steps(control_step, motion, timing)
     targets = JointTargets(touch, motion, "the emulated hand")
     body = SimulatedBody(scene, tips, known)
     stepped = EmulatedSource(
