@@ -139,7 +139,7 @@ def compile_sensed(
         felt = _sensor_of(loaded, kinds, kind, ("touch",))
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
-    overrides["observations"] |= also or {}
+    overrides["observations"] = {**overrides["observations"], **(also or {})}
     contact = by_kind.get("link_contact")
     if contact:
         own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]

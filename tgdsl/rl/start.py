@@ -96,7 +96,7 @@ def make_simulation(
         sim = BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
     num_variants = _num_variants(sensed, spec.object)
     if first_env % num_variants:
-        sim.set_objects({spec.object: (torch.arange(num_envs) + first_env) % num_variants})
+        sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
     return sim
 
 

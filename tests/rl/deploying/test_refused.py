@@ -34,11 +34,19 @@ def policy(task):
         ({"goal": (9.0,)}, DeployError, "goal: a bend of 9 rad; expected 0.5 to 1.5 rad .`bend` of the task's document"),
         ({"goal": (1.0, 2.0)}, DeployError, r"goal: found 2 numbers, but of the task .* expected 1 \[rad\]"),
         ({"start": "home"}, SimulationError, 'the scene has no keyframe "home"'),
-        ({"overrides": {"action.scale": "0.1 rad"}}, PolicyError, r"student.pt: this policy was learned with other actions: \{"),
+        (
+            {"overrides": {"action.scale": "0.1 rad"}},
+            PolicyError,
+            r"student.pt: this policy was learned with other actions: \{",
+        ),
         ({"overrides": {"physics.substeps": 4}}, PolicyError, "was learned with other control steps .s.: 0.02, here 0.016"),
         ({"overrides": {"joints": ["*_mid_*"]}}, PolicyError, "student.pt: this policy moves .*, not right_hand_mid_joint2"),
         ({"overrides": {"touch": "agg_bol"}}, SpecError, "touch"),
-        ({"groups": ("priv_error", "goal")}, DeployError, "sees priv_error of the task .*, which only a scene knows; on a hand"),
+        (
+            {"groups": ("priv_error", "goal")},
+            DeployError,
+            "sees priv_error of the task .*, which only a scene knows; on a hand",
+        ),
     ],
 )
 def test_what_does_not_fit(task, policy, options, error, message):
@@ -50,7 +58,7 @@ def test_a_policy_of_another_task(task, policy, tmp_path):
     other = press_task(tmp_path)
     (tmp_path / "press2.py").write_text((tmp_path / "press.py").read_text())
     other.write_text(other.read_text().replace("press.py", "press2.py"))
-    with pytest.raises(PolicyError, match='learned in the task "press.py:Press", not "press2.py:Press"'):
+    with pytest.raises(PolicyError, match=r'learned in the task "press.py:Press", not "press2.py:Press"'):
         Deployment(other, policy)
 
 
@@ -83,7 +91,9 @@ def test_a_rate_beyond_the_lines(task, source):
     """One exchange takes 297 + 2217 bytes of 10 bits at 3 Mbaud; in lockstep the emulator's scene waits."""
     fast = {"physics.substeps": 2, "physics.timestep": "4 ms"}
     file = press_policy(task.parent, task, Blind(6), "fast.pt", **fast)
-    with pytest.raises(HandError, match=r"control steps of 8 ms \(125 per second\), and an exchange takes 8.38 ms: at most 119"):
+    with pytest.raises(
+        HandError, match=r"control steps of 8 ms \(125 per second\), and an exchange takes 8.38 ms: at most 119"
+    ):
         next(Deployment(task, file, source, goal=(1.0,), overrides=fast, calibration=CALIBRATION).steps())
     if source == "emulator":
         found = Deployment(task, file, source, overrides=fast, calibration=CALIBRATION, lockstep=True)
@@ -119,5 +129,5 @@ def test_actions_that_are_no_numbers(task):
             return x[:, :6] / 0.0
 
     file = press_policy(task.parent, task, Lost(), "lost.pt")
-    with pytest.raises(PolicyError, match="lost.pt: at control step 0 this policy returns .* expected finite actions"):
+    with pytest.raises(PolicyError, match=r"lost.pt: at control step 0 this policy returns .* expected finite actions"):
         next(Deployment(task, file).steps())

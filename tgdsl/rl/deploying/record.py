@@ -18,7 +18,7 @@ from tgdsl.rl.deploying.prepared import Prepared
 class DeployRecord:
     """Keeps control steps and writes them.
 
-    The file holds, of each control step, its `episode` and `index` in it (step,), the observations `obs:<group>` (step, feature)
+    The file holds, of each control step, its `episode` and `index` in it (step,), observations `obs:<group>` (step, feature)
     that the action was chosen from, the `action` (step, joint) from −1 to 1, the `target` (step, joint) [rad], `age` and
     `inference` (step,) [s], and the `score` so far (step,); an age and a score that are not known are NaN. `joints` names the
     joints.
