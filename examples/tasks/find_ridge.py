@@ -37,7 +37,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.fields.models import Position, PositiveLength, Quantity, Range, RangeOf, SpecModel
 from tgdsl.rl import rotations, terms
 from tgdsl.rl.spec import RandomSpec, TaskSpec, Weight
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.task import HandNow, Now, Setup, Start, Task
 from tgdsl.runtime.simulators.watch import Watch
 
 ACROSS = 1
@@ -124,12 +124,18 @@ def reference(spec: FindRidgeSpec, record: Mapping[str, np.ndarray], dt: float) 
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
+def command(now: Now | HandNow, left: Float[Tensor, " env"]) -> Float[Tensor, "env feature"]:
+    """Return targets [rad], the last action and the share of the episode that is left."""
+    return torch.cat([now.target, now.action, left[:, None]], dim=1)
+
+
 class FindRidge(Task[FindRidgeSpec]):
     """The task."""
 
     Spec = FindRidgeSpec
     senses = ("link_contact",)
     score_unit = "found"
+    hand_groups = ("command",)
 
     def __init__(self, spec: FindRidgeSpec, setup: Setup):
         """Begin with the ridge where the scene has it.
@@ -183,7 +189,13 @@ class FindRidge(Task[FindRidgeSpec]):
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what was commanded, and what is privileged of the ridge."""
         left = 1.0 - self.elapsed / self.num_steps
-        return {"command": torch.cat([now.target, now.action, left[:, None]], dim=1), "priv_ridge": self._motion(now)}
+        return {"command": command(now, left), "priv_ridge": self._motion(now)}
+
+    @classmethod
+    def observe_hand(cls, spec: FindRidgeSpec, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what was commanded."""
+        left = 1.0 - now.steps / max(1, round(spec.episode / now.control_step))
+        return {"command": command(now, torch.full((len(now.target),), left, dtype=now.target.dtype))}
 
     def score(self) -> Float[Tensor, " env"]:
         """Return whether it rests."""

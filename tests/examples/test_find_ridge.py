@@ -12,6 +12,7 @@ from scipy.stats import binomtest
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
+from tgdsl.rl.task import HandNow
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 sys.path.append(str(EXAMPLES))  # as `python examples/learn.py` has it
@@ -220,3 +221,13 @@ def test_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path):
 def test_without_touch_nothing_but_chance_is_learned(tmp_path):
     result = run("blind", 50, tmp_path)
     assert result.interval[0] < 1.5 * result.chance
+
+
+def test_a_hand_is_told_what_the_scene_tells(make):
+    """The command follows from targets, actions and time alone."""
+    env, generator = make(2), torch.Generator().manual_seed(0)
+    for i in range(3):
+        made = env.step(2 * torch.rand((2, env.num_actions), generator=generator) - 1)
+        now = env.now
+        known = HandNow(now.joint_pos, now.joint_vel, now.target, now.action, i + 1, env.control_step, now.target[:, :0])
+        assert torch.equal(OWN.FindRidge.observe_hand(env.spec, known)["command"].float(), made.obs["command"])

@@ -3,11 +3,13 @@
 import math
 
 import jaxtyping
+import numpy as np
 import pytest
 import torch
 from tiny_tasks import RADIUS, taxel_world, tiny_env
 
 from tgdsl.errors import SimulationError
+from tgdsl.runtime.xhand1.velocity import VelocityFilter
 
 STEPS = 12
 RANDOM = """randomise:
@@ -234,8 +236,9 @@ def test_as_many_environments_in_two_processes(make):
             torch.testing.assert_close(torch.cat([part[name] for part in parts]), value, rtol=1e-5, atol=1e-6)
 
 
-def test_stop_and_go_on_is_bit_for_bit(make):
-    more = NOISY + RANDOM + "episode: 0.2 s\n"
+@pytest.mark.parametrize("joint_vel", ["exact", "measured"])
+def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
+    more = NOISY + RANDOM + f"episode: 0.2 s\njoint_vel: {joint_vel}\n"
     env, other = make(more=more, seed=1), make(more=more, seed=9)
     for action in actions(env, 5):
         env.step(action)
@@ -250,6 +253,24 @@ def test_stop_and_go_on_is_bit_for_bit(make):
         assert torch.equal(made.info.episode_return, before.info.episode_return)
     with pytest.raises(SimulationError, match="of other environments"):
         make(5, more=more).load_state_dict(saved)
+
+
+def test_measured_velocities_are_those_of_a_hands_driver(make):
+    """Of positions at each control step, at rest at the start of each episode; privileged ones stay exact."""
+    env = make(more=RANDOM + "episode: 0.2 s\njoint_vel: measured\n")
+    filters, times = [VelocityFilter(0.02) for _ in range(4)], np.zeros(4)
+    obs = env.reset(seed=3)
+    for action in [None, *actions(env, 2 * STEPS - 3)]:
+        if action is not None:
+            made = env.step(action)
+            obs, times = made.obs, times + env.control_step
+            for i in np.flatnonzero(made.info.ended):
+                filters[i].reset()
+        for i, (own, time) in enumerate(zip(filters, times, strict=True)):
+            expected = own.update(float(time), obs["proprio"][i, :2].double().numpy())
+            np.testing.assert_allclose(obs["proprio"][i, 2:4], expected, rtol=1e-5, atol=1e-6)
+    exact = env.now.joint_vel.float()
+    assert torch.equal(obs["priv_proprio"][:, 2:4], exact) and (exact - obs["proprio"][:, 2:4]).abs().max() > 0.01
 
 
 def test_what_is_drawn_is_what_physics_has(make):

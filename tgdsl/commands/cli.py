@@ -19,6 +19,7 @@ from tgdsl.commands.grasps import Grasps
 from tgdsl.commands.hand.hand import Hand
 from tgdsl.commands.import_ import Import
 from tgdsl.commands.layout.layout import Layout
+from tgdsl.commands.learning.deploy import Deploy
 from tgdsl.commands.learning.distill import Distill
 from tgdsl.commands.learning.evaluate import Evaluate
 from tgdsl.commands.learning.sweep import Sweep
@@ -44,6 +45,7 @@ Command = (
     | Annotated[Distill, tyro.conf.subcommand("distill")]
     | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Deploy, tyro.conf.subcommand("deploy")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Links, tyro.conf.subcommand("links")]
     | Annotated[Layout, tyro.conf.subcommand("layout")]

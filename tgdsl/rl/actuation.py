@@ -289,7 +289,20 @@ class Actuation:
         else:
             wanted = torch.minimum(torch.maximum(self.target + self._scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
-        self.target.copy_(torch.where(action.isfinite(), wanted, self.target))
+        self._take(torch.where(action.isfinite(), wanted, self.target))
+
+    def follow(self, control: Float[Tensor, "env actuator"]) -> None:
+        """Take set-points that come from elsewhere, such as a hand's line, in place of actions; those of other joints too.
+
+        Args:
+            control: Set-points of all actuators of the model [rad].
+        """
+        self._arrays["ctrl"].copy_(control)
+        self._take(control.index_select(1, self._index["actuator"]).to(self.target))
+
+    def _take(self, target: Float[Tensor, "env joint"]) -> None:
+        """Take new targets, of which the drives know once they arrive."""
+        self.target.copy_(target)
         self._past.copy_(torch.cat([self.target[None], self._past[:-1]]))
         if self.is_ideal:
             self._arrays["ctrl"][:, self._index["actuator"]] = self._arrived()

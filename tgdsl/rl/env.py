@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,11 +24,11 @@ from tgdsl.errors import LowerError, SimulationError
 from tgdsl.rl import groups, saving
 from tgdsl.rl.actuation import Actuation
 from tgdsl.rl.draws import Draws
-from tgdsl.rl.episodes import Episodes
+from tgdsl.rl.episodes import Episodes, Observations, Step, StepInfo
 from tgdsl.rl.grasps.load import with_grasps
 from tgdsl.rl.load import LoadedTask, load_task
 from tgdsl.rl.pushes import Pushes
-from tgdsl.rl.sensed import Felt, compile_sensed
+from tgdsl.rl.sensed import Felt, Sensed, compile_sensed
 from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_of
 from tgdsl.rl.task import Now
 from tgdsl.tensors.env_ids import may_hold
@@ -37,49 +37,6 @@ from tgdsl.tensors.torch_internals import below_autograd
 
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
-Observations = dict[str, Float[Tensor, "env feature"]]
-
-
-class StepInfo(NamedTuple):
-    """What else a step tells. Rows of what is of an episode are of that which has just ended, where one has.
-
-    Attributes:
-        ended: Episodes that have ended, terminated or truncated.
-        final_obs: Observations before the reset; other than those that the step returns where an episode has ended.
-        terms: Terms of the reward of this step by name, weights and Δt included.
-        score: Score of the episode, in `task.score_unit`.
-        episode_return: Sum of its rewards.
-        episode_steps: Its control steps.
-        episode_terms: Sums of its terms by name.
-        faults: Environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0.
-    """
-
-    ended: Bool[Tensor, " env"]
-    final_obs: Observations
-    terms: dict[str, Float[Tensor, " env"]]
-    score: Float[Tensor, " env"]
-    episode_return: Float[Tensor, " env"]
-    episode_steps: Int[Tensor, " env"]
-    episode_terms: dict[str, Float[Tensor, " env"]]
-    faults: Bool[Tensor, " env"]
-
-
-class Step(NamedTuple):
-    """What a step returns.
-
-    Attributes:
-        obs: Observations by group; of episodes that have ended, the first of the next one.
-        reward: Sum of the terms.
-        terminated: Episodes that have ended for good.
-        truncated: Episodes that have merely lasted long enough.
-        info: What else there is to tell.
-    """
-
-    obs: Observations
-    reward: Float[Tensor, " env"]
-    terminated: Bool[Tensor, " env"]
-    truncated: Bool[Tensor, " env"]
-    info: StepInfo
 
 
 class TouchEnv:
@@ -113,6 +70,7 @@ class TouchEnv:
         compiled: bool | None = None,
         first_env: int = 0,
         feels: Sequence[Felt] | None = None,
+        sensed: Sensed | None = None,
         progress: Progress | None = None,
     ):
         """Make the environments and begin an episode in each.
@@ -126,9 +84,10 @@ class TouchEnv:
             simulator: "mujoco" or "warp"; default: by the device. MuJoCo Warp on a CPU is slow, and meant for tests.
             threads: CPU threads of physics; 0: one per CPU.
             compiled: Whether the module, and all of a step but for physics, is compiled by torch; default: on a GPU.
-            first_env: Number of the first environment among those of all processes.
+            first_env: Number of the first environment among those of all processes: of it, random numbers and variants.
             feels: What several policies feel, each a group of observations `Felt.group`, in place of the document's `touch`,
                 `placement` and `noise`, and of `tactile_sensors`.
+            sensed: What `compile_sensed` made of the task, in place of the document's sensors; its module is taken as it is.
             progress: Is told in a line what is being done.
 
         Raises:
@@ -137,7 +96,7 @@ class TouchEnv:
         """
         chosen = simulator_of(device, simulator)
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
-        self.spec, sensed = loaded.spec, compile_sensed(loaded, device, progress, feels=feels)
+        self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
         is_cuda = self.touch.device.type == "cuda"
         is_compiled = is_cuda if compiled is None else compiled
@@ -145,9 +104,9 @@ class TouchEnv:
         if is_compiled:
             self.touch.compile(dynamic=not is_cuda)  # a GPU reads all environments each time, a CPU any number of them
         self._joints = moved_joints(loaded, sensed)
-        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads)
+        self.sim = make_simulation(loaded, sensed, self._joints, num_envs, device, chosen, threads, first_env)
         draws = Draws(seed, num_envs, self.sim.qpos.device, first_env, is_compiled=is_compiled)
-        setup = make_setup(loaded, sensed, self.sim, self._joints, draws)
+        setup = make_setup(loaded, sensed, self.sim, self._joints, draws, first_env)
         setup = with_grasps(setup, loaded, self.sim, self.touch.plan.scene, progress)
         try:
             self.task = loaded.task(self.spec, setup)
@@ -164,6 +123,8 @@ class TouchEnv:
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
+        is_measured = self.spec.joint_vel == "measured"
+        self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None
         self._commanded = FusedCall(self._command, is_compiled)
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
@@ -228,7 +189,9 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            self._obs = self._observe(self._now(self.sim.read()))
+            now = self._now(self.sim.read())
+            self._measure(now, everyone)
+            self._obs = self._observe(now)
             return dict(self._obs)
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
@@ -249,6 +212,25 @@ class TouchEnv:
             made = _copied(made) if self.device.type == "cuda" else made
         self._obs = made.obs
         return made._replace(obs=dict(made.obs))
+
+    def follow(self, control: Float[Tensor, "env nu"]) -> Step:
+        """Make one control step towards set-points that come from elsewhere, as over a hand's line; nobody acts.
+
+        Actions count as zeros. Episodes that end do not begin anew: call `reset`.
+
+        Args:
+            control: Set-points of all actuators, as their joints' positions [rad; slides: m].
+        """
+        with torch.inference_mode(False), torch.no_grad(), self._dispatch():
+            self.actuation.follow(control)
+            self.pushes.advance()
+            self.sim.step(self.sim.ctrl)
+            now = self._now(self.sim.read())
+            self._measure(now)
+            self.task.advance(now)
+            made = self._judged(now, self.sim.faults)
+        self._obs = made.obs
+        return made
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
@@ -295,7 +277,8 @@ class TouchEnv:
         """Return what is kept besides simulation and module: live tensors by part and name."""
         actions = {"used": self._used, "before": self._before}
         parts = {"episodes": self._episodes, "actuation": self.actuation, "pushes": self.pushes}
-        return {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+        kept = {part: own.memory() for part, own in parts.items()} | {"task": self.task.memory, "actions": actions}
+        return kept | ({"speeds": self._speeds.memory()} if self._speeds else {})
 
     def _prepare(self, tell: Progress, is_compiled: bool) -> None:
         """Have kernels compiled and, on a GPU, the step captured, by steps that count for nothing."""
@@ -319,11 +302,13 @@ class TouchEnv:
         self._before.copy_(self._used)
         sim.step(self._commanded(self._action, sim.ctrl))
         now = self._now(sim.read())
+        self._measure(now)
         self.task.advance(now)
         made = self._judged(now, sim.faults)
         if may_hold(made.info.ended):
             self._begin(made.info.ended)
             now = self._now(sim.read(made.info.ended))
+            self._measure(now, made.info.ended)
             made = made._replace(obs=self._observed(now))
         return made
 
@@ -335,6 +320,13 @@ class TouchEnv:
         self._used.copy_(torch.where(is_bad[:, None], 0.0, action).clamp(-1.0, 1.0))
         self.pushes.advance()
         return torch.where(is_bad[:, None], torch.nan, ctrl)
+
+    def _measure(self, now: Now, begun: Bool[Tensor, " env"] | None = None) -> None:
+        """Take note of where joints are, for velocities that are measured; of some environments at the start of an episode."""
+        if self._speeds and begun is None:
+            self._speeds.update(now.joint_pos)
+        elif self._speeds and begun is not None:
+            self._speeds.begin(begun, now.joint_pos)
 
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
@@ -386,8 +378,9 @@ class TouchEnv:
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""
         felt = self._sensed.observe(now.readings)
-        proprio = groups.proprio(now)
-        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, proprio)} | self.task.observe(now)
+        exact = groups.proprio(now)
+        proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
+        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)} | self.task.observe(now)
         return {name: value.to(self.device, torch.float32) for name, value in own.items()}
 
 

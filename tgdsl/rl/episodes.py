@@ -1,9 +1,11 @@
 """The episodes of all environments: how they begin, how long they have lasted, and what they have brought.
 
-Shapes: `env` environments.
+Shapes: `env` environments, `feature` numbers of a group.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +22,50 @@ from tgdsl.tensors.fused import FusedCall
 
 REST = {"friction": ONE, "mass": ZERO}
 """What of an object can be random, and the ranges in which it is not."""
+
+Observations = dict[str, Float[Tensor, "env feature"]]
+
+
+class StepInfo(NamedTuple):
+    """What else a step tells. Rows of what is of an episode are of that which has just ended, where one has.
+
+    Attributes:
+        ended: Episodes that have ended, terminated or truncated.
+        final_obs: Observations before the reset; other than those that the step returns where an episode has ended.
+        terms: Terms of the reward of this step by name, weights and Δt included.
+        score: Score of the episode, in `task.score_unit`.
+        episode_return: Sum of its rewards.
+        episode_steps: Its control steps.
+        episode_terms: Sums of its terms by name.
+        faults: Environments that have diverged, or whose actions were not finite: their episodes end, with a reward of 0.
+    """
+
+    ended: Bool[Tensor, " env"]
+    final_obs: Observations
+    terms: dict[str, Float[Tensor, " env"]]
+    score: Float[Tensor, " env"]
+    episode_return: Float[Tensor, " env"]
+    episode_steps: Int[Tensor, " env"]
+    episode_terms: dict[str, Float[Tensor, " env"]]
+    faults: Bool[Tensor, " env"]
+
+
+class Step(NamedTuple):
+    """What a step returns.
+
+    Attributes:
+        obs: Observations by group; of episodes that have ended, the first of the next one.
+        reward: Sum of the terms.
+        terminated: Episodes that have ended for good.
+        truncated: Episodes that have merely lasted long enough.
+        info: What else there is to tell.
+    """
+
+    obs: Observations
+    reward: Float[Tensor, " env"]
+    terminated: Bool[Tensor, " env"]
+    truncated: Bool[Tensor, " env"]
+    info: StepInfo
 
 
 class Episodes:

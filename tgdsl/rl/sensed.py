@@ -103,6 +103,7 @@ def compile_sensed(
     progress: Progress | None = None,
     only: Sequence[str] | None = None,
     feels: Sequence[Felt] | None = None,
+    also: Mapping[str, Sequence[Mapping[str, Any]]] | None = None,
 ) -> Sensed:
     """Compile what a task's environments feel.
 
@@ -112,6 +113,7 @@ def compile_sensed(
         progress: Is told in a line what is being done.
         only: Kinds of sensors that are taken instead of those that the policy feels and the task looks at.
         feels: What policies feel, in place of the document's `touch`, `placement` and `noise`.
+        also: Groups of observations that the module has besides, as a document has them: `{"q": [{"type": "joint_pos"}]}`.
 
     Raises:
         SpecError: If the sensors' document lacks a sensor or the object, at the place in the task's document; or all mistakes
@@ -137,6 +139,7 @@ def compile_sensed(
         felt = _sensor_of(loaded, kinds, kind, ("touch",))
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
+    overrides["observations"] = {**overrides["observations"], **(also or {})}
     contact = by_kind.get("link_contact")
     if contact:
         own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]

@@ -129,6 +129,9 @@ class TaskSpec(SpecModel):
     """Links that feel: a link group of the layout."""
     resolution: str | None = None
     """How densely, as the layout has it; default: as the sensors' document says."""
+    joint_vel: Literal["exact", "measured"] = "exact"
+    """What velocities `proprio` has: those of the simulation, or what a hand makes of the positions that it reports at each
+    control step, by differences through a low-pass filter of 20 ms; `priv_proprio` always has the former."""
     noise: str = "clean"
     """A noise profile of the sensors' document, or the built-in `clean` or `noisy`."""
     action: ActionSpec = ActionSpec()

@@ -52,7 +52,14 @@ def moved_joints(loaded: LoadedTask, sensed: Sensed) -> tuple[str, ...]:
 
 
 def make_simulation(
-    loaded: LoadedTask, sensed: Sensed, joints: tuple[str, ...], num_envs: int, device: str, simulator: str, threads: int = 0
+    loaded: LoadedTask,
+    sensed: Sensed,
+    joints: tuple[str, ...],
+    num_envs: int,
+    device: str,
+    simulator: str,
+    threads: int = 0,
+    first_env: int = 0,
 ) -> EnvSimulation:
     """Simulate the task's scene; environments with faults wait for a reset.
 
@@ -64,6 +71,7 @@ def make_simulation(
         device: As for `tgdsl.simulate`.
         simulator: "mujoco" or "warp".
         threads: CPU threads; 0: one per CPU.
+        first_env: Number of the first environment among those of all processes.
 
     Raises:
         SimulationError: If the scene cannot be simulated as the document says.
@@ -73,7 +81,7 @@ def make_simulation(
     watch = Watch(
         bodies=tuple(dict.fromkeys((sensed.object, *own.bodies))),
         sites=own.sites,
-        joints=tuple(dict.fromkeys((*joints, *own.joints))),
+        joints=tuple(dict.fromkeys((*joints, *own.joints, *sensed.touch.inputs.joints))),
         actuators=own.actuators,
         pairs=own.pairs,
     )
@@ -83,8 +91,13 @@ def make_simulation(
     given |= {"watch": watch, "on_fault": "note"}
     if simulator == "warp":
         capacities: dict[str, Any] = dict(spec.physics.capacities)
-        return WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **(given | capacities))
-    return BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
+        sim = WarpSimulation(sensed.touch, num_envs, device=device, per_env=per_env, **(given | capacities))
+    else:
+        sim = BatchSimulation(sensed.touch, num_envs, threads=threads, **given)
+    num_variants = _num_variants(sensed, spec.object)
+    if first_env % num_variants:
+        sim.set_objects({spec.object: (np.arange(num_envs) + first_env) % num_variants})
+    return sim
 
 
 def simulator_of(device: str, simulator: str | None) -> str:
@@ -102,7 +115,9 @@ def simulator_of(device: str, simulator: str | None) -> str:
     return chosen
 
 
-def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: tuple[str, ...], draws: Draws) -> Setup:
+def make_setup(
+    loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: tuple[str, ...], draws: Draws, first_env: int = 0
+) -> Setup:
     """Return what the task is told of its simulation.
 
     Raises:
@@ -126,7 +141,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
         links=tuple(rows),
         qpos=sim.qpos[0].clone(),
         half_height=_half_heights(sim, sensed, loaded.spec.object),
-        variant=(torch.arange(sim.num_envs) % num_variants).to(sim.qpos.device),
+        variant=((torch.arange(sim.num_envs) + first_env) % num_variants).to(sim.qpos.device),
         num_variants=num_variants,
         friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
         mass=sim.properties.mass(sensed.object).to(sim.qpos).clone(),
@@ -136,7 +151,7 @@ def make_setup(loaded: LoadedTask, sensed: Sensed, sim: EnvSimulation, joints: t
 
 
 def _num_variants(sensed: Sensed, name: str) -> int:
-    """Return how many variants an object has; environment i has variant i modulo their number."""
+    """Return how many variants an object has; environment i of all processes has variant i modulo their number."""
     inputs = sensed.touch.inputs
     return inputs.num_variants[inputs.objects.index(name)] if name in inputs.objects else 1
 

@@ -122,6 +122,29 @@ class Now:
     readings: Mapping[str, Tensor]
 
 
+@dataclass(frozen=True, eq=False)
+class HandNow:
+    """One instant of a hand that acts without a scene: what is known of it, and what it is asked for.
+
+    Attributes:
+        joint_pos: Positions of the joints that the policy moves [rad].
+        joint_vel: Their velocities [rad/s].
+        target: What their drives are to reach, after the last action [rad].
+        action: What the policy has asked for last, from −1 to 1; zero at the start of an episode.
+        steps: Control steps since the start of the episode.
+        control_step: Duration of a control step Δt [s].
+        goal: What it is asked for, as `Task.asked` has it.
+    """
+
+    joint_pos: Float[Tensor, "env joint"]
+    joint_vel: Float[Tensor, "env joint"]
+    target: Float[Tensor, "env joint"]
+    action: Float[Tensor, "env joint"]
+    steps: int
+    control_step: float
+    goal: Float[Tensor, "env goal"]
+
+
 class Start(NamedTuple):
     """How episodes begin.
 
@@ -144,6 +167,9 @@ class Task(ABC, Generic[S]):
         wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
         score_unit: Unit of its score.
         is_less_better: Whether its score is an error.
+        hand_groups: Groups of its own that `observe_hand` makes without a scene; of policies that see no others, hands can have
+            some.
+        goal_units: Units of the numbers of a goal that a user may give, such as ("N",); none: nothing can be asked for.
         spec: Its document.
         setup: What it is made for.
         memory: Its own state, (env, …) each, kept by `state_dict`.
@@ -154,6 +180,8 @@ class Task(ABC, Generic[S]):
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]
     is_less_better: ClassVar[bool] = False
+    hand_groups: ClassVar[tuple[str, ...]] = ()
+    goal_units: ClassVar[tuple[str, ...]] = ()
     spec: S
     setup: Setup
     memory: dict[str, Tensor]
@@ -211,6 +239,24 @@ class Task(ABC, Generic[S]):
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""
+        return {}
+
+    @classmethod
+    def asked_for(cls, spec: S, goal: tuple[float, ...]) -> S:
+        """Return the document in which just this goal is asked for, of as many numbers as there are `goal_units`.
+
+        Raises:
+            LowerError: If it is not one that the document can ask for.
+        """
+        return spec
+
+    def asked(self) -> Float[Tensor, "env goal"]:
+        """Return what is asked for now, in `goal_units`; by default nothing."""
+        return torch.zeros((self.setup.num_envs, 0), dtype=self.setup.dtype, device=self.setup.device)
+
+    @classmethod
+    def observe_hand(cls, spec: S, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return `hand_groups` as `observe` does, without a scene: of what is known of a hand, and what it is asked for."""
         return {}
 
     @abstractmethod

@@ -11,6 +11,7 @@ from tgdsl.module.taxels.identity import Taxels, check_taxels
 from tgdsl.runtime.connection import Connection as Connection
 from tgdsl.runtime.known import known_sources
 from tgdsl.runtime.source_kind import SourceKind
+from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
@@ -32,6 +33,7 @@ def connect(
     timing: SerialTiming | None = None,
     lockstep: bool = False,
     taxels: Taxels | None = None,
+    scene: SteppedScene | None = None,
     **own: Any,
 ) -> Connection:
     """Connect a module to what it shall feel.
@@ -53,6 +55,8 @@ def connect(
             simulation is always so, a real hand never.
         taxels: The taxels that the module shall have, such as those that a policy learned with: another module, its tables, an
             artefact, a rollout or an id, see `module.taxels.identity.check_taxels`.
+        scene: A scene of one's own, such as a task's, that a simulation or an emulator steps in place of the module's; it is
+            closed with the connection, and brings its own start in place of the keyframe.
         **own: Options of this kind of source alone, such as the `nconmax` and `njmax` of `warp`. Those above are left out
             where a source has no use for them, so that one script serves all.
 
@@ -65,20 +69,20 @@ def connect(
         TgdslError: If there is no such source, or it has no such option.
     """
     name = str(source)
-    kind = _kind_of(name)
+    kind = kind_of(name)
     if taxels is not None:
         check_taxels(touch, taxels)
     if num_envs != 1 and "num_envs" not in kind.options:
         raise TgdslError(f'num_envs is {num_envs}, but "{name}" is one environment')
     shared: dict[str, Any] = {"num_envs": num_envs, "control_step": control_step, "keyframe": keyframe, "motion": motion}
-    shared |= {"calibration": calibration, "addresses": addresses, "timing": timing, "lockstep": lockstep}
+    shared |= {"calibration": calibration, "addresses": addresses, "timing": timing, "lockstep": lockstep, "scene": scene}
     for option in own:
         if option not in kind.options:
             raise TgdslError(f'"{name}" has no option "{option}"; {did_you_mean(option, kind.options, "options")}')
     return kind.open(touch, name, **{option: shared[option] for option in kind.options if option in shared}, **own)
 
 
-def _kind_of(source: str) -> SourceKind:
+def kind_of(source: str) -> SourceKind:
     """Return the kind of the source that a user named.
 
     Raises:

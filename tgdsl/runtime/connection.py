@@ -62,6 +62,11 @@ class Connection(ABC):
         """Whether a log is at its end; other sources never are."""
         return False
 
+    @property
+    def age_s(self) -> float | None:
+        """How old what `observe` returns is at most, now [s]; None where nothing runs in real time."""
+        return None
+
     def step(self, control: Control = None) -> None:
         """Advance by one control step.
 

@@ -169,6 +169,27 @@ def test_memory_ends_with_episodes(make):
         torch.testing.assert_close(own.memory, expected, rtol=FORWARD, atol=FORWARD)
 
 
+@pytest.mark.parametrize(("aggregate", "kind"), [(1, "mlp"), (3, "mlp"), (3, "lstm")])
+def test_passes_go_through_rollouts_that_are_kept(make, aggregate, kind):
+    """The first through the latest one; the others through any of the last, with what was said and remembered in it."""
+    found, rollouts, passes = make(aggregate=aggregate, epochs=12, networks__touch_kind=kind), [], []
+    learned = found._learned
+
+    def noted():
+        return [value.clone() for value in found._of_rollout()]
+
+    found._learned = lambda: (passes.append(noted()), learned())
+    for _ in range(5):
+        found.roll()
+        rollouts.append(noted())
+        passes.clear()
+        found.learn()
+        which = [[all(map(torch.equal, own, seen)) for own in rollouts].index(True) for seen in passes]
+        assert which[0] == len(rollouts) - 1 and len(which) == 12
+        assert set(which) == set(range(max(0, len(rollouts) - aggregate), len(rollouts)))
+        assert all(map(torch.equal, noted(), rollouts[-1]))
+
+
 @pytest.mark.parametrize("kind", ["mlp", "convrnn"])
 def test_to_stop_and_go_on_is_to_go_on(make, tmp_path, kind):
     """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes anew."""

@@ -170,3 +170,24 @@ def test_what_is_saved_goes_on_to_the_bit(kind):
         assert torch.equal(value, other.parameters[name])
     with pytest.raises(RuntimeError, match="its networks are"):
         other.load_state_dict(Stack(architecture("mlp", ()), SEEDS, 1e-2, 0.1).state_dict())
+
+
+def test_what_goes_on_at_another_rate_learns_at_it():
+    """Adam's step is the rate times the same moments."""
+    before = Stack(architecture("mlp"), SEEDS, 1e-2, None, dtype=torch.float64)
+    x, memory = inputs(before, 6, torch.float64)
+
+    def descend(stack):
+        made = stack(x, memory)
+        stack.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+
+    for _ in range(3):
+        descend(before)
+    moved = []
+    for rate in (1e-2, 1e-4):
+        after = Stack(architecture("mlp"), SEEDS, rate, None, dtype=torch.float64)
+        after.load_state_dict(copy.deepcopy(before.state_dict()))
+        descend(after)
+        moved.append([after.parameters[name].detach() - value.detach() for name, value in before.parameters.items()])
+    for fast, slow in zip(*moved, strict=True):
+        torch.testing.assert_close(slow, 1e-2 * fast, rtol=1e-8, atol=1e-16)

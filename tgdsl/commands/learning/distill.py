@@ -93,7 +93,7 @@ class Distill:
             rows += own
         if rows:
             write_table(rows, folder / "table.csv")
-            print(f"{shown(rows, unit)}\ntable: {folder / 'table.csv'}")
+            print(f"{shown(rows, unit, loaded.task.is_less_better)}\ntable: {folder / 'table.csv'}")
 
     def _check(self) -> None:
         for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0), ("seeds", 1)):

@@ -23,6 +23,7 @@ from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.sensed import GROUP
+from tgdsl.rl.spec import TaskSpec
 
 ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 """Groups that a policy sees unless others are named: of these, those that there are."""
@@ -136,6 +137,28 @@ def card_of(file: Path) -> dict[str, Any] | None:
         PolicyError: If the policy cannot be read.
     """
     return _read(file, "cpu")[1]
+
+
+def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
+    """See that a policy was learned in a task, with its actions and control steps.
+
+    Args:
+        card: The policy's card.
+        file: Its file, for errors.
+        spec: The task's document.
+        who: What errors call it.
+
+    Raises:
+        PolicyError: If not.
+    """
+    theirs, ours = card["spec"], spec.model_dump(mode="json")
+    if theirs["task"] != ours["task"]:
+        raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
+    steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
+    for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
+        if before != now:
+            texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
+            raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
 
 
 def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxels: str) -> None:

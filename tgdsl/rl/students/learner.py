@@ -8,6 +8,8 @@ Shapes: `env` environments, `student` students of a stack, `row` environments of
 
 from __future__ import annotations
 
+import random
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -109,8 +111,14 @@ class Distiller:
     def learn(self) -> None:
         """Learn from the rollout; likewise."""
         self._losses.zero_()
-        for _ in range(self._spec.epochs):
+        if self._spec.aggregate > 1:
+            self._gathered.append([value.clone() for value in self._of_rollout()])
+        for i in range(self._spec.epochs):
+            if i and self._gathered:
+                copy_each(self._of_rollout(), self._gathered[self._chance.randrange(len(self._gathered))])
             self._learned()
+        if self._gathered:
+            copy_each(self._of_rollout(), self._gathered[-1])
         self._looked()
         self.iteration += 1
         self.samples += self._spec.steps * self.env.num_envs
@@ -235,6 +243,8 @@ class Distiller:
         self._chosen = Captured(self._choose, device, has_tf32)
         self._learned = Captured(self._epoch, device, has_tf32)
         self._looked = Captured(self._look, device)
+        self._gathered: deque[list[Tensor]] = deque(maxlen=spec.aggregate)
+        self._chance = random.Random(0)
         self._clock, self._tally, self._is_begun = Clock(device), EpisodeTally(), False
 
     def _begin(self) -> dict[str, Tensor]:
@@ -243,6 +253,11 @@ class Distiller:
             self.go_on_from(self.env.reset())
             self.env.steps.copy_(torch.randint_like(self.env.steps, self.env.max_steps))
         return self._obs
+
+    def _of_rollout(self) -> list[Tensor]:
+        """Return what a pass reads of a rollout: live tensors."""
+        own = [value for each in self.rollouts for value in (each.x, each.before, each.begun)]
+        return [*own, self._labels, self._privileged, self._ended]
 
     def _see(self, obs: Mapping[str, Tensor]) -> None:
         copy_each(list(self._seen.values()), [obs[name] for name in self._seen])

@@ -109,10 +109,10 @@ def write_table(rows: Sequence[Row], file: Path) -> None:
     atomic_write(file, text.getvalue().encode())
 
 
-def shown(rows: Sequence[Row], unit: str) -> str:
+def shown(rows: Sequence[Row], unit: str, is_less_better: bool = False) -> str:
     """Return rows as a table for people, the best first."""
     cells = []
-    for row in sorted(rows, key=lambda own: -own.score):
+    for row in sorted(rows, key=lambda own: own.score if is_less_better else -own.score):
         place = " ".join(part for part in (row.placement, row.resolution, row.noise) if part)
         bounds = f"{row.low:.3f} to {row.high:.3f}" if math.isfinite(row.low) else "–"
         cells.append((row.type, place, f"{row.seeds}", f"{row.score:.3f}", bounds, f"{row.held:.1%}", f"{row.samples:,}"))

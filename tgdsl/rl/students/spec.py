@@ -78,6 +78,10 @@ class DistillSpec(SpecModel):
     """Control steps of a gradient step, through which recurrent networks are differentiated."""
     epochs: Whole = 5
     """How often an update goes through its rollout."""
+    aggregate: Whole = 1
+    """Rollouts that updates learn from, the latest and those before it: a first pass goes through the latest one, each other
+    one through one of them at random, as DAgger's set is of all that was seen; 1: the latest alone. A run that goes on begins
+    to gather them anew."""
     learning_rate: Positive = 1e-4
     """Learning rate."""
     max_grad_norm: Positive | None = 2.0

@@ -54,7 +54,8 @@ class Stack:
             device: Where they are.
             dtype: Their dtype.
         """
-        self.architecture, self.size, self._max_norm = architecture, len(seeds), max_grad_norm
+        self.architecture, self.size = architecture, len(seeds)
+        self._max_norm, self._rate = max_grad_norm, learning_rate
         students = [made(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
@@ -109,7 +110,7 @@ class Stack:
         return {"networks": networks, "seen": kept | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved.
+        """Go on from what was saved, with the learning rate that the stack was made with.
 
         Raises:
             RuntimeError: If it is of other networks.
@@ -127,8 +128,8 @@ class Stack:
                 for name, value in own[part].items():
                     value.copy_(state[part][name])
         self.optimiser.load_state_dict(dict(state["optimiser"]))
-        for group in self.optimiser.param_groups:  # it may have been saved on another device
-            group |= {"capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+        for group in self.optimiser.param_groups:  # it may have been saved on another device, and at another rate
+            group |= {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
 
     def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))

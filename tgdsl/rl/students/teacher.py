@@ -5,10 +5,8 @@ Shapes: `env` environments, `joint` joints that the policy moves.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,7 +14,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.policy import Policy, PolicyError, card_of, check_card
+from tgdsl.rl.playing.policy import Policy, PolicyError, card_of, check_card, check_learned
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 
 WARM_CALLS = 3
@@ -43,13 +41,8 @@ class Teacher:
         card = card_of(file)
         if card is None or "spec" not in card:
             raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
+        check_learned(card, file, loaded.spec, "teacher")
         self.card, theirs, ours = card, card["spec"], loaded.spec.model_dump(mode="json")
-        if theirs["task"] != ours["task"]:
-            raise PolicyError(f'{file}: this teacher was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
-        steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
-        for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
-            if before != now:
-                raise PolicyError(f"{file}: this teacher was learned with other {name}: {_text(before)}, here {_text(now)}")
         self.felt = Felt(theirs["touch"], theirs["placement"], theirs["noise"]) if GROUP in card["groups"] else None
         if self.felt and theirs["resolution"] != ours["resolution"]:
             found, wanted = theirs["resolution"], ours["resolution"]
@@ -120,7 +113,3 @@ def own_task(loaded: LoadedTask, felt: Felt | None) -> LoadedTask:
     chosen = {"touch": "none"} if felt is None else {"touch": felt.type, "placement": felt.placement, "noise": felt.noise}
     spec = loaded.spec.model_copy(update=chosen)
     return LoadedTask(spec, loaded.task, loaded.source, loaded.folder)
-
-
-def _text(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)

@@ -63,7 +63,7 @@ from tgdsl.fields.models import Positive, PositiveLength, Quantity, Range, Range
 from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.draws import whole
 from tgdsl.rl.spec import TaskSpec, Time, Weight
-from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.task import HandNow, Now, Setup, Start, Task
 from tgdsl.rl.tasks.placing import object_qpos
 from tgdsl.runtime.simulators.model_ids import keyframe_id
 from tgdsl.tensors.env_ids import may_hold
@@ -166,6 +166,25 @@ class GripForce(Task[GripForceSpec]):
     wants_normal_force = True
     score_unit = "RMS of force error over command"
     is_less_better = True
+    hand_groups = ("goal",)
+    goal_units = ("N",)
+
+    @classmethod
+    def asked_for(cls, spec: GripForceSpec, goal: tuple[float, ...]) -> GripForceSpec:
+        """Return the document in which every command is this force [N].
+
+        Raises:
+            LowerError: If it is beyond the document's forces.
+        """
+        low, high = spec.force
+        if not low <= goal[0] <= high:
+            raise LowerError(f"a force of {goal[0]:g} N", "force", f"expected {low:g} to {high:g} N")
+        return spec.model_copy(update={"force": (goal[0], goal[0])})
+
+    @classmethod
+    def observe_hand(cls, spec: GripForceSpec, now: HandNow) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the command."""
+        return {"goal": now.goal}
 
     def __init__(self, spec: GripForceSpec, setup: Setup):
         """Look up the keyframes.
@@ -237,10 +256,14 @@ class GripForce(Task[GripForceSpec]):
             "work": weights.work * terms.work(now),
         }
 
+    def asked(self) -> Float[Tensor, "env goal"]:
+        """Return the command [N]."""
+        return self.command[:, None]
+
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the command, and what is privileged of the force and the object."""
         return {
-            "goal": self.command[:, None],
+            "goal": self.asked(),
             "priv_force": torch.cat([now.normal_force.sum(dim=1, keepdim=True), now.normal_force], dim=1),
             "priv_obj_state": groups.object_state(now),
             "priv_obj_props": groups.object_props(now),

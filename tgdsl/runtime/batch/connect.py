@@ -13,6 +13,7 @@ from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.objects.properties import PER_ENV
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
+from tgdsl.runtime.stepped_scene import SceneConnection, SteppedScene, refuse_other_steps
 from tgdsl.scene.options import Options
 
 
@@ -51,19 +52,32 @@ def simulate_on_cpu(
     )
 
 
-def simulate_at(touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None) -> BatchSimulation:
+def simulate_at(
+    touch: TactileModule, num_envs: int, control_step: float, keyframe: str | None, watch: Watch | None = None
+) -> BatchSimulation:
     """Simulate the module's scene with control steps of some duration [s].
 
     Raises:
         SimulationError: If the scene cannot be stepped like this.
     """
-    sim = BatchSimulation(touch, num_envs, keyframe=keyframe, threads=0 if num_envs > 1 else 1)
+    sim = BatchSimulation(touch, num_envs, keyframe=keyframe, threads=0 if num_envs > 1 else 1, watch=watch)
     set_control_step(sim, control_step)
     return sim
 
 
-def _open(touch: TactileModule, source: str, *, num_envs: int, control_step: float, keyframe: str | None) -> Connection:
+def _open(
+    touch: TactileModule,
+    source: str,
+    *,
+    num_envs: int,
+    control_step: float,
+    keyframe: str | None,
+    scene: SteppedScene | None = None,
+) -> Connection:
     refuse_hand_only(touch)
+    if scene is not None:
+        refuse_other_steps(scene, control_step)
+        return SceneConnection(touch, scene)
     return SimulationConnection(touch, simulate_at(touch, num_envs, control_step, keyframe))
 
 

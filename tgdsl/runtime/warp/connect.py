@@ -11,6 +11,7 @@ from tgdsl.runtime.simulators.connect import SimulationConnection, refuse_hand_o
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.watch import Watch
 from tgdsl.runtime.source_kind import SimulatorKind
+from tgdsl.runtime.stepped_scene import SceneConnection, SteppedScene, refuse_other_steps
 from tgdsl.runtime.warp.simulation import WarpSimulation
 from tgdsl.scene.options import Options
 
@@ -59,10 +60,14 @@ def _open(
     num_envs: int,
     control_step: float,
     keyframe: str | None,
+    scene: SteppedScene | None = None,
     nconmax: int | None = None,
     njmax: int | None = None,
 ) -> Connection:
     refuse_hand_only(touch)
+    if scene is not None:
+        refuse_other_steps(scene, control_step)
+        return SceneConnection(touch, scene)
     device = source.partition(":")[2] or "cuda"
     sim = WarpSimulation(touch, num_envs, device=device, keyframe=keyframe, nconmax=nconmax, njmax=njmax)
     set_control_step(sim, control_step)

@@ -22,7 +22,7 @@ from tgdsl.runtime.xhand1.driver import XHand1
 from tgdsl.runtime.xhand1.fingertips import warn_of_noise
 from tgdsl.runtime.xhand1.motion import MotionLimits
 from tgdsl.runtime.xhand1.observe import HandObserver
-from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen
+from tgdsl.runtime.xhand1.source import HandSample, XHand1Source, is_chosen, refuse_beyond_watchdog
 from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.replies import Addresses
 from tgdsl.runtime.xhand1.wire.serial_port import list_ports
@@ -43,6 +43,11 @@ class HandSource(Source, Protocol):
 
     def sample(self) -> HandSample:
         """Return what the hand said at the end of the last step."""
+        ...
+
+    @property
+    def age_s(self) -> float | None:
+        """How old that is at most, now [s]; None where nothing runs in real time."""
         ...
 
     def resume(self) -> None:
@@ -71,6 +76,11 @@ class HandConnection(Connection):
     def is_over(self) -> bool:
         """Whether a log is at its end."""
         return self._hand.is_over
+
+    @property
+    def age_s(self) -> float | None:
+        """How old what the hand said is at most, now [s]."""
+        return self._hand.age_s
 
     def read(self) -> dict[str, Float[Tensor, "env feature"]]:
         """Observe what the hand said at the end of the last step."""
@@ -138,6 +148,20 @@ def given_calibration(calibration: Calibration | str | Path | None) -> Calibrati
     return load_calibration(Path(calibration)) if isinstance(calibration, (str, Path)) else calibration
 
 
+def refuse_unfit_steps(control_step: float, motion: MotionLimits | None, timing: SerialTiming | None) -> None:
+    """Refuse control steps that are shorter than an exchange on the line, or longer than the watchdog waits.
+
+    Raises:
+        HandError: If they are shorter.
+        MotionError: If they are longer.
+    """
+    shortest = (timing or SerialTiming()).exchange_s
+    if 0 < control_step < shortest:
+        what = f"control steps of {1e3 * control_step:g} ms ({1 / control_step:.0f} per second)"
+        raise HandError(f"{what}, and an exchange takes {1e3 * shortest:.2f} ms: at most {1 / shortest:.0f} per second")
+    refuse_beyond_watchdog(control_step, None if motion is None else motion.watchdog_s)
+
+
 def _open(
     touch: TactileModule,
     source: str,
@@ -155,6 +179,7 @@ def _open(
     port = source.partition(":")[2]
     observer = HandObserver(touch, known, control_step)
     targets = JointTargets(touch, motion, "the hand")
+    refuse_unfit_steps(control_step, motion, timing)
     warn_of_noise(touch.plan)
     with ExitStack() as opened:
         hand = opened.enter_context(XHand1.open(port or _only_port(), addresses, motion=motion, timing=timing))

@@ -117,9 +117,7 @@ class XHand1Source:
         """
         if not 0 < control_step < math.inf:
             raise HandError(f"a control step of {control_step:g} s, expected a finite time above 0")
-        if hand.watchdog_s is not None and control_step >= hand.watchdog_s:
-            what = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * hand.watchdog_s:g} ms"
-            raise MotionError(f"{what}; expected a shorter step")
+        refuse_beyond_watchdog(control_step, hand.watchdog_s)
         self.hand = hand
         self.calibration = calibration or Calibration.none()
         self._velocity = VelocityFilter(velocity_time_constant)
@@ -178,6 +176,11 @@ class XHand1Source:
             raise StaleReadingError("the last step or reset gave no reading; step or reset again")
         return self._sample
 
+    @property
+    def age_s(self) -> float | None:
+        """How old the sample is at most, now [s]."""
+        return self.sample().reading.age_s()
+
     def state(self) -> SceneState:
         """Refuse: a hand does not know where objects are, so no taxel reading can be computed from it.
 
@@ -225,6 +228,17 @@ class XHand1Source:
         while (reading := self.hand.read(self._read_timeout_s)).requested_at < requested_after:
             continue
         return HandSample.of(reading, self.calibration, self._velocity, self._timer.time_of(reading))
+
+
+def refuse_beyond_watchdog(control_step: float, watchdog_s: float | None) -> None:
+    """See that commands, one per control step, come before a watchdog bites.
+
+    Raises:
+        MotionError: If they do not.
+    """
+    if watchdog_s is not None and control_step >= watchdog_s:
+        what = f"a control step of {1e3 * control_step:g} ms, and the watchdog bites after {1e3 * watchdog_s:g} ms"
+        raise MotionError(f"{what}; expected a shorter step")
 
 
 def no_scene_state(who: str) -> StateError:

@@ -13,16 +13,14 @@ import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from tgdsl.errors import SimulationError
-from tgdsl.module.module import TactileModule
-from tgdsl.runtime.batch.simulation import BatchSimulation
+from tgdsl.runtime.stepped_scene import SteppedScene
 from tgdsl.runtime.xhand1.calibration import Calibration
 from tgdsl.runtime.xhand1.controls import JointControls
 from tgdsl.runtime.xhand1.emulator.body import TipForces, is_driven
 from tgdsl.runtime.xhand1.emulator.simulated_tips import SimulatedTips
+from tgdsl.runtime.xhand1.motion import joint_ids
 from tgdsl.runtime.xhand1.reader import Reading
 from tgdsl.runtime.xhand1.wire.payloads import FINGERS, FORCE_MAX, FORCE_MIN, NUM_JOINTS, NUM_TAXELS, PASSIVE, JointCommand
 
@@ -42,26 +40,23 @@ class SimulatedBody:
         failure: What ended `run`; None if nothing did.
     """
 
-    def __init__(self, touch: TactileModule, sim: BatchSimulation, tips: SimulatedTips, calibration: Calibration):
-        """Take a simulation.
+    def __init__(self, scene: SteppedScene, tips: SimulatedTips, calibration: Calibration):
+        """Take a scene.
 
         Args:
-            touch: The module that reads it; nobody else may call it.
-            sim: The simulation, of one environment.
+            scene: The scene, which watches the hand's joints; nobody else may step it.
             tips: What the fingertips feel.
             calibration: How forces become counts.
 
         Raises:
-            SimulationError: If it has more than one environment.
             MotionError: If the scene's actuators are not those of a hand.
         """
-        if sim.num_envs != 1:
-            raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
         self.num_late_s = 0.0
         self.clipped: set[str] = set()
         self.failure: Exception | None = None
-        self._touch, self._sim, self._tips, self._calibration = touch, sim, tips, calibration
-        self._controls = JointControls.of_model(sim.model)
+        self._scene, self._tips, self._calibration = scene, tips, calibration
+        self._controls = JointControls.of_model(scene.sim.model)
+        self._names = [scene.sim.model.joint(int(i)).name for i in joint_ids(scene.sim.model)]
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -77,18 +72,18 @@ class SimulatedBody:
     def command(self, time_s: float, joints: Sequence[JointCommand]) -> None:
         """Take set-points; a drive that is no longer driven holds where it is."""
         with self._lock:
-            position = self._position()
-            for i, joint in enumerate(joints):
-                if is_driven(joint):
-                    self._sim.batch.ctrl[0, self._controls.actuator_id[i]] = joint.position
-                elif is_driven(self._joints[i]):
-                    self._sim.batch.ctrl[0, self._controls.actuator_id[i]] = position[i]
+            setpoints = self._scene.sim.qpos[0].double().cpu().numpy()[self._controls.qpos_id]
+            told = [i for i, joint in enumerate(joints) if is_driven(joint) or is_driven(self._joints[i])]
+            for i in told:
+                if is_driven(joints[i]):
+                    setpoints[i] = joints[i].position
+            self._scene.put(self._controls.actuator_id[told], setpoints[told])
             self._joints = tuple(joints)
 
     def felt(self, time_s: float) -> tuple[Float[np.ndarray, " joint"], TipForces]:
         """Return angles and counts after the last step."""
         with self._lock:
-            return self._position(), TipForces(self._counts, np.zeros((len(FINGERS), NUM_TAXELS, 3)))
+            return self._position.copy(), TipForces(self._counts, np.zeros((len(FINGERS), NUM_TAXELS, 3)))
 
     def is_told(self, target: Float[np.ndarray, " joint"]) -> bool:
         """Return whether all joints were last told to go just there, as far as the wire's floats can say it."""
@@ -103,14 +98,14 @@ class SimulatedBody:
             SimulationError: If it diverges.
         """
         with self._lock:
-            self._sim.step()
-            self._time += self._sim.control_step
+            self._scene.step()
+            self._time += self._scene.control_step
             self._feel()
 
     def reset(self) -> None:
         """Start the scene anew."""
         with self._lock:
-            self._sim.reset()
+            self._scene.reset()
             self._time = 0.0
             self._feel()
 
@@ -124,14 +119,14 @@ class SimulatedBody:
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
-        self._sim.close()
+        self._scene.close()
 
     def _run(self) -> None:
         due = time.monotonic()
         try:
             while not self._stopping.wait(max(due - time.monotonic(), 0.0)):
                 self.step()
-                due += self._sim.control_step
+                due += self._scene.control_step
                 late = time.monotonic() - due
                 if late > _LATE_S:
                     self.num_late_s += late
@@ -139,12 +134,10 @@ class SimulatedBody:
         except Exception as error:  # told by whoever steps the source
             self.failure = error
 
-    def _position(self) -> Float[np.ndarray, " joint"]:
-        return np.array(self._sim.batch.qpos[0, self._controls.qpos_id], dtype=np.float64)
-
     def _feel(self) -> None:
-        with torch.no_grad():
-            force = self._tips.forces(self._touch(self._sim.state()))
+        """Take angles and counts of one instant."""
+        self._position = self._scene.positions(self._names)
+        force = self._tips.forces(self._scene.readings)
         self._counts = self._calibration.counts_of(force)
         rounded = np.round(self._counts)
         outside = np.asarray(np.any((rounded < FORCE_MIN) | (rounded > FORCE_MAX), axis=1))

@@ -69,6 +69,11 @@ class EmulatedSource(XHand1Source):
             self._opened = opened.pop_all()
         self._told = False
 
+    @property
+    def age_s(self) -> float | None:
+        """How old the sample is at most, now [s]; None in lockstep, where the scene waits."""
+        return None if self._is_lockstep else super().age_s
+
     def step(self, control: Tensor | np.ndarray | None = None) -> None:
         """Step as a hand does.
 

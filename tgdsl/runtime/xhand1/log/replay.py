@@ -100,6 +100,11 @@ class ReplaySource:
         return self._now
 
     @property
+    def age_s(self) -> float | None:
+        """How old the sample was at most, on the log's clock, when it was delivered [s]."""
+        return self._sample.reading.age_s(self._now)
+
+    @property
     def is_over(self) -> bool:
         """Whether the log is at its end: the next step raises `ReplayOverError`."""
         if self._control_step is None:

@@ -27,6 +27,7 @@ from tgdsl.runtime.xhand1.wire.errors import (
     HandTimeoutError,
 )
 from tgdsl.runtime.xhand1.wire.parser import FrameParser
+from tgdsl.runtime.xhand1.wire.payloads import COMMAND_SIZE, STATE_SIZE
 from tgdsl.runtime.xhand1.wire.protocol import HOST_ADDRESS, OVERHEAD, Command, Frame, encode_frame, hand_address
 from tgdsl.runtime.xhand1.wire.replies import Addresses, Reply, Waiting
 from tgdsl.runtime.xhand1.wire.serial_port import BAUD, Port
@@ -58,6 +59,11 @@ class SerialTiming:
     settle_s: float = 0.018
     quiet_s: float = 0.0005
     checks_wire_time: bool = True
+
+    @property
+    def exchange_s(self) -> float:
+        """How long the bytes of a command and of the state that answers it take on the line [s]."""
+        return 10 * (2 * OVERHEAD + COMMAND_SIZE + STATE_SIZE) / self.baud
 
 
 @dataclass

@@ -1,0 +1,231 @@
+"""A policy on a simulation, an emulated hand and a log: what it sees and asks for is what TouchEnv's would."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hand_logs import random_readings, write_log
+from pressing_hands import CALIBRATION, ORDER, SCALE, TURN, Blind, press_policy, press_task
+
+from tgdsl.rl.deploying.deploy import Deployment, deploy
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.evaluation import SEED, evaluate
+from tgdsl.rl.playing.policy import policy_for
+from tgdsl.runtime.xhand1.velocity import VelocityFilter
+from tgdsl.runtime.xhand1.wire.payloads import JOINTS
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+EPISODES = 3
+LOCKSTEP = {"lockstep": True, "calibration": CALIBRATION}
+CLOSE = {"rtol": 1e-5, "atol": 2e-6}
+"""float32, products of one row and of several."""
+
+
+@pytest.fixture(scope="module")
+def task(tmp_path_factory):
+    return press_task(tmp_path_factory.mktemp("press"))
+
+
+@pytest.fixture(scope="module")
+def policy(task):
+    """Linear in all that it sees, with velocities as a hand measures them."""
+    return press_policy(task.parent, task, joint_vel="measured")
+
+
+@pytest.fixture(scope="module")
+def blind(task):
+    return press_policy(task.parent, task, Blind(6), "blind.pt", joint_vel="measured")
+
+
+def in_environments(task, file, **overrides):
+    """Return observations and targets of each step of the first episodes of environments, (step, env, …), and scores."""
+    env = TouchEnv(task, EPISODES, threads=1, overrides=overrides)
+    policy, obs, steps = policy_for(env, file), env.reset(SEED), []
+    for _ in range(env.max_steps):
+        made = env.step(policy(obs))
+        target = env.actuation.target.clone() if not made.info.ended.any() else None  # the next episode's
+        steps.append((obs, target))
+        obs = made.obs
+    env.close()
+    return steps, made.info.score
+
+
+@pytest.mark.parametrize("joint_vel", ["exact", "measured"])
+def test_on_a_simulation_it_does_what_it_does_in_environments(task, joint_vel):
+    """Episode i is that of environment i: observations, targets and scores; drives with play, bias and delay are the scene's."""
+    file = press_policy(task.parent, task, name=f"{joint_vel}.pt", joint_vel=joint_vel)
+    expected, scores = in_environments(task, file, joint_vel=joint_vel)
+    found = list(Deployment(task, file).steps(EPISODES))
+    assert len(found) == EPISODES * len(expected)
+    for moment in found:
+        obs, target = expected[moment.index]
+        assert list(moment.obs) == ["proprio", "tactile_sensors", "goal"]
+        for name, value in moment.obs.items():
+            torch.testing.assert_close(value[0], obs[name][moment.episode], **CLOSE)
+        if target is not None:
+            torch.testing.assert_close(moment.target[0], target[moment.episode], rtol=0, atol=1e-6)
+    last = [moment.judged for moment in found if moment.index == len(expected) - 1]
+    assert all(own.is_over and own.is_held for own in last) and not any(m.judged.is_over for m in found if m.index < 20)
+    np.testing.assert_allclose([own.score for own in last], scores, atol=1e-5)
+    assert max(moment.obs["tactile_sensors"].abs().max() for moment in found) > 10
+
+
+def test_set_points_from_elsewhere_move_environments_as_actions_do(task):
+    """To the bit, with the targets that actions gave."""
+    generator, runs, targets = torch.Generator().manual_seed(0), [], []
+    actions = [2 * torch.rand((2, 6), generator=generator) - 1 for _ in range(12)]
+    for follows in (False, True):
+        env, found = TouchEnv(task, 2, threads=1), []
+        for i, action in enumerate(actions):
+            if follows:
+                control = env.sim.ctrl.clone()
+                control[:, torch.from_numpy(env.task.setup.actuators.actuator)] = targets[i]
+                made = env.follow(control)
+            else:
+                made = env.step(action)
+                targets.append(env.actuation.target.clone())
+            found.append((env.sim.qpos.clone(), made.obs["tactile_sensors"].clone(), made.info.score.clone()))
+        runs.append(found)
+        env.close()
+    for own, other in zip(*runs, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(own, other, strict=True))
+    assert runs[0][0][0].abs().max() > 0
+
+
+def test_an_emulated_hand_shows_what_the_simulation_does(task, blind):
+    """Forces to half a count, angles as far as the wire's floats can say them, velocities as these make them."""
+    runs = [list(Deployment(task, blind, source, **options).steps(2)) for source, options in SOURCES.items()]
+    half_count = 0.5 * np.abs(SCALE * TURN).sum(axis=1).max()
+    for simulated, emulated in zip(*runs, strict=True):
+        assert torch.equal(simulated.target, emulated.target) and torch.equal(simulated.obs["goal"], emulated.obs["goal"])
+        one, other = simulated.obs["tactile_sensors"], emulated.obs["tactile_sensors"]
+        assert (one - other).abs().max() <= half_count * (1 + 1e-4)
+        one, other = simulated.obs["proprio"], emulated.obs["proprio"]
+        torch.testing.assert_close(other[:, :6], one[:, :6], rtol=2e-7, atol=1e-7)
+        torch.testing.assert_close(other[:, 6:12], one[:, 6:12], rtol=0, atol=4e-7 / 0.02)
+        assert torch.equal(one[:, 12:], other[:, 12:])
+        assert simulated.judged.score == pytest.approx(emulated.judged.score, abs=1e-6)
+    last = runs[1][-1]
+    assert last.obs["tactile_sensors"].abs().max() > 50 * half_count
+    assert (runs[0][-1].obs["tactile_sensors"] != last.obs["tactile_sensors"]).any() and last.age_s is None
+
+
+SOURCES = {"simulation": {}, "emulator": LOCKSTEP}
+
+
+def test_the_emulators_score_is_that_of_the_simulation(task, policy):
+    """A policy that acts on what it feels: within the interval of as many episodes in environments."""
+    env = TouchEnv(task, EPISODES, threads=1, overrides={"joint_vel": "measured"})
+    expected = evaluate(env, policy_for(env, policy), EPISODES)
+    env.close()
+    simulated = deploy(task, policy, episodes=EPISODES).scores
+    assert simulated.mean == pytest.approx(expected.score, abs=1e-5)
+    assert simulated.interval == pytest.approx(expected.score_interval, abs=1e-4)
+    emulated = deploy(task, policy, "emulator", episodes=EPISODES, **LOCKSTEP).scores
+    assert expected.score_interval[0] < emulated.mean < expected.score_interval[1]
+    assert emulated.held == expected.held == 1.0
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_contact_bits_are_forces_beyond_the_threshold(tmp_path, side):
+    """The emulated hand feels forces that the policy does not see."""
+    task = press_task(tmp_path, side)
+    file = press_policy(tmp_path, task, Blind(6), touch="agg_bool")
+    bits = list(Deployment(task, file, "emulator", **LOCKSTEP).steps())
+    file = press_policy(tmp_path, task, Blind(6), "force.pt")
+    forces = list(Deployment(task, file, "emulator", **LOCKSTEP).steps())
+    for own, other in zip(bits, forces, strict=True):
+        norm = other.obs["tactile_sensors"].reshape(3, 5).norm(dim=0)
+        assert own.obs["tactile_sensors"].tolist() == [(norm > CALIBRATION.contact_threshold).float().tolist()]
+    assert 0 < own.obs["tactile_sensors"].sum() < 5
+
+
+def test_a_log_is_acted_on_and_moves_nothing(task, policy, tmp_path):
+    """Its angles in the order of actions, its speeds, its forces; targets follow from the first angles."""
+    readings = random_readings(1.0 + 0.02 * np.arange(20))
+    log = write_log(tmp_path / "a.npz", readings)
+    found = Deployment(task, policy, str(log), goal=(1.0,), lockstep=True, calibration=CALIBRATION)
+    moments = list(found.steps())
+    names = found.prepared.moved.names
+    ids = [JOINTS.index(name.removeprefix("right_hand_")) for name in names]
+    assert [f"right_hand_{name}" for name in ORDER if f"right_hand_{name}" in names] == list(names) and len(names) == 6
+    speeds, target = VelocityFilter(0.02), np.clip(readings[0].state.position[ids].astype(np.float64), -1, 1)
+    assert 15 < len(moments) <= 20
+    for moment, reading in zip(moments, readings, strict=False):
+        position, proprio = reading.state.position, moment.obs["proprio"][0].numpy()
+        np.testing.assert_allclose(proprio[:6], position[ids], atol=1e-6)
+        speed = speeds.update(reading.requested_at, position.astype(np.float64))
+        np.testing.assert_allclose(proprio[6:12], speed[ids], rtol=1e-5)
+        force = CALIBRATION.apply(reading.state.total_force)
+        np.testing.assert_allclose(moment.obs["tactile_sensors"].reshape(3, 5), force.T[::-1], rtol=1e-6)
+        wanted = np.clip(target + 0.05 * np.clip(moment.action[0].numpy(), -1, 1), -1, 1)
+        target = 0.8 * wanted + 0.2 * target
+        np.testing.assert_allclose(moment.target[0], target, atol=1e-9)
+        assert moment.judged is None and moment.obs["goal"].tolist() == [[1.0]]
+    report = found.report()
+    assert report.scores is None and not report.moves and report.age.median > 0
+    assert str(report).startswith(f"no score: {log} has no scene that knows what happened; 1 episode, {len(moments)} control")
+    assert str(report).endswith(f"{log} was not moved: actions were computed, and went nowhere")
+
+
+def test_in_real_time_samples_have_an_age(task, blind):
+    """However busy the machine is: latency is age and inference, and no score is lost."""
+    found = Deployment(task, blind, "emulator", calibration=CALIBRATION)
+    moments = list(found.steps(seconds=0.1))
+    report = found.report()
+    assert len(moments) == report.steps == 5 and all(moment.age_s > 0 for moment in moments)
+    both = [moment.age_s + moment.inference_s for moment in moments]
+    assert report.latency.median == pytest.approx(1e3 * np.median(both))
+    assert report.latency.p99 == pytest.approx(1e3 * np.quantile(both, 0.99))
+    assert report.control_rate == pytest.approx(50) and report.rate > 0 and len(report.scores.each) == 1
+
+
+@pytest.mark.parametrize("goal", [(), (0.7,)])
+def test_what_is_asked_for_is_the_tasks_or_the_users(task, blind, goal):
+    found = {moment.obs["goal"].item() for moment in Deployment(task, blind, goal=goal).steps(2, 0.1)}
+    if goal:
+        assert found == {np.float32(0.7)}
+    else:
+        assert len(found) == 2 and all(0.5 <= value <= 1.5 for value in found)
+
+
+def test_a_policy_without_a_card(task, tmp_path):
+    """It is taken for the document's own, and its groups are those that hands have."""
+    sizes = 18 + 15 + 1
+    torch.jit.trace(torch.nn.Linear(sizes, 6), torch.zeros(1, sizes)).save(str(tmp_path / "plain.pt"))
+    found = Deployment(task, tmp_path / "plain.pt", goal=(1.0,))
+    assert found.prepared.groups == {"proprio": 18, "tactile_sensors": 15, "goal": 1}
+    assert len(list(found.steps(seconds=0.1))) == 5
+
+
+@pytest.mark.slow
+def test_mujoco_warp_too(task, blind):
+    """On a CPU, in float32: the first steps, before the drives' noise and contacts part them."""
+    simulated, warp = (list(Deployment(task, blind, source).steps(seconds=0.2)) for source in ("simulation", "warp:cpu"))
+    for own, other in zip(simulated, warp, strict=True):
+        torch.testing.assert_close(own.obs["proprio"][:, :6], other.obs["proprio"][:, :6], rtol=0, atol=2e-3)
+        assert torch.equal(own.action, other.action)
+
+
+REPOSITORY = Path(__file__).parents[3]
+KEPT = REPOSITORY / "policies" / "grip_force_agg_force.pt"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not KEPT.is_file(), reason="no student is kept")
+def test_the_kept_student_grips_alike_in_simulation_and_behind_the_line():
+    """Eight episodes, one of each object; scores within the interval of the simulation's."""
+    task, calibration = REPOSITORY / "examples/tasks/grip_force.yaml", REPOSITORY / "examples/tasks/grip_calibration.yaml"
+    simulated = deploy(task, KEPT, episodes=8).scores
+    emulated = deploy(task, KEPT, "emulator", episodes=8, lockstep=True, calibration=calibration).scores
+    assert simulated.interval[0] < emulated.mean < simulated.interval[1]
+
+
+def test_a_calibration_with_another_threshold_gives_other_bits(tmp_path):
+    task = press_task(tmp_path)
+    file = press_policy(tmp_path, task, Blind(6), touch="agg_bool")
+    deaf = replace(CALIBRATION, contact_threshold=1e6)
+    bits = [m.obs["tactile_sensors"].sum() for m in Deployment(task, file, "emulator", lockstep=True, calibration=deaf).steps()]
+    assert not any(bits)

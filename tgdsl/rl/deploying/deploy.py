@@ -1,0 +1,335 @@
+"""Run a policy on a source, whatever it is: observe, choose, command, at the task's control rate.
+
+Shapes: `actuator` actuators of the scene, `joint` joints that the policy moves, `feature` numbers of a group.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from tgdsl.console.progress import Progress
+from tgdsl.rl.deploying.acting import HandActor
+from tgdsl.rl.deploying.prepared import DeployError, Prepared, prepare
+from tgdsl.rl.deploying.report import Quantiles, Report, Scores
+from tgdsl.rl.deploying.scene import Judged, TaskScene
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.playing.evaluation import SEED
+from tgdsl.runtime.connect import connect, kind_of
+from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.simulators.model_ids import keyframe_id
+from tgdsl.runtime.xhand1.calibration import Calibration
+from tgdsl.runtime.xhand1.motion import MotionLimits
+
+APPROACH_S = 2.0
+"""Time in which a hand that may move goes to the keyframe from which it shall act [s]."""
+EMULATED_SPEED, EMULATED_CURRENT, EMULATED_GAIN, EMULATED_WATCHDOG_S = 1e6, 300, 100, 1.0
+"""Limits of an emulated hand: its drives are those of the scene, and it is not to wait for them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One control step of a policy.
+
+    Attributes:
+        episode: Number of the episode, from 0.
+        index: Number of the control step in it, from 0.
+        obs: The policy's groups of observations.
+        action: What it asked for, from −1 to 1.
+        target: Set-points of the joints that it moves [rad].
+        age_s: How old the sample was [s]; None where nothing runs in real time.
+        inference_s: From then until the set-points were there [s].
+        judged: What the scene's task says after the step; None without a scene.
+    """
+
+    episode: int
+    index: int
+    obs: Mapping[str, Float[Tensor, "env feature"]]
+    action: Float[Tensor, "env joint"]
+    target: Float[Tensor, "env joint"]
+    age_s: float | None
+    inference_s: float
+    judged: Judged | None
+
+
+@dataclass
+class _Sums:
+    """What is added up of all steps."""
+
+    ages: list[float | None] = field(default_factory=list)
+    inferences: list[float] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    are_held: list[bool] = field(default_factory=list)
+    seconds: float = 0.0
+    late_steps: int = 0
+
+
+class Deployment:
+    """A policy on a source: what it takes, seen before anything is connected.
+
+    Attributes:
+        prepared: The policy and its task.
+        source: The source, as `tgdsl.connect` takes it.
+        has_scene: Whether it has a scene, so that the task can judge.
+        moves: Whether set-points go to joints.
+    """
+
+    def __init__(
+        self,
+        task: str | PathLike[str] | Mapping[str, Any],
+        policy: str | PathLike[str],
+        source: str = "simulation",
+        *,
+        groups: Sequence[str] = (),
+        goal: Sequence[float] = (),
+        overrides: Mapping[str, Any] | None = None,
+        seed: int = SEED,
+        start: str | None = None,
+        calibration: Calibration | str | Path | None = None,
+        motion: MotionLimits | Callable[[mujoco.MjModel], MotionLimits] | None = None,
+        lockstep: bool = False,
+        progress: Progress | None = None,
+        **options: Any,
+    ):
+        """Read everything, and see that it fits.
+
+        Args:
+            task: The task's document.
+            policy: The policy's file.
+            source: `simulation`, `warp`, `emulator`, `xhand1:PORT`, a log, or another kind that is installed.
+            groups: Groups of observations that the policy takes, in its order; default: see `prepare`.
+            goal: What it is asked for, in the task's units; default: what the scene's task asks for.
+            overrides: Values of the document to set first by dotted path.
+            seed: What is random in a scene follows from it: episode i is the first one of environment i of `tgdsl evaluate`.
+            start: Keyframe whose controls a hand without a scene begins with; default: it holds the joints where they are.
+            calibration: What a hand's counts mean: see `tgdsl.connect`.
+            motion: Leave for a real hand to move, or what makes it of the scene's model; default: none. An emulated one always
+                has.
+            lockstep: Whether an emulator's scene waits for each step, and a log is read as fast as possible.
+            progress: Is told in a line what is being done.
+            **options: Other options of `tgdsl.connect`.
+
+        Raises:
+            SpecError: All mistakes of the documents, at their places.
+            PolicyError: If the policy cannot be read, or was learned for something else.
+            DeployError: If it sees what no hand can know, or nobody says what it is asked for.
+            TgdslError: If there is no such source.
+        """
+        kind = kind_of(source)
+        self.source, self.has_scene = source, "scene" in kind.options
+        self._is_emulated = is_emulated = self.has_scene and "motion" in kind.options
+        self._device, self._simulator = "cpu", "mujoco"
+        if kind.name == "warp":
+            self._device, self._simulator = source.partition(":")[2] or "cuda", "warp"
+        self.prepared = prepare(
+            task,
+            Path(policy),
+            groups=groups,
+            goal=goal,
+            overrides=overrides,
+            device=self._device,
+            is_emulated=is_emulated,
+            progress=progress,
+        )
+        own = self.prepared
+        if not self.has_scene and own.loaded.task.goal_units and own.goal is None and _needs_goal(own):
+            units = ", ".join(own.loaded.task.goal_units)
+            what = f'the task "{own.loaded.spec.task}" draws what it asks for by what is in its scene, and {source} has none'
+            raise DeployError(f"{policy}: {what}; say what to ask for: a goal [{units}]")
+        motion = motion(own.model) if callable(motion) else motion
+        if is_emulated and motion is None:
+            motion = emulated_limits(own)
+        self.moves = kind.name != "log" and (motion is not None or "motion" not in kind.options)
+        self._start = None if start is None else own.model.key_ctrl[keyframe_id(own.model, start)]
+        self._seed, self._progress = seed, progress
+        self._options = options | {"calibration": calibration, "motion": motion, "lockstep": lockstep}
+        self._sums = _Sums()
+
+    def scene(self, episode: int) -> TaskScene:
+        """Return the scene of an episode: that of the environment of this number."""
+        own = self.prepared
+        env = TouchEnv(
+            own.loaded,
+            1,
+            device=self._device,
+            seed=self._seed,
+            simulator=self._simulator,
+            threads=1,
+            first_env=episode,
+            sensed=own.sensed,
+            progress=self._progress,
+        )
+        return TaskScene(env)
+
+    def steps(self, episodes: int = 1, seconds: float | None = None) -> Iterator[Moment]:
+        """Act, and yield each control step.
+
+        A scene's episodes end as the task says; others, and a log that is not over, after some time.
+
+        Args:
+            episodes: How many.
+            seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
+
+        Raises:
+            DeployError: If there is nothing to do.
+            ObservationError: If the source cannot give what the policy feels; no hand was touched then.
+            HandError: If a hand does not answer, or may not move like this.
+        """
+        if episodes < 1 or not (seconds is None or 0 < seconds < math.inf):
+            raise DeployError(f"{episodes} episodes of {seconds} s, expected at least 1, and more than 0 s")
+        longest = self.prepared.loaded.spec.episode if seconds is None else seconds
+        is_whole = seconds is None and kind_of(self.source).name == "log"
+        num_steps = None if is_whole else max(1, round(longest / self.prepared.control_step))
+        self._sums = _Sums()
+        actor = HandActor(self.prepared, is_exact=self.has_scene and not self._is_emulated)
+        if self.has_scene:
+            for episode in range(episodes):
+                scene = self.scene(episode)
+                with self._connected(scene) as connection:
+                    actor.begin(scene.start)
+                    yield from self._episode(episode, connection, actor, num_steps, scene)
+            return
+        with self._connected(None) as connection:
+            for episode in range(episodes):
+                if episode:
+                    connection.reset()
+                self._approach(connection, actor)
+                yield from self._episode(episode, connection, actor, num_steps, None)
+
+    def report(self) -> Report:
+        """Return what came of the steps that were made.
+
+        Raises:
+            DeployError: If none was made.
+        """
+        sums, spec = self._sums, self.prepared.loaded.spec
+        if not sums.inferences:
+            raise DeployError(f"{self.source}: not one control step was made")
+        ages = [age for age in sums.ages if age is not None]
+        pairs = [age + own for age, own in zip(sums.ages, sums.inferences, strict=True) if age is not None]
+        return Report(
+            task=spec.task,
+            policy=str(self.prepared.file),
+            source=self.source,
+            unit=self.prepared.loaded.task.score_unit,
+            episodes=len(sums.scores) if self.has_scene else max(1, len(sums.are_held)),
+            steps=len(sums.inferences),
+            scores=Scores.of(sums.scores, sums.are_held) if sums.scores else None,
+            age=Quantiles.of(ages) if ages else None,
+            inference=Quantiles.of(sums.inferences),
+            latency=Quantiles.of(pairs) if ages else None,
+            control_rate=1.0 / self.prepared.control_step,
+            rate=len(sums.inferences) / sums.seconds,
+            late_steps=sums.late_steps,
+            moves=self.moves,
+        )
+
+    def _connected(self, scene: TaskScene | None) -> Connection:
+        """Connect; a scene is closed with the connection, or if there is none."""
+        with ExitStack() as opened:
+            if scene is not None:
+                opened.callback(scene.close)
+            own = self.prepared
+            found = connect(own.sensed.touch, self.source, control_step=own.control_step, scene=scene, **self._options)
+            opened.pop_all()
+        return found
+
+    def _approach(self, connection: Connection, actor: HandActor) -> None:
+        """Begin where a hand is, or go to a keyframe's controls first, if it may move."""
+        held = actor.hold(connection.observe()["joint_pos"])
+        if self._start is not None:
+            held = torch.from_numpy(self._start.copy())
+            if self.moves:
+                for _ in range(round(APPROACH_S / connection.control_step)):
+                    connection.step(held[None])
+        actor.begin(held)
+
+    def _episode(
+        self, episode: int, connection: Connection, actor: HandActor, num_steps: int | None, scene: TaskScene | None
+    ) -> Iterator[Moment]:
+        """Make the steps of one episode."""
+        sums = self._sums
+        late = getattr(connection.source, "num_late_steps", 0)
+        asked = torch.tensor([self.prepared.goal or ()], dtype=torch.float64)
+        index, judged = 0, None if scene is None else scene.judged
+        while (num_steps is None or index < num_steps) and not connection.is_over:
+            began = time.monotonic()
+            age = connection.age_s
+            obs = actor.observe(connection.observe(), asked if judged is None else judged.goal)
+            control = actor.act(obs)
+            inference = time.monotonic() - began
+            connection.step(control)
+            sums.seconds += time.monotonic() - began
+            sums.ages.append(age)
+            sums.inferences.append(inference)
+            judged = None if scene is None else scene.judged
+            yield Moment(episode, index, obs, actor.action, actor.target, age, inference, judged)
+            index += 1
+            if judged is not None and judged.is_over:
+                break
+        sums.late_steps += getattr(connection.source, "num_late_steps", 0) - late
+        sums.are_held.append(judged is None or judged.is_held)
+        if judged is not None:
+            sums.scores.append(judged.score)
+
+
+def deploy(
+    task: str | PathLike[str] | Mapping[str, Any],
+    policy: str | PathLike[str],
+    source: str = "simulation",
+    *,
+    episodes: int = 1,
+    seconds: float | None = None,
+    watch: Callable[[Moment], None] | None = None,
+    **options: Any,
+) -> Report:
+    """Run a policy on a source; return what came of it.
+
+    Args:
+        task: The task's document.
+        policy: The policy's file.
+        source: As `tgdsl.connect` takes it.
+        episodes: How many.
+        seconds: Longest duration of each [s]; default: an episode's, of a log all of it.
+        watch: Is told of each control step.
+        **options: As for `Deployment`.
+
+    Raises:
+        TgdslError: As from `Deployment` and `Deployment.steps`.
+    """
+    found = Deployment(task, policy, source, **options)
+    for moment in found.steps(episodes, seconds):
+        if watch is not None:
+            watch(moment)
+    return found.report()
+
+
+def emulated_limits(prepared: Prepared) -> MotionLimits:
+    """Return limits of an emulated hand. Do not use these figures on a real one: what its gains do is not published.
+
+    Raises:
+        MotionError: If the scene is not of an XHand1.
+    """
+    return MotionLimits.of_robot(
+        prepared.model,
+        speed=EMULATED_SPEED,
+        current_limit=EMULATED_CURRENT,
+        kp=EMULATED_GAIN,
+        watchdog_s=EMULATED_WATCHDOG_S,
+    )
+
+
+def _needs_goal(prepared: Prepared) -> bool:
+    """Return whether the policy sees a group that is made of what is asked for."""
+    return any(name in prepared.loaded.task.hand_groups for name in prepared.groups)

@@ -1,0 +1,132 @@
+"""A simulated scene of one environment, as sources step it: set-points in, control steps, readings out.
+
+Shapes: `actuator` actuators of the scene, `joint` joints by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from tgdsl.errors import SimulationError
+from tgdsl.module.module import TactileModule
+from tgdsl.runtime.connection import Connection
+from tgdsl.runtime.controls import control_tensor
+from tgdsl.runtime.simulators.simulation import Simulation
+from tgdsl.runtime.source import Control
+from tgdsl.tensors.env_ids import EnvIds
+
+
+class SteppedScene:
+    """A scene that holds its set-points until it is told others, and is read at the end of each control step.
+
+    Subclasses that know more of the scene, such as a task, override `advance` and `begin`.
+
+    Attributes:
+        sim: The simulation, of one environment.
+        readings: What the module reads at the end of the last step, or at the start.
+    """
+
+    def __init__(self, touch: TactileModule, sim: Any):
+        """Take a simulation that is at its start.
+
+        Args:
+            touch: The module that reads it; nobody else may call it.
+            sim: The simulation.
+
+        Raises:
+            SimulationError: If it has more than one environment.
+        """
+        if sim.num_envs != 1:
+            raise SimulationError(f"an emulated hand has one environment, found {sim.num_envs}")
+        self.sim: Simulation = sim
+        self._touch = touch
+        self.readings = self.read()
+
+    @property
+    def num_envs(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def control_step(self) -> float:
+        """Duration of one control step [s]."""
+        return self.sim.control_step
+
+    def put(self, actuators: Int[np.ndarray, " n"], setpoints: Float[np.ndarray, " n"]) -> None:
+        """Tell some actuators where to go from the next physics step on [rad; slides: m]."""
+        self.sim.ctrl[0, torch.from_numpy(actuators)] = torch.from_numpy(setpoints).to(self.sim.ctrl)
+
+    def step(self, control: Control = None) -> None:
+        """Make one control step, and read the sensors.
+
+        Args:
+            control: Set-points of all actuators, (actuator,) or (1, actuator); default: as they were.
+
+        Raises:
+            SimulationError: If they do not fit, or the scene diverges.
+        """
+        if control is not None:
+            values = control_tensor(control, *self.sim.ctrl.shape).reshape(-1)
+            self.put(np.arange(len(values)), values.cpu().numpy())
+        self.readings = self.advance()
+
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Begin a new episode, and read the sensors."""
+        self.readings = self.begin()
+
+    def advance(self) -> dict[str, Tensor]:
+        """Make one control step; return the readings."""
+        self.sim.step()
+        return self.read()
+
+    def begin(self) -> dict[str, Tensor]:
+        """Begin a new episode; return the readings."""
+        self.sim.reset()
+        return self.read()
+
+    def read(self) -> dict[str, Tensor]:
+        """Return the readings of the present state: once per state, as sensors remember their last samples."""
+        with torch.no_grad():
+            return self._touch(self.sim.state())
+
+    def positions(self, joints: Sequence[str]) -> Float[np.ndarray, " joint"]:
+        """Return where joints that are watched are, at the instant that the readings are of [rad; slides: m]."""
+        watched = self.sim.watched()
+        rows = [watched.watch.joints.index(name) for name in joints]
+        return watched.joint_pos[0, rows].double().cpu().numpy()
+
+    def close(self) -> None:
+        """Release the module; the scene can no longer be used."""
+        self.sim.close()
+
+
+class SceneConnection(Connection):
+    """A connection to a scene that reads the module's sensors itself.
+
+    Shapes: `env` one, `feature` numbers of an observation.
+    """
+
+    def __init__(self, touch: TactileModule, scene: SteppedScene):
+        """Connect a module to the scene that it reads."""
+        super().__init__(scene)
+        self._touch, self._scene = touch, scene
+
+    def read(self) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return the observation groups of the scene's last readings."""
+        return self._touch.observe(self._scene.readings)
+
+
+def refuse_other_steps(scene: SteppedScene, control_step: float) -> None:
+    """See that a scene makes control steps of some duration [s].
+
+    Raises:
+        SimulationError: If not.
+    """
+    if abs(scene.control_step - control_step) > 1e-9:
+        raise SimulationError(f"control steps of {control_step:g} s, and the scene's are {scene.control_step:g} s")
