@@ -49,6 +49,8 @@ class Bench:
     """States to measure errors on, an .npz file that `--save-states` wrote; default: a run of the scene."""
     save_states: OptionalFile = None
     """Write the states of the run to this file."""
+    against: OptionalFile = None
+    """The bench.json of an earlier run: says whether errors are the same, and which variants have changed places in time."""
     state_envs: int = 16
     """Environments of that run, which go differently far; half of them verify the errors of the others."""
     steps: int = 90
@@ -70,12 +72,14 @@ class Bench:
             return
         from tgdsl.files.write import check_writable
         from tgdsl.report.bench.bench import Bench as Work
+        from tgdsl.report.bench.compare import compared, read_rows
         from tgdsl.report.bench.files import check_files, write_files
         from tgdsl.report.bench.sensors import Options
         from tgdsl.tensors.devices import device_of
 
         options = Options(device_of(self.device), _numbers(self.envs), self.repeats, self.compiled, self.seed)
         check_files(self.out)
+        earlier = None if self.against is None else read_rows(self.against)
         if self.save_states is not None:
             check_writable(self.save_states)
         work = Work(
@@ -91,6 +95,8 @@ class Bench:
         )
         report = _measured(work)
         print(_text(report))
+        if earlier is not None:
+            print("\n".join(["", f"against {self.against}", *compared(report, earlier).lines()]))
         print("\n".join(["", *map(str, write_files(report, self.out))]))
 
     def _run_without_document(self) -> None:
