@@ -19,9 +19,10 @@ from tgdsl.modal.elasticity import Elements
 from tgdsl.modal.spec import ShapeModes
 from tgdsl.modal.spectrum import SIGHT, SLIVER, spectrum
 from tgdsl.modal.vibration import vibration
-from tgdsl.report.oracles.results import Comparison, Oracle, array, cases
+from tgdsl.report.oracles.results import Comparison, Oracle, along, array, cases
 from tgdsl.report.oracles.setups.solids import (
     ball,
+    bending,
     box,
     breathing,
     lamb,
@@ -172,6 +173,51 @@ def scaled(sides: tuple[float, ...] = (0.06, 0.05, 0.04), num_modes: int = 8) ->
     )
 
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def struck_along_a_beam(number: int, length: float = 0.4, height: float = 0.006, width: float = 0.01) -> Comparison:
+    """Return how strongly a way of bending is excited by blows along a beam: not at its nodes, most at its ends."""
+    node = max(roots(lambda at: bending(at, number), 0.1, 0.49))
+    x = np.sort([*np.linspace(-0.5, 0.5, 21), node])
+    exact = bending(x, number) / 2
+    found = analysed("beam", surface_of(box(length, width, height)), made_of(MATERIALS["steel"], 4), 1e9)
+    assert found.shapes is not None
+    share = found.shapes.share(np.stack([length * x, 0 * x, 0 * x + height / 2], axis=1), np.tile(UP, (len(x), 1)))
+    own = share[:, int(np.argmax(np.abs(share.T @ exact)))]
+    return Comparison(
+        f"Blows along a beam that bends, mode {number + 1}",
+        "Bernoulli and Euler",
+        "φ = cos βx / cos ½βL + cosh βx / cosh ½βL, odd: sin and sinh; over that of an end",
+        KINDS,
+        "gain at the contact, over that at an end",
+        "1",
+        along("place from the middle over the length", "1", x),
+        exact,
+        own / own[-1],
+        atol=0.01,
+    )
+
+
+def struck_at_the_centre(side: float = 0.2, thickness: float = 0.004) -> Comparison:
+    """Return how strongly the first modes of a free square plate are excited at its centre, where all but one have a node."""
+    found = analysed("plate", surface_of(box(side, side, thickness)), made_of(MATERIALS["steel"], 6), 1e9)
+    assert found.shapes is not None
+    share = np.abs(found.shapes.share(np.array([[0.0, 0.0, thickness / 2]]), UP[None])[0])
+    return Comparison(
+        "A blow at the centre of a square plate",
+        "symmetry: displacements as xy, x² − y² and a pair, odd in x or y, are zero there",
+        "φ(0, 0) = 0",
+        KINDS,
+        "gain at the contact, over the mean",
+        "1",
+        cases(["xy", "x² − y²", "the pair"]),
+        np.zeros(3),
+        share[[0, 1, 3]],
+        atol=5e-3,
+    )
+
+
 ORACLES: tuple[Oracle, ...] = (
     slender_beam,
     thick_beam,
@@ -179,4 +225,6 @@ ORACLES: tuple[Oracle, ...] = (
     *(partial(modes_of_a_ball, poissons_ratio) for poissons_ratio in (0.3, 0.4999)),
     square_plate,
     scaled,
+    *(partial(struck_along_a_beam, number) for number in (0, 1)),
+    struck_at_the_centre,
 )

@@ -68,6 +68,19 @@ def roots(function: Callable[[np.ndarray], np.ndarray], low: float, high: float)
     return [float(np.asarray(brentq(function, at[i], at[i + 1]))) for i in range(499) if value[i] * value[i + 1] < 0]
 
 
+def bending(x: np.ndarray | float, number: int) -> np.ndarray:
+    """Return how a free beam of unit length is displaced at places from its middle, by Bernoulli and Euler: 2 at its ends.
+
+    Args:
+        x: From −0.5 to 0.5.
+        number: Of the way of bending, from 0.
+    """
+    beta = roots(lambda b: np.cos(b) - 1 / np.cosh(b), 3.5, 12.0)[number]
+    one, other = (np.cos, np.cosh) if number % 2 == 0 else (np.sin, np.sinh)
+    at = beta * np.asarray(x)
+    return np.asarray(one(at) / one(beta / 2) + other(at) / other(beta / 2))
+
+
 def timoshenko(length: float, height: float, width: float, poissons_ratio: float, below: float) -> list[float]:
     """Return ω of a free–free beam's bending across its height by Timoshenko's theory, with E = 1 and ρ = 1.
 
