@@ -84,11 +84,23 @@ def choose(
 
 def _is_asked(document: Document, overrides: Mapping[str, Any] | None) -> bool:
     """Return whether a document may have an `accuracy`, without reading it twice; one that cannot be read has none."""
-    if "accuracy" in repr(overrides):
+    if any("accuracy" in path or _names_accuracy(value) for path, value in (overrides or {}).items()):
         return True
     if isinstance(document, (str, PathLike)):
         return is_file(Path(document)) and b"accuracy" in Path(document).read_bytes()
-    return "accuracy" in repr(document)
+    return _names_accuracy(document)
+
+
+def _names_accuracy(value: object, depth: int = 3) -> bool:
+    """Return whether text holds the word, or a mapping the key: no deeper than `sensors`, their names and their keys.
+
+    Lists hold no sensors, and a list of lists of the same lists takes for ever to go through.
+    """
+    if isinstance(value, str):
+        return "accuracy" in value
+    if not isinstance(value, Mapping) or depth == 0:
+        return False
+    return "accuracy" in value or any(_names_accuracy(own, depth - 1) for own in value.values())
 
 
 def task_of(

@@ -216,10 +216,10 @@ KEPT = REPOSITORY / "policies" / "grip_force_agg_force.pt"
 @pytest.mark.slow
 @pytest.mark.skipif(not KEPT.is_file(), reason="no student is kept")
 def test_the_kept_student_grips_alike_in_simulation_and_behind_the_line():
-    """Eight episodes, one of each object; scores within the interval of the simulation's."""
+    """Four episodes, of another object each; scores within the interval of the simulation's."""
     task, calibration = REPOSITORY / "examples/tasks/grip_force.yaml", REPOSITORY / "examples/tasks/grip_calibration.yaml"
-    simulated = deploy(task, KEPT, episodes=8).scores
-    emulated = deploy(task, KEPT, "emulator", episodes=8, lockstep=True, calibration=calibration).scores
+    simulated = deploy(task, KEPT, episodes=4).scores
+    emulated = deploy(task, KEPT, "emulator", episodes=4, lockstep=True, calibration=calibration).scores
     assert simulated.interval[0] < emulated.mean < simulated.interval[1]
 
 

@@ -12,6 +12,7 @@ import tgdsl
 from tgdsl.errors import ArtifactError, SimulationError, SpecError, StateError
 from tgdsl.fields.materials import MATERIALS
 from tgdsl.module.module import TactileModule
+from tgdsl.plan.plan import FORMAT
 from tgdsl.runtime.batch.simulation import BatchSimulation
 from tgdsl.sensors import KINDS
 from tgdsl.testing import FLOAT64_TOLERANCE, ReferenceModule, assert_agrees
@@ -101,7 +102,7 @@ def test_an_artefact_knows_them_all(tmp_path):
     again.reset()
     torch.testing.assert_close(tgdsl.simulate(again, 3).read()["warm"][:, 0, 0], torch.full((3,), 26.85, dtype=torch.float64))
     with pytest.raises(ArtifactError, match="plan format"):
-        type(touch.plan).from_json(touch.plan.to_json().replace('"format":14', '"format":12'), touch.plan.arrays)
+        type(touch.plan).from_json(touch.plan.to_json().replace(f'"format":{FORMAT}', '"format":12'), touch.plan.arrays)
 
 
 def test_what_a_state_may_hold(tmp_path):
