@@ -295,3 +295,45 @@ def test_a_choice_is_kept_as_it_is(tmp_path):
     choice = Choice({"objects.a.tolerance": 1e-3, "sensors.b.operator": None}, {"b": ("one", "  zwei, ≤")})
     again = choosing.unpacked(choosing.packed(choice))
     assert dataclasses.asdict(again) == dataclasses.asdict(choice)
+
+
+SOUND = """
+<mujoco>
+  <option timestep="0.001"/>
+  <worldbody>
+    <body name="plate"><geom type="box" size=".1 .1 .005"/></body>
+    <body name="ball" pos="0 0 .018"><freejoint/><geom type="sphere" size=".01" mass=".05"/></body>
+  </worldbody>
+</mujoco>
+"""
+RUNG = [{"frequency": 523.0, "decay": 6.0, "gain": 2.0}, {"frequency": 2903.0, "decay": 55.0, "gain": 1.0}]
+
+
+def sounding(tmp_path, **sensor):
+    (tmp_path / "sound.xml").write_text(SOUND)
+    given = {"kind": "contact_audio", "links": "plate", "feels": ["ball"], "modes": RUNG, "scrape": 0, "samples": 16, **sensor}
+    return {
+        "tgdsl": 1,
+        "robot": {"model": str(tmp_path / "sound.xml")},
+        "objects": {"ball": {"body": "ball"}},
+        "sensors": {"s": given},
+    }
+
+
+def test_modes_of_a_sound_are_chosen_by_their_part_of_it(tmp_path):
+    """The quiet mode begins with half of the loud one's amplitude and decays within the run: 1 % needs both, 50 % not.
+
+    Written, one mode stays, and its error is against both: too large.
+    """
+    for accuracy, modes in (("1 %", 2), ("50 %", 1)):
+        touch = tgdsl.compile(sounding(tmp_path, accuracy=accuracy))
+        assert touch.plan.sensors[0].constants["frequency"].shape == (1, modes)
+    with pytest.raises(SpecError, match=r"sensors\.s\.accuracy: nothing that is free to choose holds 1 %"):
+        tgdsl.compile(sounding(tmp_path, accuracy="1 %", loudest=1))
+
+
+def test_states_are_recorded_at_the_steps_that_a_sensor_wants(tmp_path):
+    """One physics step per call: 16 samples of 1 ms, of which no mode is dropped; the run lasts as long as with five."""
+    touch = tgdsl.compile(sounding(tmp_path))
+    recording = record(touch, 2, steps=10)
+    assert {state.dt for state in recording.states} == {0.001} and len(recording.states) == 50

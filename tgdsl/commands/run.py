@@ -78,11 +78,10 @@ class Run:
     def start(self, touch: TactileModule, progress: StatusLine) -> tuple[BatchSimulation, Controls]:
         """Return the scene at its start, and the controls that it is stepped through."""
         from tgdsl.runtime.rollout import recorded_controls
-        from tgdsl.runtime.scripted import script_of
+        from tgdsl.runtime.scripted import script_of, substeps_of
         from tgdsl.runtime.simulate import simulate
 
-        blocks = max(sensor.substeps for sensor in touch.plan.sensors)
-        substeps = (blocks or 5) if self.substeps is None else self.substeps
+        substeps = substeps_of(touch, 5) if self.substeps is None else self.substeps
         if self.controls is not None:
             return simulate(touch, self.num_envs, substeps=substeps), recorded_controls(self.controls)
         script = script_of(touch, self.keyframes, progress)

@@ -62,6 +62,16 @@ class Script:
         return Run(sim, controls)
 
 
+def substeps_of(touch: TactileModule, others: int) -> int:
+    """Return how many physics steps a control step has: as many as sensors that read blocks want.
+
+    Args:
+        touch: The module.
+        others: How many there are where no sensor wants any.
+    """
+    return max((sensor.substeps for sensor in touch.plan.sensors), default=0) or others
+
+
 def script_of(touch: TactileModule, keyframes: tuple[str, ...] | None = None, progress: Progress = silent) -> Script:
     """Return how a scene is run.
 

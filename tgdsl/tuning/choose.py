@@ -33,7 +33,7 @@ from tgdsl.tuning.recording import Recording, record
 from tgdsl.tuning.trial import Level, Outcome, Places, Trial, cheapest, level_of
 from tgdsl.tuning.trials import Sensor
 
-FORMAT = 1
+FORMAT = 2
 """Version of how choices are made."""
 ENVS, STEPS = 16, 90
 """Environments of the run, of which half choose and half verify (more where objects have more variants), and control steps."""

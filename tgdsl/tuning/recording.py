@@ -24,7 +24,7 @@ from tgdsl.module.accuracy.states import narrowed
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SHAPES, SceneState
 from tgdsl.plan.inputs import Inputs
-from tgdsl.runtime.scripted import Script, script_of
+from tgdsl.runtime.scripted import Script, script_of, substeps_of
 from tgdsl.scene.scene import scene_model
 
 LEAST_ENVS = 2
@@ -106,7 +106,8 @@ def record(
         touch: The module.
         num_envs: Environments.
         steps: Control steps, about.
-        substeps: Physics steps of each; a module that reads each physics step of a call has as many as it reads.
+        substeps: Physics steps of each. A module with sensors that are advanced at physics steps has as many as these want; if
+            fewer, it makes more control steps, so that the run lasts as long.
         seed: Of what differs between environments.
         script: How it is run; default: as `tgdsl run` does.
         progress: Is told what is done.
@@ -117,11 +118,11 @@ def record(
     """
     if num_envs < LEAST_ENVS or steps < 1:
         raise TgdslError(f"{num_envs} environments of {steps} steps: expected at least {LEAST_ENVS}, and at least one step")
-    substeps = touch.inputs.substeps if touch.inputs.substeps > 1 else substeps
+    own = substeps_of(touch, substeps)
     script = script or script_of(touch, progress=progress)
     phases = 1 if script.keyframes is None and script.closing is None else 3
-    seconds = steps / phases * substeps * scene_model(touch.plan.scene).opt.timestep
-    sim, controls = script.begin(touch, num_envs, substeps, seconds)
+    seconds = steps / phases * max(own, substeps) * scene_model(touch.plan.scene).opt.timestep
+    sim, controls = script.begin(touch, num_envs, own, seconds)
     found = []
     model = sim.model
     ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, 0.0)
