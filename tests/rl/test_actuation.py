@@ -195,6 +195,29 @@ def test_relative_actions_add_up_within_the_range_and_are_smoothed(tmp_path):
     assert expected > 1.9
 
 
+@BOTH
+def test_offsets_are_from_the_target_that_an_episode_began_with(tmp_path, simulator):
+    """Two environments start at 0.3 and −1.8 rad: a ⟼ start + 0.5 a, within ±2; the second begins anew where its joint is then."""
+    sim, actuation = hinge(tmp_path, simulator, num_envs=2, action=ActionSpec(mode="offset", scale=0.5))
+    sim.qpos[:, 0] = torch.tensor([0.3, -1.8])
+    actuation.reset(torch.tensor([True, True]), torch.tensor([1, 1]))
+    for action in (1.0, -1.0, 0.2):
+        actuation.command(torch.full((2, 1), action))
+        expected = [0.3 + 0.5 * action, max(-2.0, -1.8 + 0.5 * action)]
+        assert actuation.target[:, 0].tolist() == pytest.approx(expected, abs=1e-6)
+    sim.qpos[:, 0] = 0.7
+    actuation.reset(torch.tensor([False, True]), torch.tensor([1, 2]))
+    actuation.command(torch.full((2, 1), -1.0))
+    assert actuation.target[:, 0].tolist() == pytest.approx([-0.2, 0.2], abs=1e-6)
+    saved = {name: value.clone() for name, value in actuation.memory().items()}
+    sim.qpos[:, 0] = -0.4
+    actuation.reset(torch.tensor([True, True]), torch.tensor([3, 3]))
+    for name, value in actuation.memory().items():
+        value.copy_(saved[name])
+    actuation.command(torch.zeros(2, 1))
+    assert actuation.target[:, 0].tolist() == pytest.approx([0.3, 0.7], abs=1e-6)
+
+
 # What is drawn
 
 

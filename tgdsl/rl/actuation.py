@@ -5,6 +5,7 @@ the drive makes a torque of it:
 
     absolute    w = q_low + (a + 1)/2 (q_high − q_low)
     relative    w = clip(w' + s a, q_low, q_high)                  w' the target before, s the action's scale [rad, m]
+    offset      w = clip(w_0 + s a, q_low, q_high)                 w_0 the target with which the episode began
     smoothed    w ← (1 − σ) w + σ w'
     delayed     w of `delay` control steps ago
     play        u = clip(u', w + b − β/2, w + b + β/2)             u' before, b position bias, β backlash [rad]
@@ -57,10 +58,11 @@ Factor = Annotated[Range, RangeOf("number", gt=0.0)]
 class ActionSpec(SpecModel):
     """How an action of a policy is understood."""
 
-    mode: Literal["relative", "absolute"] = "relative"
-    """Whether an action moves the target, or is the target, −1 and 1 being the ends of the joint's range."""
+    mode: Literal["relative", "absolute", "offset"] = "relative"
+    """Whether an action moves the target, is the target, −1 and 1 being the ends of the joint's range, or is how far the target
+    is from that at the episode's start."""
     scale: Annotated[float, Quantity("angle", gt=0.0)] = 0.05
-    """s, what an action of 1 moves a hinge's target by in a control step [rad]; relative actions alone."""
+    """s, what an action of 1 is for a hinge's target [rad]: in a control step if relative, in all if `offset`."""
     slide_scale: PositiveLength = 0.01
     """The same of slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
@@ -244,7 +246,7 @@ class Actuation:
         self._low, self._span = low.float().to(device), (high - low).float().to(device)
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
-        self._play = torch.zeros_like(self.target)
+        self._play, self._start = torch.zeros_like(self.target), torch.zeros_like(self.target)
         self._count = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of physics steps, above them of episodes
         self.is_ideal = drive.is_ideal
         """Whether the robot's own actuators do all; if not, `drive` has to be called before each physics step."""
@@ -275,8 +277,10 @@ class Actuation:
         """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
         name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
         now, mask = self._arrays[name].index_select(1, self._index[which]), chosen[:, None]
-        for held, new in ((self.target, now), (self._past, now), (self._play, now + self.drawn["bias"]), (self.torque, 0.0)):
-            put(held, mask, new)
+        for held in (self.target, self._past, self._start):
+            put(held, mask, now)
+        put(self._play, mask, now + self.drawn["bias"])
+        put(self.torque, mask, 0.0)
 
     def command(self, action: Float[Tensor, "env joint"]) -> None:
         """Take an action of each environment: new targets, of which the drives know once they arrive.
@@ -287,7 +291,8 @@ class Actuation:
         if self.action.mode == "absolute":
             wanted = low + 0.5 * (action + 1.0) * (high - low)
         else:
-            wanted = torch.minimum(torch.maximum(self.target + self._scale * action, low), high)
+            origin = self._start if self.action.mode == "offset" else self.target
+            wanted = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
         self._take(torch.where(action.isfinite(), wanted, self.target))
 
@@ -336,6 +341,7 @@ class Actuation:
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
         own = {"target": self.target, "torque": self.torque, "play": self._play, "past": self._past, "count": self._count}
+        own |= {"start": self._start} if self.action.mode == "offset" else {}
         return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:
