@@ -1,6 +1,9 @@
-"""Draw what policies scored while they learned, by wall-clock and by samples, from the kept curves.
+"""Keep what policies scored while they learned, and draw it by wall-clock and by samples.
 
-python benchmarks/training_curves.py [--out docs/images/training_curves.png]
+python benchmarks/training_curves.py [--out docs/images/training_curves.png]          # draw what is kept
+python benchmarks/training_curves.py --keep out/screwdriver --name screwdriver/s1    # keep a run's curve first
+
+Of a run's curve.csv `ROWS` rows are kept: means of as many iterations each, of episodes' values those over their episodes.
 """
 
 from __future__ import annotations
@@ -19,6 +22,8 @@ KEPT = ROOT / "docs" / "measured" / "train"
 PANELS: dict[str, dict[str, str]] = {
     "in_palm_rotate, one cube: quarter turns in 10 s": {
         "cube/u3": "u3: four fingers, pyramidal",
+        "cube/c1": "c1: elliptic, condim 4, seed 1",
+        "cube/c2": "c2: elliptic, condim 4, seed 2",
         "cube/v2": "v2: elliptic, seed 2",
         "cube/v2_again": "v2 again",
         "cube/v3": "v3: elliptic, seed 3",
@@ -28,10 +33,21 @@ PANELS: dict[str, dict[str, str]] = {
         "cube/u4": "u4: pyramidal, more noise",
         "cube/t2": "t2: no floor of exploration",
     },
-    "in_palm_rotate, randomised: quarter turns in 10 s": {"rotate/w": "w", "rotate/w_again": "w again"},
+    "in_palm_rotate, randomised: quarter turns in 10 s": {
+        "rotate/y": "y: 8,192 environments, later a drop costs four times as much",
+        "rotate/w": "w",
+        "rotate/w_again": "w again",
+    },
+    "screwdriver: rad/s while upright": {"screwdriver/s1": "s1"},
+    "in_hand_repose: goals in a row": {"repose/r1": "r1"},
     "grip_force: RMS of force error over command": {"grip_force/x": "x", "grip_force/x_again": "x again"},
 }
 """Titles, and the runs by file and label."""
+ROWS = 64
+"""Rows of a curve that are kept, at most."""
+COLUMNS = ("iteration", "samples", "seconds", "Episode/return", "Episode/score", "Episode/dropped", "Reward/spin",
+           "Policy/mean_std", "Loss/learning_rate", "rollout", "update")  # fmt: skip
+"""What is kept of an iteration, if it is there."""
 WINDOW = 5
 """Rows of a curve that a point is the mean of."""
 
@@ -43,6 +59,31 @@ def curve(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     seconds, samples, score = (np.array([float(row[key]) for row in rows]) for key in ("seconds", "samples", "Episode/score"))
     smooth = np.convolve(score, np.ones(WINDOW) / WINDOW, mode="valid")
     return seconds[WINDOW - 1 :] / 60, samples[WINDOW - 1 :] / 1e6, smooth
+
+
+def keep(run: Path, name: str) -> Path:
+    """Write a thinned copy of a run's curve; return its file."""
+    with (run / "curve.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names, size = [column for column in COLUMNS if column in rows[0]], -(-len(rows) // ROWS)
+    found = KEPT / f"{name}.csv"
+    found.parent.mkdir(parents=True, exist_ok=True)
+    with found.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        for first in range(0, len(rows), size):
+            part = rows[first : first + size]
+            writer.writerow([_mean(part, column) for column in names])
+    return found
+
+
+def _mean(rows: list[dict[str, str]], column: str) -> str:
+    """Return a column's mean, of episodes' values that over their episodes; what counts on is that of the last row."""
+    if column in ("iteration", "samples", "seconds"):
+        return f"{float(rows[-1][column]):.5g}" if column != "iteration" else rows[-1][column]
+    weights = [float(row["episodes"]) if column.startswith("Episode/") else 1.0 for row in rows]
+    told = [(float(row[column]), weight) for row, weight in zip(rows, weights, strict=True) if row[column] and weight]
+    return f"{sum(value * weight for value, weight in told) / sum(weight for _, weight in told):.5g}" if told else ""
 
 
 def panel(by_time: Axes, by_samples: Axes, title: str, runs: dict[str, str]) -> None:
@@ -61,11 +102,17 @@ def panel(by_time: Axes, by_samples: Axes, title: str, runs: dict[str, str]) -> 
 
 
 def main() -> None:
-    """Draw them."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Keep one if asked to, and draw them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="a run's folder")
+    parser.add_argument("--name", metavar="TASK/NAME", help="of the curve that is kept")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images" / "training_curves.png")
     options = parser.parse_args()
-    figure = Figure(figsize=(10, 9), dpi=100)
+    if (options.keep is None) != (options.name is None):
+        parser.error("--keep and --name go together")
+    if options.keep is not None:
+        print(keep(options.keep, options.name))
+    figure = Figure(figsize=(10, 15), dpi=100)
     for (title, runs), pair in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):
         by_time, by_samples = pair
         panel(by_time, by_samples, title, runs)

@@ -29,9 +29,9 @@ BEGIN = 0.4
 
 def gait(env: TouchEnv, obs: Mapping[str, Tensor]) -> Tensor:
     """Return the actions that bring targets to where the gait has them now."""
-    target = env.actuation.target
-    middle, sine, cosine = (torch.tensor(own, dtype=target.dtype, device=target.device) for own in (MIDDLE, SINE, COSINE))
-    time = (env.steps * env.control_step).to(target)[:, None]
+    start = env.actuation.start
+    middle, sine, cosine = (torch.tensor(own, dtype=start.dtype, device=start.device) for own in (MIDDLE, SINE, COSINE))
+    time = (env.steps * env.control_step).to(start)[:, None]
     phase = 2.0 * math.pi * FREQUENCY * time
     wanted = middle + sine * phase.sin() + cosine * phase.cos()
-    return (time / BEGIN).clamp(max=1.0) * (wanted - target) / env.spec.action.scale
+    return (time / BEGIN).clamp(max=1.0) * (wanted - start) / env.spec.action.scale

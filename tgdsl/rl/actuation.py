@@ -193,11 +193,13 @@ class Actuation:
 
     Attributes:
         target: Position targets after the last action [rad].
+        start: Those that episodes began with [rad].
         torque: What each drive exerted in the last physics step [N·m].
         drawn: What was drawn for each drive, by the names of `DriveSpec`.
     """
 
     target: Float[Tensor, "env joint"]
+    start: Float[Tensor, "env joint"]
     torque: Float[Tensor, "env joint"]
     drawn: Mapping[str, Float[Tensor, "env joint"]]
 
@@ -246,7 +248,7 @@ class Actuation:
         self._low, self._span = low.float().to(device), (high - low).float().to(device)
         self._past = torch.zeros((int(drive.delay[1]) + 1, num_envs, num), device=device, dtype=dtype)
         self.target, self.torque = torch.zeros_like(self._past[0]), torch.zeros_like(self._past[0])
-        self._play, self._start = torch.zeros_like(self.target), torch.zeros_like(self.target)
+        self._play, self.start = torch.zeros_like(self.target), torch.zeros_like(self.target)
         self._count = torch.zeros(num_envs, dtype=torch.int64, device=device)  # of physics steps, above them of episodes
         self.is_ideal = drive.is_ideal
         """Whether the robot's own actuators do all; if not, `drive` has to be called before each physics step."""
@@ -277,7 +279,7 @@ class Actuation:
         """Have the drives of some environments hold the positions that their joints now have, or the present controls."""
         name, which = ("ctrl", "actuator") if at_controls else ("qpos", "qpos")
         now, mask = self._arrays[name].index_select(1, self._index[which]), chosen[:, None]
-        for held in (self.target, self._past, self._start):
+        for held in (self.target, self._past, self.start):
             put(held, mask, now)
         put(self._play, mask, now + self.drawn["bias"])
         put(self.torque, mask, 0.0)
@@ -291,7 +293,7 @@ class Actuation:
         if self.action.mode == "absolute":
             wanted = low + 0.5 * (action + 1.0) * (high - low)
         else:
-            origin = self._start if self.action.mode == "offset" else self.target
+            origin = self.start if self.action.mode == "offset" else self.target
             wanted = torch.minimum(torch.maximum(origin + self._scale * action, low), high)
         wanted = torch.lerp(wanted, self.target, self.action.smoothing)
         self._take(torch.where(action.isfinite(), wanted, self.target))
@@ -341,7 +343,7 @@ class Actuation:
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
         own = {"target": self.target, "torque": self.torque, "play": self._play, "past": self._past, "count": self._count}
-        own |= {"start": self._start} if self.action.mode == "offset" else {}
+        own |= {"start": self.start} if self.action.mode == "offset" else {}
         return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:

@@ -81,7 +81,7 @@ class Stack:
                 factor = (self._max_norm / (squares.sum(dim=0).sqrt() + NORM_EPS)).clamp(max=1.0)
                 gradients = [gradient * factor.view(-1, *(1,) * (gradient.ndim - 1)) for gradient in gradients]
             for weight, gradient in zip(weights, gradients, strict=True):
-                weight.grad = gradient
+                weight.grad = torch.empty_like(weight).copy_(gradient)  # Adam's fused kernel takes no others' strides
         self.optimiser.step()
 
     @torch.no_grad()
