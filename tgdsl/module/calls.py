@@ -64,20 +64,21 @@ class Calls:
         return {"_wanted": self._wanted, "compiled": {}, "graphed": {}}
 
 
-def inductor_options(plan: Plan, quantities: Sequence[Quantity]) -> dict[str, Any]:
+def inductor_options(plan: Plan, quantities: Sequence[Quantity], device: torch.device) -> dict[str, Any]:
     """Return what is asked of Inductor for a plan and the quantities that it asks for.
 
     Kernels look at each index whether it is in range only where some index is given by the user: a variant's or a material's
     number. Where taxels of one link ask primitives for a depth or a distance and no more, blocks are tiles of environments and
     taxels: what there is once per environment is loaded once per tile. With more links it is looked up per taxel, and with more
-    to find a tile takes too many registers. Where nothing but patches is asked for, kernels are as large as can be.
+    to find a tile takes too many registers. Where nothing but patches is asked for, kernels on a CPU are as large as can be: on
+    a GPU one kernel takes twice the time of three.
     """
     is_slight = (
         all(quantity.is_light(plan.quantities[quantity.name]) for quantity in quantities)
         and not any(sensor.noise for sensor in plan.sensors)
         and all(target.num_pairs == 1 for target in plan.objects)
     )
-    is_fused = bool(quantities) and all(quantity.is_fused for quantity in quantities)
+    is_fused = device.type == "cpu" and bool(quantities) and all(quantity.is_fused for quantity in quantities)
     return torch_internals.inductor_options(any(name in plan.inputs.fields for name in CHOICES), is_slight, is_fused)
 
 

@@ -358,7 +358,7 @@ class TactileModule(HookedModule):
 
     def inductor_options(self) -> dict[str, Any]:
         """Return what `compile` asks of Inductor: see `calls.inductor_options`."""
-        return inductor_options(self.plan, self._quantities)
+        return inductor_options(self.plan, self._quantities, self.device)
 
     def example_state(
         self, num_envs: int, seed: int = 0, dtype: torch.dtype = torch.float64, spread: float = 0.03

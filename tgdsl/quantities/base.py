@@ -236,7 +236,7 @@ class Quantity:
         num_rows: `(part, use) → rows` of memory with one per row of the value, for `Memory(rows=…)`.
         explain: `(part, use, objects of the Plan) → what an account of a sensor says of it`.
         is_light: `(part) → whether` little is found per taxel, so that kernels may be tiled over environments and taxels.
-        is_fused: Whether kernels are to be as large as can be: all that is computed is alike, and would be read again.
+        is_fused: Whether kernels on a CPU are to be as large as can be: all that is computed is alike, and would be read again.
         account: `(part, objects of the Plan) → lines by headline`: what was measured of what is computed beforehand.
     """
 
