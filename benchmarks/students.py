@@ -77,7 +77,7 @@ def profile(given: argparse.Namespace) -> dict[str, Any]:
         found |= simulated(given, loaded, teacher, parts)
     whole = found["one"]["iteration_ms"]
     for part in found.values():
-        part["ratio"] = part["iteration_ms"] / whole
+        part["ratio"] = round(part["iteration_ms"] / whole, 4)
     name = torch.cuda.get_device_name() if given.device.startswith("cuda") else given.device
     shown = {"device": name, "torch": torch.__version__, "task": loaded.spec.task, "envs": given.envs}
     return shown | {
@@ -111,7 +111,7 @@ def simulated(given: argparse.Namespace, loaded: LoadedTask, teacher: Teacher, p
 def measured(
     env: TouchEnv, loaded: LoadedTask, teacher: Teacher, keys: Sequence[StudentKey], warm: int, iterations: int
 ) -> dict[str, Any]:
-    """Teach some students, and return what an iteration takes [ms], and the most memory that torch had [GiB]."""
+    """Teach some students; return medians and extremes of what an iteration takes [ms], and most memory of torch [GiB]."""
     is_cuda = env.device.type == "cuda"
     if is_cuda:
         gc.collect()  # graphs of the part before
@@ -126,9 +126,9 @@ def measured(
     parts = {"rollout": [own.rollout for own in made], "update": [own.update for own in made]}
     parts["iteration"] = [own.rollout + own.update for own in made]
     found: dict[str, Any] = {"students": len(keys), "stacks": len(distiller.rollouts)}
-    found |= {f"{name}_ms": 1e3 * statistics.median(values) for name, values in parts.items()}
-    found |= {f"{name}_spread_ms": [1e3 * min(values), 1e3 * max(values)] for name, values in parts.items()}
-    found["warm_s"] = ready
+    found |= {f"{name}_ms": round(1e3 * statistics.median(values), 3) for name, values in parts.items()}
+    found |= {f"{name}_spread_ms": [round(1e3 * end(values), 3) for end in (min, max)] for name, values in parts.items()}
+    found["warm_s"] = round(ready, 2)
     found["memory_gib"] = torch.cuda.max_memory_reserved(env.device) / 2**30 if is_cuda else None
     return found
 
