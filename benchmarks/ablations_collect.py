@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from ablations_kept import KEPT, LIMIT, ROOT, KeptError, Taught, column, read_json, read_rows, read_text, taught_in
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from tgdsl.files.write import atomic_write_all, with_folder
 from tgdsl.rl.load import load_task
@@ -75,7 +75,8 @@ def collect(
             raise KeptError(f'{run / "table.csv"}: there is no row of the resolution "{resolution}"')
         curve = read_rows(folder / "curve.csv")
         made[resolution] = made_from(folder / "run.json")
-        files[f"{resolution}/curve.csv"] = thinned(curve, own, rows, folder / "curve.csv")
+        parts = begun_midway(curve, made[resolution], folder / "curve.csv")
+        files[f"{resolution}/curve.csv"] = thinned(curve, own, rows, folder / "curve.csv", parts)
         files[f"{resolution}/evaluation.json"] = evaluations(folder / "evaluation.json", own)
     document = next(iter(made.values()))["document"]
     task = next((load_task(file).task for file in (Path(document), ROOT / document) if file.is_file()), None)
@@ -100,7 +101,21 @@ def collect(
     return size
 
 
-def thinned(curve: Sequence[Mapping[str, str]], taught: Sequence[Taught], rows: int, file: Path) -> str:
+def begun_midway(curve: Sequence[Mapping[str, str]], made: Mapping[str, Any], file: Path) -> Bool[Array, " point"]:
+    """Return in which iterations the episodes that ended may have been parts alone: the first of each leg.
+
+    When a run begins or goes on, its first episodes count as having lasted a while, so that not all end at once; what they
+    score is that of a part, which would look as if students had forgotten something.
+    """
+    iteration, physics = column(curve, "iteration", file), made["physics"]
+    steps = round(made["episode"] / (physics["timestep"] * physics["substeps"]))
+    length = math.ceil(steps / made["distill"]["steps"])
+    return np.any([(iteration > first) & (iteration <= first + length) for first in made["begun"]], axis=0)
+
+
+def thinned(
+    curve: Sequence[Mapping[str, str]], taught: Sequence[Taught], rows: int, file: Path, left_out: Bool[Array, " point"]
+) -> str:
     """Return a curve of few rows as CSV: means over spans of as many control steps each, of scores weighted by episodes.
 
     Args:
@@ -108,6 +123,7 @@ def thinned(curve: Sequence[Mapping[str, str]], taught: Sequence[Taught], rows: 
         taught: The students.
         rows: Most rows.
         file: Where it was read from, for errors.
+        left_out: Rows whose scores do not count.
 
     Raises:
         KeptError: If a student's column is missing, or the curve goes on beyond what was evaluated.
@@ -122,7 +138,7 @@ def thinned(curve: Sequence[Mapping[str, str]], taught: Sequence[Taught], rows: 
         steps = f"{round(samples[-1]):,} control steps of each student, the table {taught[0].row.samples:,}"
         raise KeptError(f"{file}: the curve has {steps}: the last leg was not evaluated")
     span = np.ceil(samples / samples[-1] * rows - 1e-9).astype(int)
-    episodes = np.nan_to_num(column(curve, "episodes", file))
+    episodes = np.where(left_out, 0.0, np.nan_to_num(column(curve, "episodes", file)))
     values = {"samples": samples, "seconds": column(curve, "seconds", file)}
     values |= {name: column(curve, name, file) for name in columns}
     text = io.StringIO()
@@ -156,19 +172,25 @@ def made_from(file: Path) -> dict[str, Any]:
     """Return what the simulation of a resolution was made from: of all legs the devices, else of the last one.
 
     Raises:
-        KeptError: If that cannot be read.
+        KeptError: If that cannot be read, or does not say when its legs began.
     """
     starts = read_json(file, "what the run was made from").get("starts") or []
     if not starts:
         raise KeptError(f"{file}: it has no starts")
     last = starts[-1]
+    begun = [start.get("iteration") for start in starts[1:]]
+    if None in begun:
+        raise KeptError(
+            f"{file}: it does not say at which iteration leg {begun.index(None) + 2} began: it is of an older tgdsl"
+        )
     return {
         "document": last["task"],
         "task": last["spec"]["task"],
-        "legs": len(starts),
+        "begun": [0, *begun],
         "devices": list(dict.fromkeys(start["device"] for start in starts)),
         "envs": last["envs"],
         "episode": last["spec"]["episode"],
+        "physics": last["spec"]["physics"],
         "distill": last["spec"]["distill"],
         "versions": last["versions"],
     }

@@ -3,7 +3,7 @@
 - `distill.json`: who was taught, by whom, and what the run was made from; no local paths
 - `table.csv`: as `tgdsl distill` wrote it
 - `<resolution>/curve.csv`: at most 60 rows, each the mean of as many control steps: `samples`, control steps of each student;
-  `seconds`; `Score/…` and `Loss/…` of each student, 4 digits
+  `seconds`; `Score/…` and `Loss/…` of each student, 4 digits; scores without the first episodes of each leg
 - `<resolution>/evaluation.json`: the evaluation of each student
 - `teacher.json`, `rest.json`: evaluations of the teacher and of joints at rest, where given
 

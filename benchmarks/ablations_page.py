@@ -176,7 +176,7 @@ def _conditions(ablation: Ablation) -> str:
     made = ablation.made
     simulations, task = list(made["simulations"].values()), _task(ablation)
     devices = ", ".join(dict.fromkeys(device for own in simulations for device in own["devices"]))
-    legs, envs = max(own["legs"] for own in simulations), simulations[0]["envs"]
+    legs, envs = max(len(own["begun"]) for own in simulations), simulations[0]["envs"]
     minutes = max(each.row.minutes for each in ablation.taught)
     said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {envs:,} environments, {minutes:.1f} min"
     said += f" in {legs} legs" if legs > 1 else ""

@@ -15,8 +15,8 @@ ones in which kernels are loaded and graphs captured; as ratios to `one`. Each p
 Environments are made as `tgdsl distill` makes them, twice: with the sensor of `force_torque` alone for `one` and `seeds`, with
 the sensors of all types for `types`. In environments made once, with all sensors, a single student would pay for seven types
 that it does not feel, and both ratios would look better than they are. There `one` is measured a second time, as `one_beside`:
-how much of `types` is due to the sensors, and how much to the students. `--once` makes them once all the same,
-in half the time.
+how much of `types` is due to the sensors, and how much to the students. With `--once` environments are made once all the same:
+less start-up, and ratios of what students cost alone.
 """
 
 from __future__ import annotations
@@ -99,9 +99,7 @@ def simulated(given: argparse.Namespace, loaded: LoadedTask, teacher: Teacher, p
         found = {}
         for name, keys in parts.items():
             found[name] = measured(env, loaded, teacher, keys, given.warm, given.iterations)
-            told = (
-                f"{key} {value:.1f}" if isinstance(value, float) else f"{key} {value}" for key, value in found[name].items()
-            )
+            told = (f"{key} {value:.1f}" for key, value in found[name].items() if isinstance(value, float))
             print(f"{name}: {', '.join(told)}", flush=True)
         return found
     finally:
