@@ -76,6 +76,8 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert read_checkpoint(folder / "default" / "checkpoint.pt")["iteration"] == 3
     curve = rows_of(folder / "default" / "curve.csv")
     assert [row["iteration"] for row in curve] == ["1", "2", "3"] and float(curve[2]["Loss/none-s0"]) > 0
+    starts = json.loads((folder / "default" / "run.json").read_text())["starts"]
+    assert [start["iteration"] for start in starts] == [0, 2]
     code, out, error = here(base, "distill", "task.yaml", "--resume", str(folder), "--types", "none", "--device", "cpu")
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
 

@@ -189,7 +189,8 @@ class _Part:
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
-            folder.begin(origin | {"students": [key.name for key in distiller.keys]}, loaded, env)
+            taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
+            folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             total = command.iterations or loaded.spec.distill.iterations
             limit = float("inf") if command.minutes is None else 60.0 * command.minutes

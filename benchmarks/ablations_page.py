@@ -1,0 +1,275 @@
+"""Tables of docs/ablations.md, between its markers, from what is kept; what stands around them is left as it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ablations_kept import KEPT, ROOT, Ablation, KeptError, Taught, kept_ablations, read_rows, read_text
+from ablations_plots import plot, png_of
+from ablations_verdicts import FLAT, Trend, is_worse, trend
+
+from tgdsl.files.write import atomic_write
+from tgdsl.rl.students.keys import NONE
+
+PAGE = ROOT / "docs" / "ablations.md"
+BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
+PAPER = {"in_palm_rotate": (6000, 24), "in_hand_repose": (6000, 24), "screwdriver": (2000, 12)}
+"""Iterations of a student and control steps of each environment per iteration: Chung et al., *Tactile Genesis*, appendix,
+"Training Setup", table of hyperparameters. The steps stand there among the teacher's numbers, as do the environments."""
+PAPER_ENVS = 8192
+READING = "grip_force_reading.csv"
+NOTHING = "Nothing is kept yet."
+
+
+class Judged(NamedTuple):
+    """Students that differ in their seeds alone, and what their curve says.
+
+    Attributes:
+        taught: The students.
+        trend: How the mean of their scores changes over the last third; None: too few points.
+        is_flat: Whether that has flattened; None where that cannot be told.
+    """
+
+    taught: Taught
+    trend: Trend | None
+    is_flat: bool | None
+
+
+def paper_samples(task: str) -> int | None:
+    """Return the control steps that a student of the paper learned from; None of a task that it does not have."""
+    if task not in PAPER:
+        return None
+    iterations, steps = PAPER[task]
+    return iterations * steps * PAPER_ENVS
+
+
+def span_of(ablation: Ablation, resolution: str) -> float | None:
+    """Return the range of scores, from joints at rest, or else from students that feel nothing, to the teacher."""
+    if ablation.teacher is None:
+        return None
+    blind = [each.row.score for each in ablation.taught if each.row.type == NONE and each.row.resolution == resolution]
+    low = ablation.rest["score"] if ablation.rest else blind[0] if blind else None
+    return None if low is None else abs(ablation.teacher["score"] - low)
+
+
+def judged(ablation: Ablation) -> list[Judged]:
+    """Return what each curve says."""
+    found = []
+    for taught in ablation.taught:
+        curves, span = ablation.curves[taught.row.resolution], span_of(ablation, taught.row.resolution)
+        score = sum(curves.score[name] for name in taught.names) / len(taught.names)
+        made = trend(curves.samples, score)  # pyright: ignore[reportArgumentType]
+        found.append(Judged(taught, made, None if made is None or span is None else made.is_flat(span)))
+    return found
+
+
+def worse_than(one: Judged, others: Sequence[Judged], is_less_better: bool) -> list[Judged]:
+    """Return those of others that some students are worse than: all curves flat, intervals apart."""
+    if not one.is_flat:
+        return []
+    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.is_flat]
+    return [other for other, own in ends if is_worse((one.taught.row.low, one.taught.row.high), own, is_less_better)]
+
+
+def tables(folder: Path = KEPT) -> str:
+    """Return all that stands between the markers.
+
+    Raises:
+        KeptError: If something that is kept cannot be read.
+    """
+    reading = read_rows(folder / READING) if (folder / READING).is_file() else []
+    parts = [section(ablation, reading) for ablation in kept_ablations(folder)]
+    if reading:
+        parts.append(reading_section(reading, read_text(folder / READING)))
+    return "\n\n".join(parts) or NOTHING
+
+
+def section(ablation: Ablation, reading: Sequence[dict[str, str]] = ()) -> str:
+    """Return an ablation's heading, conditions, table, verdicts and plot."""
+    found, is_less_better = judged(ablation), ablation.made["is_less_better"]
+    force = {row["type"]: f"{float(row['r2']):.3f}" for row in reading} if _task(ablation) == "grip_force" else {}
+    header = ["type", "where", "seeds", f"score [{ablation.made['unit']}]", "95 %", "held", "control steps of each"]
+    header += ["change in the last third (95 %)", "flat", "worse than", *(["R² of the force, whole hand"] if force else [])]
+    lines = [_line(header), _line(["---"] * len(header))]
+    places = list(dict.fromkeys(each.taught.where for each in found))
+
+    def rank(each: Judged) -> tuple[bool, int, float]:
+        row = each.taught.row
+        return row.type == NONE, places.index(each.taught.where), row.score if is_less_better else -row.score
+
+    for each in sorted(found, key=rank):
+        lines.append(_line([*_row(ablation, each, found), *([force.get(each.taught.row.type, "–")] if force else [])]))
+    for name, kept in (("teacher", ablation.teacher), ("joints at rest", ablation.rest)):
+        if kept is not None:
+            bounds = _bounds(*kept["score_interval"])
+            cells = [f"*{name}*", "", "", f"{kept['score']:.3f}", bounds, _percent(kept["held"])]
+            lines.append(_line([*cells, *[""] * (len(header) - len(cells))]))
+    parts = [f"### {ablation.name}", _conditions(ablation), "\n".join(lines), _verdicts(found, is_less_better)]
+    parts.append(f"![Score over control steps of each student: {ablation.name}](images/ablation_{ablation.name}.png)")
+    return "\n\n".join(parts)
+
+
+def reading_section(rows: Sequence[dict[str, str]], text: str) -> str:
+    """Return the table of how well the force can be read from each type."""
+    command = next((line.lstrip("# ") for line in text.splitlines() if line.startswith("#")), "")
+    header = ["type", "numbers", "R² (95 %)", "RMS error [N]", "RMS error, relative (95 %)"]
+    lines = [_line(header), _line(["---"] * len(header))]
+    for row in rows:
+        r2 = f"{float(row['r2']):.3f} ({_bounds(float(row['r2_low']), float(row['r2_high']))})"
+        relative, low, high = (_percent(float(row[name])) for name in ("relative", "relative_low", "relative_high"))
+        cells = [f"`{row['type']}`", row["numbers"], r2, f"{float(row['rms']):.3f}"]
+        lines.append(_line([*cells, f"{relative} ({low} to {high})"]))
+    first = rows[0]
+    said = (
+        f"`{command}`: while the teacher acts, ridge regression from the numbers of one instant to the sum of normal forces on "
+        f"the object, by MuJoCo's own contact forces; {first['train_episodes']} episodes to fit, {first['test_episodes']} "
+        f"others to test, {int(first['instants']):,} instants of them. Intervals are over test episodes. `none`: joint "
+        "positions, velocities and last action."
+    )
+    return "\n\n".join(["### The force that can be read", said, "\n".join(lines)])
+
+
+def written(text: str, made: str, file: Path = PAGE) -> str:
+    """Return a page's text with other tables between its markers.
+
+    Raises:
+        KeptError: If it has no markers.
+    """
+    before, begin, rest = text.partition(BEGIN + "\n")
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise KeptError(f"{file}: expected the lines {BEGIN} and {END}")
+    return f"{before}{begin}\n{made}\n\n{end}{after}"
+
+
+def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
+    """Write tables and plots; return the files.
+
+    Raises:
+        KeptError: If something that is kept cannot be read, or the page has no markers.
+        FileError: If something cannot be written.
+    """
+    atomic_write(page, written(read_text(page), tables(folder), page).encode())
+    files = [page]
+    for ablation in kept_ablations(folder):
+        files.append(page.parent / "images" / f"ablation_{ablation.name}.png")
+        atomic_write(files[-1], png_of(plot(ablation)))
+    return files
+
+
+def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
+    worse = worse_than(own, _beside(own, found), ablation.made["is_less_better"])
+    row, change, paper = own.taught.row, own.trend, paper_samples(_task(ablation))
+    place = ", ".join(part for part in own.taught.where if part)
+    steps = _millions(row.samples) + (f" ({_percent(row.samples / paper, 2)} of the paper's)" if paper else "")
+    moved = "–" if change is None else "{} ({} to {})".format(*map(_signed, change))
+    flat = {True: "yes", False: "no", None: "–"}[own.is_flat]
+    names = _named(worse, _beside(own, found)) or ("–" if own.is_flat else "open")
+    score = [f"{row.score:.3f}", _bounds(row.low, row.high), _percent(row.held)]
+    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, names]
+
+
+def _conditions(ablation: Ablation) -> str:
+    made = ablation.made
+    simulations, task = list(made["simulations"].values()), _task(ablation)
+    devices = ", ".join(dict.fromkeys(device for own in simulations for device in own["devices"]))
+    legs, envs = max(len(own["begun"]) for own in simulations), simulations[0]["envs"]
+    minutes = max(each.row.minutes for each in ablation.taught)
+    said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {envs:,} environments, {minutes:.1f} min"
+    said += f" in {legs} legs" if legs > 1 else ""
+    said += f" for each of {len(simulations)} resolutions. " if len(simulations) > 1 else ". "
+    if made["overrides"]:
+        said += "Overrides: " + ", ".join(f"`{name}={value}`" for name, value in made["overrides"].items()) + ". "
+    spans = {span_of(ablation, resolution) for resolution in made["resolutions"]}
+    spans.discard(None)
+    if spans:
+        low, high = min(filter(None, spans)), max(filter(None, spans))
+        bound = f"{FLAT * low:.3g}" if low == high else f"{FLAT * low:.3g} to {FLAT * high:.3g}"
+        said += f"Flat: within ±{bound} over the last third. "
+    else:
+        said += "Without the scores of teacher and joints at rest no curve is called flat. "
+    paper = paper_samples(task)
+    if paper is None:
+        return said + "The paper does not have this task."
+    iterations, steps = PAPER[task]
+    return said + (
+        f"The paper's students: {iterations:,} iterations of {steps} steps in {PAPER_ENVS:,} environments, "
+        f"{_millions(paper)} control steps each."
+    )
+
+
+def _verdicts(found: Sequence[Judged], is_less_better: bool) -> str:
+    """Return how many pairs are told apart, and what of placements, resolutions and noises."""
+    flat = sum(bool(own.is_flat) for own in found)
+    pairs = [(one, other) for i, one in enumerate(found) for other in _beside(one, found[i + 1 :])]
+    apart = sum(bool(worse_than(a, [b], is_less_better) or worse_than(b, [a], is_less_better)) for a, b in pairs)
+    said = [
+        f"{flat} of {len(found)} curves have flattened; {apart} of {len(pairs)} pairs of types in one place are told apart."
+    ]
+    for i, axis in enumerate(("placement", "resolution", "noise")):
+        for one in found:
+            others = [other for other in found if _differ_in(one, other) == [i]]
+            for other in worse_than(one, others, is_less_better):
+                rest = ", ".join(part for k, part in enumerate(one.taught.where) if part and k != i)
+                names = (one.taught.where[i], other.taught.where[i])
+                said.append(f"- `{one.taught.row.type}`, {rest}: {axis} {names[0]} is worse than {names[1]}.")
+    head, *items = said
+    return "\n\n".join([head, *(["\n".join(items)] if items else [])])
+
+
+def _beside(one: Judged, found: Sequence[Judged]) -> list[Judged]:
+    """Return other types in the same place; what feels nothing is in each place of its resolution."""
+
+    def is_beside(other: Judged) -> bool:
+        if NONE in (one.taught.row.type, other.taught.row.type):
+            return one.taught.row.resolution == other.taught.row.resolution
+        return one.taught.where == other.taught.where
+
+    return [other for other in found if other.taught.row.type != one.taught.row.type and is_beside(other)]
+
+
+def _differ_in(one: Judged, other: Judged) -> list[int]:
+    """Return where two of one type differ: in placement, resolution or noise; nothing if types do, or they feel nothing."""
+    if one.taught.row.type != other.taught.row.type or one.taught.row.type == NONE:
+        return []
+    return [i for i, (a, b) in enumerate(zip(one.taught.where, other.taught.where, strict=True)) if a != b]
+
+
+def _named(worse: Sequence[Judged], beside: Sequence[Judged]) -> str:
+    """Return types by name, with their places where not all of the type's are among them."""
+    types: dict[str, list[Judged]] = {}
+    for each in worse:
+        types.setdefault(each.taught.row.type, []).append(each)
+    names = []
+    for name, own in types.items():
+        is_everywhere = len(own) == sum(each.taught.row.type == name for each in beside)
+        places = "; ".join(", ".join(part for part in each.taught.where if part) for each in own)
+        names.append(f"`{name}`" if is_everywhere else f"`{name}` ({places})")
+    return ", ".join(names)
+
+
+def _task(ablation: Ablation) -> str:
+    return next(iter(ablation.made["simulations"].values()))["task"]
+
+
+def _bounds(low: float, high: float) -> str:
+    return f"{low:.3f} to {high:.3f}" if math.isfinite(low) and math.isfinite(high) else "–"
+
+
+def _percent(share: float, digits: int = 1) -> str:
+    return f"{100 * share:.{digits}f} %"
+
+
+def _signed(value: float) -> str:
+    return f"{round(value, 3) + 0.0:+.3f}"
+
+
+def _millions(count: int) -> str:
+    return f"{count / 1e6:,.0f} M" if count >= 1e8 else f"{count / 1e6:.3g} M"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

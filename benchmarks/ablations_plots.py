@@ -1,0 +1,67 @@
+"""Plots of ablations: score over control steps of each student, a panel per placement, resolution and noise."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+from ablations_kept import Ablation, Taught
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from tgdsl.rl.spec import SENSED
+from tgdsl.rl.students.keys import NONE
+
+MOST_LINES, MOST_COLUMNS = 10, 3
+"""Lines of students in a panel, and panels side by side."""
+COLOURS = {name: colormaps["tab10"](i % 10) for i, name in enumerate(SENSED)} | {NONE: "black"}
+"""Colour of each type, the same in all plots."""
+
+
+def plot(ablation: Ablation) -> Figure:
+    """Return the plot of an ablation; a panel shows at most ten types, the best."""
+    felt = [each for each in ablation.taught if each.row.type != NONE]
+    blind = [each for each in ablation.taught if each.row.type == NONE]
+    places = list(dict.fromkeys(each.where for each in felt)) or [each.where for each in blind]
+    columns = min(MOST_COLUMNS, math.ceil(math.sqrt(len(places))))
+    rows = math.ceil(len(places) / columns)
+    figure = Figure(figsize=(1.5 + 4.2 * columns, 3.4 * rows), dpi=100, layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, where in zip(panels, places, strict=False):
+        own = [each for each in felt if each.where == where]
+        panel(axes, ablation, own + [each for each in blind if each.row.resolution == where[1]], where)
+    for axes in panels[len(places) :]:
+        axes.set_axis_off()
+    for axes in panels[::columns]:
+        axes.set_ylabel(f"score [{ablation.made['unit']}]" if len(ablation.made["unit"]) < 20 else ablation.made["unit"])
+    handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside right upper", frameon=False, fontsize=8)
+    return figure
+
+
+def panel(axes: Axes, ablation: Ablation, taught: list[Taught], where: tuple[str, str, str]) -> None:
+    """Draw the students of one place: the mean over seeds, and from the least to the largest of them."""
+    ranked = sorted(taught, key=lambda each: each.row.score * (1 if ablation.made["is_less_better"] else -1))
+    for each in ranked[:MOST_LINES]:
+        curves = ablation.curves[each.row.resolution]
+        score = np.stack([curves.score[name] for name in each.names])
+        millions, colour = curves.samples / 1e6, COLOURS[each.row.type]
+        axes.plot(millions, score.mean(axis=0), color=colour, linewidth=1.3, label=each.row.type)
+        axes.fill_between(millions, score.min(axis=0), score.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+    for name, kept, dashes in (("teacher", ablation.teacher, "--"), ("joints at rest", ablation.rest, ":")):
+        if kept is not None:
+            axes.axhline(kept["score"], color="black", linestyle=dashes, linewidth=1.0, label=name)
+    left_out = f" (best {MOST_LINES} of {len(ranked)})" if len(ranked) > MOST_LINES else ""
+    axes.set_title(", ".join(part for part in where if part) + left_out, fontsize=9, loc="left")
+    axes.set_xlabel("million control steps of each student", fontsize=9)
+    axes.grid(True, color="#e3e5e8", linewidth=0.6)
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as PNG: the same bytes for the same figure."""
+    content = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(content, metadata={"Software": None})
+    return content.getvalue()

@@ -1,0 +1,278 @@
+"""`benchmarks/ablations.py`: what is kept of runs, and the page that is written from it."""
+
+import csv
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from felt_tasks import felt_task
+from made_up_runs import ITERATIONS, LEGS, PART, ROWS, STEPS, made_up_run
+from written_teachers import teacher
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+import ablations
+from ablations_collect import collect
+from ablations_kept import KEPT, LIMIT, KeptError, kept_ablations, read_ablation
+from ablations_page import BEGIN, END, NOTHING, PAGE, judged, paper_samples, tables, worse_than, write_page, written
+from ablations_plots import plot
+
+from tgdsl.rl.load import load_task
+
+STEPS_OF_EACH = ITERATIONS * STEPS * ROWS
+LEVEL = {"force": lambda x: 10.0, "bool": lambda x: 8.0, "depth": lambda x: 9.9, "proximity": lambda x: 4.0 * x}
+"""Three that have levelled off, the last of them beside the first, and one that still rises."""
+BLIND = LEVEL | {"none": lambda x: 1.0}
+
+
+def evaluation(file, score, task="in_palm_rotate"):
+    file.write_text(json.dumps({"task": task, "score": score, "score_interval": [score - 0.2, score + 0.2], "held": 1.0}))
+    return file
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Keep a made-up run; return the folder of all that is kept."""
+
+    def keep(name="made_up", scores=BLIND, **options):
+        run = made_up_run(tmp_path / f"run_{name}", scores, **options)
+        known = {"teacher": 12.0, "rest": 0.0} if options.get("task") != "grip_force" else {"teacher": 0.0, "rest": 10.0}
+        files = [
+            evaluation(tmp_path / f"{who}.json", score, options.get("task", "in_palm_rotate")) for who, score in known.items()
+        ]
+        collect(run, name, *files, into=tmp_path / "kept")
+        return tmp_path / "kept"
+
+    return keep
+
+
+def rows_of(file):
+    with file.open(newline="") as opened:
+        return list(csv.DictReader(opened))
+
+
+def test_a_curve_is_thinned_to_means_over_equal_spans(kept):
+    """300 iterations are 60 rows of five; of a straight line each is its middle, but for iterations that do not count.
+
+    Those are ones in which no episode ended, and the first 17 of each leg, as long as an episode.
+    """
+    rows = rows_of(kept() / "made_up" / "med" / "curve.csv")
+    assert len(rows) == 60 and rows[0]["samples"] == f"{3 * STEPS * ROWS:.4g}" and rows[-1]["seconds"] == f"{5.0 * 298:.4g}"
+    counted = {i for i in range(1, ITERATIONS + 1) if i % 3 and not any(first < i <= first + PART for first in LEGS)}
+    told = [[i for i in range(5 * k + 1, 5 * k + 6) if i in counted] for k in range(60)]
+    expected = [4.0 * sum(own) / len(own) / ITERATIONS + 0.01 if own else math.nan for own in told]
+    found = [float(row["Score/proximity-hand-clean-s1"] or "nan") for row in rows]
+    assert found == pytest.approx(expected, rel=1e-3, nan_ok=True) and sum(map(math.isnan, found)) == 6
+    assert float(rows[0]["Loss/none-s0"]) == pytest.approx(sum(1 / i for i in range(1, 6)) / 5, rel=1e-3)
+    assert all(len(value.replace(".", "").lstrip("0")) <= 4 for row in rows for value in row.values() if "e" not in value)
+
+
+def test_verdicts_are_those_of_flat_curves_whose_intervals_lie_apart(kept):
+    found = judged(read_ablation(kept() / "made_up"))
+    assert {own.taught.row.type: own.is_flat for own in found} == dict.fromkeys(BLIND, True) | {"proximity": False}
+    worse = {own.taught.row.type: {other.taught.row.type for other in worse_than(own, found, False)} for own in found}
+    assert worse == {
+        "force": set(),
+        "bool": {"force", "depth"},
+        "depth": set(),
+        "proximity": set(),
+        "none": {"force", "depth", "bool"},
+    }
+
+
+def test_of_an_error_less_is_better(kept):
+    text = tables(kept(task="grip_force"))
+    rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
+    assert list(rows) == ["proximity", "bool", "depth", "force", "none"]
+    assert rows["proximity"].endswith("| no | open |") and rows["bool"].endswith("| yes | `none` |")
+    assert rows["none"].endswith("| yes | – |") and rows["force"].endswith("| `bool`, `none` |")
+    assert "of the paper's" not in text and "The paper does not have this task." in text
+
+
+def test_without_a_yardstick_no_curve_is_flat(kept, tmp_path):
+    folder = kept()
+    (folder / "made_up" / "rest.json").unlink()
+    assert judged(read_ablation(folder / "made_up"))[0].is_flat  # what feels nothing stands in for rest
+    (folder / "made_up" / "teacher.json").unlink()
+    assert {own.is_flat for own in judged(read_ablation(folder / "made_up"))} == {None}
+    assert "no curve is called flat" in tables(folder) and "0 of 5 curves have flattened" in tables(folder)
+
+
+def test_placements_resolutions_and_noises(kept):
+    """What feels nothing is in each resolution once, and is compared with all that is felt at it."""
+    places = [
+        (where, density, noise) for density in ("low", "med") for where in ("tips", "hand") for noise in ("clean", "noisy")
+    ]
+    folder = kept(scores={"force": lambda x: 5.0, "none": lambda x: 1.0}, places=places)
+    ablation = read_ablation(folder / "made_up")
+    assert [own.row.resolution for own in ablation.taught if own.row.type == "none"] == ["low", "med"]
+    text = tables(folder)
+    assert "8 of 8 pairs of types in one place are told apart" in text and "is worse than hand" not in text
+    table = rows_of(folder / "made_up" / "table.csv")
+    for row in table:
+        if row["placement"] == "tips" and row["noise"] == "clean":
+            row |= {"score": "3", "low": "2.9", "high": "3.1"}
+    with (folder / "made_up" / "table.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(table[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(table)
+    blind = next(line for line in tables(folder).splitlines() if line.startswith("| `none` | low"))
+    assert blind.endswith("| yes | `force` |")
+    told = [line for line in tables(folder).splitlines() if line.startswith("- ")]
+    assert told == [
+        "- `force`, low, clean: placement tips is worse than hand.",
+        "- `force`, med, clean: placement tips is worse than hand.",
+        "- `force`, tips, low: noise clean is worse than noisy.",
+        "- `force`, tips, med: noise clean is worse than noisy.",
+    ]
+    figure = plot(read_ablation(folder / "made_up"))
+    assert [axes.get_title(loc="left") for axes in figure.axes][:2] == ["tips, low, clean", "tips, low, noisy"]
+    assert max(len(axes.lines) for axes in figure.axes) == 4  # teacher and rest too
+
+
+def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_path):
+    assert paper_samples("in_palm_rotate") == 1_179_648_000 and paper_samples("screwdriver") == 196_608_000
+    folder, page = kept(), tmp_path / "docs" / "ablations.md"
+    kept("another", LEVEL)
+    (page.parent / "images").mkdir(parents=True)
+    page.write_text(f"# Title\n\nProse before.\n\n{BEGIN}\n\nwhat was there\n\n{END}\n\nProse after.\n")
+    files = write_page(folder, page)
+    first = [file.read_bytes() for file in files]
+    text = first[0].decode()
+    assert text.startswith(f"# Title\n\nProse before.\n\n{BEGIN}\n\n### another") and text.endswith(f"{END}\n\nProse after.\n")
+    assert [file.name for file in files] == ["ablations.md", "ablation_another.png", "ablation_made_up.png"]
+    assert f"0.072 M ({100 * STEPS_OF_EACH / 1_179_648_000:.2f} % of the paper's)" in text and "in 2 legs" in text
+    assert "what was there" not in text and "| *teacher* |" in text and "Flat: within ±0.6 over the last third." in text
+    assert [file.read_bytes() for file in write_page(folder, page)] == first
+
+
+def test_the_page_that_is_committed_is_that_of_what_is_kept():
+    text = PAGE.read_text(encoding="utf-8")
+    assert text == written(text, tables()), "run: python benchmarks/ablations.py page"
+    found = kept_ablations()
+    pictures = [PAGE.parent / "images" / f"ablation_{own.name}.png" for own in found]
+    assert sorted((PAGE.parent / "images").glob("ablation_*.png")) == sorted(pictures)
+    sizes = [sum(file.stat().st_size for file in (KEPT / own.name).rglob("*.*")) for own in found]
+    assert all(size <= LIMIT for size in sizes)
+
+
+def test_of_nothing_the_page_says_so(tmp_path):
+    assert tables(tmp_path) == NOTHING
+
+
+def test_no_local_paths_are_kept(kept):
+    own = {"grasps.file": "/somewhere/else/grasps.npz", "x": f"{PAGE}"}
+    text = (kept(overrides=own) / "made_up" / "distill.json").read_text()
+    assert json.loads(text)["overrides"] == {"grasps.file": "grasps.npz", "x": "docs/ablations.md"}
+    assert str(PAGE.parents[1]) not in text
+
+
+def test_sixty_students_find_room(tmp_path):
+    """Ten types at two placements, three seeds: 60 students."""
+    scores = {
+        name: (lambda x, i=i: 1.0 / 3.0 + i * x) for i, name in enumerate([*LEVEL, "force_torque", "elastomer", "agg_bool"])
+    }
+    places = [(where, "med", noise) for where in ("tips", "hand") for noise in ("clean", "noisy")]
+    run = made_up_run(tmp_path / "run", scores, 2, places)
+    assert collect(run, "large", into=tmp_path / "kept") < 100_000
+
+
+def test_mistakes(tmp_path, capsys, monkeypatch):
+    def refused(change=lambda run: None, name="name", **options):
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+        run = made_up_run(tmp_path / "run", options.pop("scores", LEVEL), **options.pop("made", {}))
+        change(run)
+        with pytest.raises(KeptError) as error:
+            collect(run, name, into=tmp_path / "kept", **options)
+        assert not (tmp_path / "kept").exists()
+        return str(error.value)
+
+    assert '"a/b" is no name for an ablation' in refused(name="a/b")
+    assert "distill.json: cannot read this file" in refused(lambda run: (run / "distill.json").unlink())
+    assert "table.csv: cannot read this file" in refused(lambda run: (run / "table.csv").unlink())
+    assert "found the columns a, b, expected type, placement" in refused(
+        lambda run: (run / "table.csv").write_text("a,b\n1,2\n")
+    )
+    asked = {"resolutions": ["med", "low"]}
+    assert 'no row of the resolution "low"' in refused(lambda run: (run / "distill.json").write_text(json.dumps(asked)))
+    assert "distill.json: there are no resolutions" in refused(lambda run: (run / "distill.json").write_text("{}"))
+    stale = refused(made={"is_stale": True})
+    assert (
+        f"curve has {STEPS_OF_EACH + STEPS * ROWS:,} control steps of each student, the table {STEPS_OF_EACH:,}: the last leg"
+        in stale
+    )
+    curve = ("med", "curve.csv")
+    header = lambda run: run.joinpath(*curve).write_text("iteration,samples\n1,1\n")  # noqa: E731
+    assert "curve.csv: there is no column Score/force-hand-clean-s0" in refused(header)
+    starts = lambda run: (run / "med" / "run.json").write_text('{"starts": [{}, {}]}')  # noqa: E731
+    assert "run.json: it does not say at which iteration leg 2 began: it is of an older tgdsl" in refused(starts)
+    assert "there is no evaluation of force-hand-clean-s0" in refused(
+        lambda run: (run / "med" / "evaluation.json").write_text("{}")
+    )
+    assert "this is no JSON" in refused(lambda run: (run / "med" / "run.json").write_text("{"))
+    other = evaluation(tmp_path / "other.json", 1.0, "screwdriver")
+    assert 'an evaluation in "screwdriver", expected one in "in_palm_rotate"' in refused(teacher=other)
+    assert "examples/tasks/nothing.yaml, which is not here" in refused(made={"task": "nothing"})
+    assert "expected at most 300,000: take fewer --rows than 300" in refused(made={"seeds": 20}, rows=300)
+    with pytest.raises(KeptError, match=r"distill.json: there is no document: this is not what `collect` writes"):
+        tables(tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("# Nothing\n")
+    monkeypatch.setattr(sys, "argv", ["ablations.py", "page", "--kept", str(tmp_path / "kept"), "--page", str(page)])
+    with pytest.raises(SystemExit) as ended:
+        ablations.main()
+    assert ended.value.code == 2 and f"{page}: expected the lines {BEGIN} and {END}" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+def test_a_run_of_tgdsl_distill_and_its_next_leg(tmp_path, here):
+    """A small task on the CPU, two resolutions: what the command writes is what is collected."""
+    task = felt_task(tmp_path)
+    sensors = (tmp_path / "sensors.yaml").read_text()
+    dense = "      high:\n        tip: {method: grid, rows: 3, columns: 3, direction: [0, 0, 1], radius: 8 mm}\nobjects:"
+    (tmp_path / "sensors.yaml").write_text(sensors.replace("objects:", dense, 1))
+    teacher(tmp_path / "teacher.pt", load_task(task), ["priv_proprio", "priv_obj_state"])
+    small = [
+        word
+        for own in ("steps=4", "networks.encoder.hidden=[8]", "networks.hidden=[8]")
+        for word in ("--set", f"distill.{own}")
+    ]
+    taught = ("--teacher", str(tmp_path / "teacher.pt"), "--types", "depth,none", "--placements", "ends", "--seeds", "2")
+    options = (
+        "--device",
+        "cpu",
+        "--envs",
+        "8",
+        "--iterations",
+        "6",
+        "--episodes",
+        "2",
+        "--resolutions",
+        "low,high",
+        "-o",
+        "run",
+    )
+    code, _, error = here(tmp_path, "distill", "task.yaml", *taught, *options, *small)
+    assert code == 0, error
+    collect(tmp_path / "run", "small", into=tmp_path / "kept")
+    first = read_ablation(tmp_path / "kept" / "small")
+    assert [(own.row.type, own.row.resolution) for own in first.taught] == [
+        ("depth", "low"),
+        ("none", "low"),
+        ("depth", "high"),
+        ("none", "high"),
+    ]
+    assert first.made["teacher"] == "teacher.pt" and str(tmp_path) not in (tmp_path / "kept/small/distill.json").read_text()
+    code, _, error = here(
+        tmp_path, "distill", "task.yaml", "--resume", "run", "--device", "cpu", "--iterations", "9", "--episodes", "2"
+    )
+    assert code == 0, error
+    collect(tmp_path / "run", "small", into=tmp_path / "kept")
+    second = read_ablation(tmp_path / "kept" / "small")
+    assert second.curves["high"].samples.tolist() == [8.0 * i for i in range(1, 10)]
+    assert second.made["simulations"]["low"]["begun"] == [0, 6] and second.taught[0].row.samples == 72
+    assert "### small" in tables(tmp_path / "kept")
