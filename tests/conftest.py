@@ -7,8 +7,10 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
+import quick_compiles
 from jaxtyping import install_import_hook
 
+quick_compiles.prepare()
 install_import_hook("tgdsl", "beartype.beartype")
 
 from tgdsl.quantities.base import Gathered, Scene  # noqa: E402
@@ -48,7 +50,9 @@ def here(monkeypatch, capsys):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks."""
+    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; slow tests may compile too."""
+    if item.get_closest_marker("slow"):
+        quick_compiles.quicken()
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("gpu"):
             patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
