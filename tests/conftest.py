@@ -7,10 +7,12 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
+import quick_checks
 import quick_compiles
 from jaxtyping import install_import_hook
 
 quick_compiles.prepare()
+quick_checks.prepare()
 install_import_hook("tgdsl", "beartype.beartype")
 
 from tgdsl.quantities.base import Gathered, Scene  # noqa: E402
