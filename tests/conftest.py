@@ -52,11 +52,11 @@ def here(monkeypatch, capsys):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; slow tests may compile too."""
+    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; nor where a test wants none."""
     if item.get_closest_marker("slow"):
         quick_compiles.quicken()
     with pytest.MonkeyPatch.context() as patch:
-        if item.get_closest_marker("gpu"):
+        if item.get_closest_marker("gpu") or item.get_closest_marker("unchecked"):
             patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
         return (yield)
 
