@@ -7,8 +7,12 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
+import quick_checks
+import quick_compiles
 from jaxtyping import install_import_hook
 
+quick_compiles.prepare()
+quick_checks.prepare()
 install_import_hook("tgdsl", "beartype.beartype")
 
 from tgdsl.quantities.base import Gathered, Scene  # noqa: E402
@@ -48,9 +52,11 @@ def here(monkeypatch, capsys):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks."""
+    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; nor where a test wants none."""
+    if item.get_closest_marker("slow"):
+        quick_compiles.quicken()
     with pytest.MonkeyPatch.context() as patch:
-        if item.get_closest_marker("gpu"):
+        if item.get_closest_marker("gpu") or item.get_closest_marker("unchecked"):
             patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
         return (yield)
 

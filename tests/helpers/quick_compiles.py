@@ -1,0 +1,47 @@
+"""torch.compile in less time: what it compiles stays as it is, to the byte.
+
+Most of the time that a test of compiled kernels takes is Inductor's and sympy's, in Python. A third of it is spared by caches
+that hold all expressions of a module, where theirs hold the last 128 or 1,000, and by a garbage collector that runs seldom.
+"""
+
+import functools
+import gc
+import os
+from functools import cache
+
+SYMPY_CACHE = "200000"
+"""Results that sympy keeps of each of its functions; it reads the number when it is imported."""
+COLLECTED_AFTER = (100_000, 10, 10)
+"""Objects made and not freed before the collector looks at them; 700, 10 and 10 are Python's own."""
+
+
+def prepare() -> None:
+    """Set what has to be set before torch and sympy are imported; processes that tests start inherit the first."""
+    os.environ.setdefault("SYMPY_CACHE_SIZE", SYMPY_CACHE)
+    gc.set_threshold(*COLLECTED_AFTER)
+
+
+@cache
+def quicken() -> None:
+    """Widen the caches of Inductor's functions of strides, and fill its table of dtypes once instead of for each operation."""
+    from torch._inductor import sizevars
+    from torch._inductor.codegen import cpp
+    from torch._inductor.dtype_propagation import DtypePropagationOpsHandler
+
+    for name in ("stride_at", "simplify_index_in_vec_range", "stride_at_vec_range"):
+        known = getattr(sizevars, name)
+        wide = functools.lru_cache(maxsize=None)(getattr(known, "__wrapped__", known))
+        setattr(sizevars, name, wide)
+        if hasattr(cpp, name):
+            setattr(cpp, name, wide)
+
+    fill = DtypePropagationOpsHandler.__init__
+    filled = set()
+
+    def fill_once(self: DtypePropagationOpsHandler) -> None:
+        """The handler is a singleton, whose rules torch sets again whenever it is asked for."""
+        if id(self) not in filled:
+            fill(self)
+            filled.add(id(self))
+
+    DtypePropagationOpsHandler.__init__ = fill_once
