@@ -158,8 +158,8 @@ def _turned(phasors: Tensor, struck: Tensor, turn: Tensor, constants: Constants)
         turn: What is left of each part, and what it has of the other, (2, row, part · mode).
         constants: The sensor's.
     """
-    (along, across), modes = turn.unbind(), phasors.shape[-1] // 2
-    crossed = torch.cat([phasors[..., modes:], phasors[..., :modes]], dim=-1)
+    along, across = turn.unbind()
+    crossed = phasors.roll(phasors.shape[-1] // 2, dims=-1)
     after = torch.addcmul(phasors * along, crossed, across)
     for grain, own in enumerate(constants["struck"].unbind()):
         one = struck[:, :, grain]
