@@ -39,21 +39,26 @@ def rolled(env, steps=12):
     return {name: torch.stack([obs[name] for obs in seen]) for name in seen[0]}
 
 
+def assert_same(one, two):
+    """Up to rounding: a processor's vectors treat what is left at the end of an array by instructions of another rounding."""
+    torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-6 * float(two.abs().max()))
+
+
 def test_each_group_is_what_an_environment_of_its_own_feels(make):
-    """Clean to the bit, with noise where no other links draw numbers before its own; and what else is seen is the same."""
+    """With noise too, where no other links draw numbers before its own; and what else is seen is the same."""
     env = make(FEELS)
     found = rolled(env)
     assert "tactile_sensors" not in found
     for felt in FEELS:
         if felt.noise == "clean":
             alone = rolled(make(touch=felt.type, placement=felt.placement))
-            assert torch.equal(found[felt.group], alone["tactile_sensors"]), felt
+            assert_same(found[felt.group], alone["tactile_sensors"])
             assert (alone["tactile_sensors"] != 0).any(), felt
             assert torch.equal(found["priv_obj_state"], alone["priv_obj_state"])
     noisy, clean = (found[Felt("depth", "all", noise).group] for noise in ("noisy", "clean"))
     assert not torch.equal(noisy, clean)
     alone = rolled(make(touch="depth", placement="all", noise="noisy"))
-    assert torch.equal(noisy, alone["tactile_sensors"])
+    assert_same(noisy, alone["tactile_sensors"])
 
 
 def test_one_sensor_serves_all_types_placements_and_noises(make):
@@ -93,7 +98,8 @@ def test_images_of_a_network_are_those_of_the_module(make, placement):
     action = torch.full((ENVS, 2), 0.3)
     for _ in range(3):
         obs, own = env.step(action).obs, alone.step(action).obs
-    assert torch.equal(obs[felt.group], own["tactile_sensors"]) and (obs[felt.group] != 0).any()
+    assert_same(obs[felt.group], own["tactile_sensors"])
+    assert (obs[felt.group] != 0).any()
     found = Images(grid).images(obs[felt.group])
     images, masks = alone.images()
     assert found.shape[1] == len(images) == (1 if placement == "ends" else 2)
