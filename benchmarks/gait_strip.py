@@ -1,7 +1,7 @@
 """Draw instants of what a policy does, side by side, in one image.
 
-    MUJOCO_GL=osmesa python benchmarks/gait_strip.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --first 2 --every 0.075 \
-        --out docs/images/screwdriver.png
+    MUJOCO_GL=osmesa python benchmarks/gait_strip.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --every 0.05 \
+        --distance 0.45 --azimuth=200 --elevation=-25 --out docs/images/screwdriver.png
 
 One environment with the task's first variant, in MuJoCo, without exploration.
 """

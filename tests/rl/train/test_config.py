@@ -28,7 +28,8 @@ def test_the_paper_s_numbers():
         "screwdriver": (5000, 12, 0.99, 0.0),
     }
     for name, wanted in table.items():
-        task = load_task(f"examples/tasks/{name}.yaml", {"train": {"learning_rate": 1e-3}})  # what is said leaves the rest as it is
+        said = {"train": {"learning_rate": 1e-3}}  # which leaves the rest as it is
+        task = load_task(f"examples/tasks/{name}.yaml", said)
         train = task.spec.train
         assert (train.iterations, train.steps, train.discount, train.entropy) == wanted
         made = config(task, GROUPS)
