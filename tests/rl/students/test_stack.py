@@ -10,6 +10,7 @@ from tgdsl.rl.students import losses
 from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
 from tgdsl.rl.students.stack import Stack, made
 from tgdsl.rl.students.student import Architecture, deployed, forgotten
+from tgdsl.rl.train.checkpoint import FORMAT, read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
 SEEDS = (3, 4, 9)
@@ -170,6 +171,31 @@ def test_what_is_saved_goes_on_to_the_bit(kind):
         assert torch.equal(value, other.parameters[name])
     with pytest.raises(RuntimeError, match="its networks are"):
         other.load_state_dict(Stack(architecture("mlp", ()), SEEDS, 1e-2, 0.1).state_dict())
+
+
+@pytest.mark.parametrize("seeds", [(3,), SEEDS])
+@pytest.mark.parametrize("kind", ENCODERS)
+def test_gradients_lie_as_their_weights_do(kind, seeds):
+    """Adam's fused kernel on a GPU refuses others; those that `vmap` makes are often transposed."""
+    stack = Stack(architecture(kind), seeds, 1e-2, 0.1)
+    x, memory = inputs(stack, 6, torch.float32)
+    stack.descend(stack(x, memory).action.square().mean(dim=(1, 2)) + 0.0 * sum(w.sum() for w in stack.parameters.values()))
+    assert all(weight.grad.stride() == weight.stride() for weight in stack.parameters.values())
+
+
+def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
+    one, other = (Stack(architecture("mlp"), seeds, 1e-2, 0.1) for seeds in (SEEDS, (1, 2, 5)))
+    x, memory = inputs(one, 6, torch.float32)
+    made = one(x, memory)
+    one.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
+    state = {"format": FORMAT, "stacks": [one.state_dict()]}
+    sizes = [write_checkpoint(state, tmp_path / f"{slim}.pt", slim) for slim in (False, True)]
+    assert sizes[1] < 0.9 * sizes[0]
+    other.load_state_dict(read_checkpoint(tmp_path / "True.pt")["stacks"][0])
+    assert all(torch.equal(value, other.parameters[name]) for name, value in one.parameters.items())
+    own, kept = (next(iter(each.optimiser.state.values()))["exp_avg"] for each in (one, other))
+    assert kept.dtype == torch.float32
+    torch.testing.assert_close(kept, own, rtol=2**-8, atol=0)
 
 
 def test_what_goes_on_at_another_rate_learns_at_it():

@@ -124,14 +124,21 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
 
 def _slim(state: Mapping[str, Any]) -> dict[str, Any]:
     """Return a state whose optimisers' moments are rounded; optimisers widen them again."""
+    if "stacks" in state:
+        stacks = [dict(own) | {"optimiser": _rounded(own["optimiser"])} for own in state["stacks"]]
+        return dict(state) | {"stacks": stacks}
     if "algorithm" not in state:
         return dict(state)
     algorithm = dict(state["algorithm"])
     for name in [name for name in algorithm if name.endswith("optimizer_state_dict")]:
-        optimiser = dict(algorithm[name])
-        optimiser["state"] = {
-            i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in own.items()}
-            for i, own in optimiser["state"].items()
-        }
-        algorithm[name] = optimiser
+        algorithm[name] = _rounded(algorithm[name])
     return dict(state) | {"algorithm": algorithm}
+
+
+def _rounded(optimiser: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an optimiser's state with its moments in bfloat16."""
+    moments = {
+        i: {key: value.bfloat16() if key.startswith("exp_avg") else value for key, value in own.items()}
+        for i, own in optimiser["state"].items()
+    }
+    return dict(optimiser) | {"state": moments}
