@@ -51,14 +51,17 @@ def here(monkeypatch, capsys):
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
     """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; nor where a test wants none."""
     if item.get_closest_marker("slow"):
         quick_compiles.quicken()
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("gpu") or item.get_closest_marker("unchecked"):
             patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-        return (yield)
+        made = yield
+    if item.get_closest_marker("slow") and (nextitem is None or nextitem.path != item.path):
+        quick_compiles.forget()
+    return made
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -2,6 +2,7 @@
 
 Most of the time that a test of compiled kernels takes is Inductor's and sympy's, in Python. A third of it is spared by caches
 that hold all expressions of a module, where theirs hold the last 128 or 1,000, and by a garbage collector that runs seldom.
+Both are emptied after each file of tests that compiles, so that memory does not grow from one to the next.
 """
 
 import functools
@@ -21,6 +22,16 @@ def prepare() -> None:
     gc.set_threshold(*COLLECTED_AFTER)
 
 
+_widened: list[functools._lru_cache_wrapper] = []
+
+
+def forget() -> None:
+    """Free what was kept for expressions of graphs that are gone, and these."""
+    for wide in _widened:
+        wide.cache_clear()
+    gc.collect()
+
+
 @cache
 def quicken() -> None:
     """Widen the caches of Inductor's functions of strides, and fill its table of dtypes once instead of for each operation."""
@@ -31,6 +42,7 @@ def quicken() -> None:
     for name in ("stride_at", "simplify_index_in_vec_range", "stride_at_vec_range"):
         known = getattr(sizevars, name)
         wide = functools.lru_cache(maxsize=None)(getattr(known, "__wrapped__", known))
+        _widened.append(wide)
         setattr(sizevars, name, wide)
         if hasattr(cpp, name):
             setattr(cpp, name, wide)
