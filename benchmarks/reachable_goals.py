@@ -103,7 +103,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     given = parser.parse_args()
-    overrides = {"touch": "none", "randomise.drive": {}, "randomise.push": {}} | dict(one.split("=", 1) for one in given.set)
+    overrides = {"touch": "none", "randomise.drive": {}, "randomise.push": {}, "physics.cone": "pyramidal"}
+    overrides |= {"action": {"mode": "relative", "scale": "0.05 rad"}} | dict(one.split("=", 1) for one in given.set)
     env = TouchEnv(given.task, given.episodes, threads=1, seed=given.seed, overrides=overrides)
     planners, scores = [Planner(env, row) for row in range(given.episodes)], {}
     while len(scores) < given.episodes:

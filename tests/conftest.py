@@ -52,11 +52,11 @@ def here(monkeypatch, capsys):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
-    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks; nor where a test wants none."""
+    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks."""
     if item.get_closest_marker("slow"):
         quick_compiles.quicken()
     with pytest.MonkeyPatch.context() as patch:
-        if item.get_closest_marker("gpu") or item.get_closest_marker("unchecked"):
+        if item.get_closest_marker("gpu"):
             patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
         made = yield
     if item.get_closest_marker("slow") and (nextitem is None or nextitem.path != item.path):

@@ -147,7 +147,6 @@ def test_chance_is_the_best_fixed_place(make):
 
 
 @pytest.mark.slow
-@pytest.mark.unchecked
 def test_no_fixed_stop_does_better_than_chance(make):
     """Fingers that slide to fixed targets, whatever they meet: all targets together, and the best one (5 standard errors)."""
     env = make(400, touch="none")
@@ -210,7 +209,6 @@ def test_a_run_is_the_same_twice_and_is_written(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.unchecked
 @pytest.mark.filterwarnings(TORCHSCRIPT)
 def test_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path):
     """After 50 updates, a quarter of a million control steps; nine in ten and more went well where this was measured."""
@@ -219,7 +217,6 @@ def test_a_minute_of_learning_with_touch_is_far_above_chance(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.unchecked
 @pytest.mark.filterwarnings(TORCHSCRIPT)
 def test_without_touch_nothing_but_chance_is_learned(tmp_path):
     result = run("blind", 50, tmp_path)

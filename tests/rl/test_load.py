@@ -42,6 +42,8 @@ def problems(call):
         ("physics: {cone: round}\n", 8, "physics.cone", "elliptic"),
         ("physics: {substeps: 0}\n", 8, "physics.substeps", "1"),
         ("action: {scale: 3 mm}\n", 8, "action.scale", "unit of angle"),
+        ("action: {mode: absolute, scale: 0.2}\n", 8, "action", "absolute actions have none"),
+        ("action: {mode: ofset}\n", 8, "action.mode", "offset"),
         ("color: red\n", 8, "color", "unknown key"),
     ],
 )

@@ -41,6 +41,7 @@ import mujoco
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from pydantic import model_validator
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, did_you_mean, listed
@@ -67,6 +68,15 @@ class ActionSpec(SpecModel):
     """The same of slides [m]."""
     smoothing: Annotated[float, Quantity("number", ge=0.0)] = 0.0
     """σ, share of the target before in the new one, less than 1."""
+
+    @model_validator(mode="after")
+    def _check(self) -> ActionSpec:
+        for name, unit in (("scale", "rad"), ("slide_scale", "m")):
+            value = getattr(self, name)
+            if self.mode == "absolute" and value != type(self).model_fields[name].default:
+                what = f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
+                raise ValueError(f"{what}; leave it out, or take mode relative or offset")
+        return self
 
 
 class DriveSpec(SpecModel):
@@ -342,8 +352,8 @@ class Actuation:
 
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""
-        own = {"target": self.target, "torque": self.torque, "play": self._play, "past": self._past, "count": self._count}
-        own |= {"start": self.start} if self.action.mode == "offset" else {}
+        own = {"target": self.target, "start": self.start, "torque": self.torque}
+        own |= {"play": self._play, "past": self._past, "count": self._count}
         return own | {f"drawn/{name}": value for name, value in self.drawn.items()}
 
     def _ends(self, which: int) -> Float[Tensor, "drawn joint"]:

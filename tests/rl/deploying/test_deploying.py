@@ -214,7 +214,6 @@ KEPT = REPOSITORY / "policies" / "grip_force_agg_force.pt"
 
 
 @pytest.mark.slow
-@pytest.mark.unchecked
 def test_the_kept_student_grips_alike_in_simulation_and_behind_the_line():
     """Four episodes, of another object each; scores within the interval of the simulation's."""
     task, calibration = REPOSITORY / "examples/tasks/grip_force.yaml", REPOSITORY / "examples/tasks/grip_calibration.yaml"

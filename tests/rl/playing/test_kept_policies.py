@@ -15,17 +15,19 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
 def test_it_does_better_than_rest(file):
-    """Within three seconds in eight environments, in sum, on MuJoCo; a student over an episode.
+    """Within two seconds in four environments, on MuJoCo; a student over an episode of eight, and what has to bring an object to
+    one goal after another over one of sixteen, in sum: there some lose theirs.
 
     Its card names no place on the machine where it was learned.
     """
     assert file.stat().st_size <= 8 * 2**20
     card = card_of(file)
     assert card["score"]["episodes"] >= 1000 and str(Path.home()) not in str(card) and "/tmp" not in str(card)
-    num = 8
+    is_long = "teacher" in card or card["score"]["task"] == "in_hand_repose"
+    num = (8 if "teacher" in card else 16) if is_long else 4
     env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
     policy, obs = policy_for(env, file), env.reset(seed=1)
-    steps = env.max_steps - 1 if "teacher" in card else round(3.0 / env.control_step)
+    steps = env.max_steps - 1 if is_long else round(2.0 / env.control_step)
     returns = torch.zeros(num)
     for _ in range(steps):
         step = env.step(policy(obs))
@@ -33,7 +35,7 @@ def test_it_does_better_than_rest(file):
     rest = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
     rest.reset(seed=1)
     resting = sum(rest.step(torch.zeros(num, env.num_actions)).reward.float() for _ in range(steps))
-    assert returns.sum() > resting.sum()
+    assert returns.sum() > resting.sum() if is_long else (returns > resting).all()
     assert (env.task.score().sum() < rest.task.score().sum()) == env.task.is_less_better
     env.close()
     rest.close()

@@ -109,8 +109,9 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=["xhand1", "sharpa"])
 def test_the_hands_too(document):
-    quick = {"episode": "0.6 s", "action.scale": 0.3, "goal_tolerance": 0.39, "goal_hold": 2, "goal_timeout": "0.4 s"}
-    env = TouchEnv(document, 4, threads=1, overrides={**quick, "touch": "none"})
+    quick = {"episode": "0.6 s", "goal_tolerance": 0.39, "goal_hold": 2, "goal_timeout": "0.4 s"}
+    moved = {"action": {"mode": "relative", "scale": 0.3}, "touch": "none"}
+    env = TouchEnv(document, 4, threads=1, overrides=quick | moved)
     recorder = Recorder(env)
     for action in random_actions(env, 60):
         recorder.step(action)

@@ -35,7 +35,7 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
 
 @pytest.mark.slow
 def test_the_hand_too():
-    env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"episode": "0.5 s", "action.scale": 0.3})
+    env = TouchEnv(DOCUMENT, 4, threads=1, overrides={"episode": "0.5 s", "action": {"mode": "relative", "scale": 0.3}})
     recorder = Recorder(env)
     for action in random_actions(env, 50):
         recorder.step(action)
