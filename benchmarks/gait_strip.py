@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.policy import policy_for
 
 COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
@@ -25,8 +25,7 @@ COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
 
 def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.ndarray]]:
     """Return the model, the object's body, and `qpos` at the instants that are drawn."""
-    overrides = dict(pair.split("=", 1) for pair in options.set)
-    env = TouchEnv(load_task(options.task, overrides), 1, seed=options.seed)
+    env = TouchEnv(options.task, 1, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
     policy, obs, found = policy_for(env, options.policy), env.reset(), []
     first, every = (round(time / env.control_step) for time in (options.first, options.every))
     for step in range(first + every * COLUMNS * ROWS):

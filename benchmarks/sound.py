@@ -10,9 +10,9 @@
 environments, links and modes at once: a phasor per mode, turned from one sample to the next, which gives the same samples (this
 is checked first). `two poles` is the loop with a two-pole resonator per mode, as printed by Chung et al., struck by the same
 impulses: cheaper, but another response, which float32 does not hold. All write their state in place, once eager and once
-compiled; in turn, in CPU time of the thread. `products` are the fewest
-multiply-adds that a block takes, as part of a product of large matrices: its bound on this machine. `module` is a whole call,
-contacts and noise included, with mean gains and with those at the contact. `gpu` times the whole call, compiled.
+compiled; in turn, in CPU time of the thread. `products` are the fewest multiply-adds that a block takes, as part of a product
+of large matrices: its bound on this machine. `module` is a whole call, contacts and noise included, with mean gains and with
+those at the contact. `gpu` times the whole call, compiled.
 """
 
 from __future__ import annotations
@@ -84,56 +84,53 @@ def write_artefacts(options: argparse.Namespace) -> None:
 # On a CPU -------------------------------------------------------------------------------------------------------------------
 
 
-class TwoPoles:
-    """Two-pole resonators, sample by sample."""
+class Loop:
+    """Modes as phasors, turned from one sample to the next; `parts` are their real and imaginary parts (env, row, mode)."""
 
     def __init__(self, constants: dict[str, Tensor], num_envs: int):
         """Be at rest."""
-        self._constants = constants
-        radius, angle = torch.exp(-constants["decay"] * STEP / SAMPLES), 2 * math.pi * constants["frequency"] * STEP / SAMPLES
-        self._first, self._second, self._gain = 2 * radius * torch.cos(angle), radius**2, constants["gain"] * torch.sin(angle)
+        self._constants, self._gain = constants, constants["gain"]
+        rate = torch.complex(-constants["decay"].double(), 2 * math.pi * constants["frequency"].double())
+        turn = torch.exp(rate * (STEP / SAMPLES))
+        self._real, self._imag = turn.real.float(), turn.imag.float()
         self.state = {"steady": torch.zeros(num_envs, LINKS, 1), "pending": torch.zeros(num_envs, LINKS, 1)}
-        self.last, self.before = (torch.zeros(num_envs, LINKS, MODES) for _ in range(2))
+        self.parts = tuple(torch.zeros(num_envs, LINKS, MODES) for _ in range(2))
 
-    def step(self, force: Tensor, last: Tensor, before: Tensor) -> tuple[Tensor, ...]:
-        """Return samples (env, sample, row), and the last two values of each resonator."""
+    def samples(self, struck: Tensor, real: Tensor, imag: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Return samples (env, row) each, and both parts of what is kept, after impulses (env, row, 1) [N·s]."""
+        real, found = real + struck, []
+        for _ in range(SAMPLES):
+            real, imag = self._real * real - self._imag * imag, self._imag * real + self._real * imag
+            found.append((self._gain * imag).sum(dim=-1))
+        return found, real, imag
+
+    def advance(self, force: Tensor) -> Tensor:
+        """Advance by a physics step: return samples (env, sample, row)."""
         impulse, new = impulses(force, self._constants, self.state)
-        struck, found = impulse.sum(dim=2)[..., None], []
+        found, *parts = self.samples(impulse.sum(dim=2)[..., None], *self.parts)
+        for old, made in (*zip(self.parts, parts, strict=True), *((self.state[name], new[name]) for name in self.state)):
+            old.copy_(made)
+        return torch.stack(found, dim=1)
+
+
+class TwoPoles(Loop):
+    """Two-pole resonators; `parts` are their last two values."""
+
+    def __init__(self, constants: dict[str, Tensor], num_envs: int):
+        """Be at rest."""
+        super().__init__(constants, num_envs)
+        self._first, self._second = 2 * self._real, self._real**2 + self._imag**2
+        self._gain = constants["gain"] * torch.sin(2 * math.pi * constants["frequency"] * STEP / SAMPLES)
+
+    def samples(self, struck: Tensor, real: Tensor, imag: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Return the same; the last value, then the one before."""
+        (last, before), found = (real, imag), []
         for k in range(SAMPLES):
             now = self._first * last - self._second * before
             now = now + struck if k == 0 else now
             found.append((self._gain * now).sum(dim=-1))
             last, before = now, last
-        return torch.stack(found, dim=1), last, before, new["steady"], new["pending"]
-
-    def advance(self, force: Tensor) -> Tensor:
-        """Advance by a physics step: return samples (env, sample, row)."""
-        found, last, before, steady, pending = self.step(force, self.last, self.before)
-        for old, new in ((self.last, last), (self.before, before)):
-            old.copy_(new)
-        self.state["steady"].copy_(steady)
-        self.state["pending"].copy_(pending)
-        return found
-
-
-class Loop(TwoPoles):
-    """Phasors, sample by sample: `last` and `before` are their real and imaginary parts."""
-
-    def __init__(self, constants: dict[str, Tensor], num_envs: int):
-        """Be at rest."""
-        super().__init__(constants, num_envs)
-        rate = torch.complex(-constants["decay"].double(), 2 * math.pi * constants["frequency"].double())
-        turn = torch.exp(rate * (STEP / SAMPLES))
-        self._real, self._imag, self._loud = turn.real.float(), turn.imag.float(), constants["gain"]
-
-    def step(self, force: Tensor, last: Tensor, before: Tensor) -> tuple[Tensor, ...]:
-        """Return samples (env, sample, row), and both parts of each phasor."""
-        impulse, new = impulses(force, self._constants, self.state)
-        real, imag, found = last + impulse.sum(dim=2)[..., None], before, []
-        for _ in range(SAMPLES):
-            real, imag = self._real * real - self._imag * imag, self._imag * real + self._real * imag
-            found.append((self._loud * imag).sum(dim=-1))
-        return torch.stack(found, dim=1), real, imag, new["steady"], new["pending"]
+        return found, last, before
 
 
 def block(force: Tensor, context: Context, constants: dict[str, Tensor], state: dict[str, Tensor]) -> tuple[Tensor, dict]:

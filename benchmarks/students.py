@@ -33,6 +33,7 @@ from typing import Any
 
 import torch
 
+from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_write, check_writable, with_folder
@@ -58,8 +59,7 @@ def profile(given: argparse.Namespace) -> dict[str, Any]:
     Raises:
         TgdslError: If environments do not divide among the students of a part; nothing has run.
     """
-    overrides = dict(pair.split("=", 1) for pair in given.set)
-    loaded = load_task(given.task, overrides)
+    loaded = load_task(given.task, parsed_overrides(tuple(given.set)))
     place, noise = [loaded.spec.placement], [loaded.spec.noise]
     one = student_keys([ALONE], place, noise, 1)
     simulations: list[Parts] = [

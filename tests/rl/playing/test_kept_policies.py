@@ -15,9 +15,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: file.stem)
 def test_it_does_better_than_rest(file):
-    """Within two seconds in four environments, on MuJoCo; a student over an episode of eight, and what has to bring an object to
-    one goal after another over one of sixteen, in sum: there some lose theirs.
+    """Within two seconds in four environments, on MuJoCo; others over an episode, in sum.
 
+    These are a student, of eight environments, and what brings objects to orientations, of sixteen: some lose theirs.
     Its card names no place on the machine where it was learned.
     """
     assert file.stat().st_size <= 8 * 2**20
