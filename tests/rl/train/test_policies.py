@@ -15,7 +15,10 @@ pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 
 def test_a_policy_brings_its_card(tmp_path):
-    """It acts as the network without exploration; other joints and taxels are refused; a touchless one takes any taxels."""
+    """It acts as the network without exploration; a touchless one takes any taxels.
+
+    Other joints and taxels are refused, and tasks, actions and control steps other than those that it was learned with.
+    """
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     learner.iterate()
     card = card_for(learner, made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
@@ -34,6 +37,15 @@ def test_a_policy_brings_its_card(tmp_path):
     write_policy(learner, card | {"taxels": "0"}, file)
     with pytest.raises(PolicyError, match="this policy feels with other taxels"):
         policy_for(env, file)
+    learned = card["spec"]
+    for other, message in (
+        ({"task": "screwdriver"}, f'was learned in the task "screwdriver", not "{learned["task"]}"'),
+        ({"action": learned["action"] | {"smoothing": 0.5}}, "was learned with other actions: "),
+        ({"physics": learned["physics"] | {"timestep": 0.001}}, "was learned with other control steps "),
+    ):
+        write_policy(learner, card | {"spec": learned | other}, file)
+        with pytest.raises(PolicyError, match=message):
+            policy_for(env, file)
     blind, _ = small_learner(tmp_path)
     write_policy(blind, card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
     assert policy_for(env, file).groups == ("priv_proprio", "goal", "priv_obj_state")

@@ -125,6 +125,7 @@ def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
     """
     card = card_of(file)
     if card is not None:
+        check_learned(card, file, env.spec)
         check_card(card, file, env.joint_names, env.touch.taxels_id)
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
     return Policy(file, groups, env.num_envs, env.num_actions, env.device)
