@@ -47,7 +47,7 @@ class Taught:
     """Students that differ in their seeds alone.
 
     Attributes:
-        row: Their row of the table, with the resolution of their simulation, also where they feel nothing.
+        row: Their row of the table.
         names: Their names, a student per seed.
     """
 
@@ -129,12 +129,12 @@ def read_ablation(folder: Path) -> Ablation:
 
 
 def taught_in(rows: Sequence[Mapping[str, str]], resolutions: Sequence[str], file: Path) -> tuple[Taught, ...]:
-    """Return the students of a table; rows of those that feel nothing stand in it once per resolution, in order.
+    """Return the students of a table.
 
     Raises:
         KeptError: If the table is of other columns, or of other resolutions.
     """
-    found, simulations = [], iter(resolutions)
+    found = []
     for row in rows:
         if tuple(row) != Row._fields:
             raise KeptError(f"{file}: found the columns {', '.join(map(str, row))}, expected {', '.join(Row._fields)}")
@@ -142,8 +142,6 @@ def taught_in(rows: Sequence[Mapping[str, str]], resolutions: Sequence[str], fil
             own = Row(**{name: kind(row[name]) for name, kind in get_type_hints(Row).items()})
         except ValueError as error:
             raise KeptError(f"{file}: {error}") from error
-        if own.type == NONE:
-            own = own._replace(resolution=next(simulations, ""))
         if own.resolution not in resolutions:
             raise KeptError(f'{file}: a row of the resolution "{own.resolution}", expected {", ".join(resolutions)}')
         felt = None if own.type == NONE else Felt(own.type, own.placement, own.noise)

@@ -13,6 +13,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from ablations_kept import KeptError, read_rows
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -62,9 +63,12 @@ def curve(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def keep(run: Path, name: str) -> Path:
-    """Write a thinned copy of a run's curve; return its file."""
-    with (run / "curve.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    """Write a thinned copy of a run's curve; return its file.
+
+    Raises:
+        KeptError: If there is no curve.
+    """
+    rows = read_rows(run / "curve.csv")
     names, size = [column for column in COLUMNS if column in rows[0]], -(-len(rows) // ROWS)
     found = KEPT / f"{name}.csv"
     found.parent.mkdir(parents=True, exist_ok=True)
@@ -111,7 +115,10 @@ def main() -> None:
     if (options.keep is None) != (options.name is None):
         parser.error("--keep and --name go together")
     if options.keep is not None:
-        print(keep(options.keep, options.name))
+        try:
+            print(keep(options.keep, options.name))
+        except KeptError as error:
+            parser.error(str(error))
     figure = Figure(figsize=(10, 15), dpi=100)
     for (title, runs), pair in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):
         by_time, by_samples = pair

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pickle
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -90,6 +91,13 @@ def test_the_version_on_the_command_line(here, tmp_path):
 
 def test_the_package_says_that_it_is_typed():
     assert (REPOSITORY / "tgdsl" / "py.typed").is_file()
+
+
+def test_shapes_in_annotations_are_text():
+    """A number is none to jaxtyping, which then checks nothing of that annotation: `Float[Tensor, " 3"]`."""
+    unchecked = re.compile(r"\b(?:Bool|Complex|Float|Inexact|Int|Num|Real|Shaped|UInt)\[[\w.]+, *\d")
+    files = [*(REPOSITORY / "tgdsl").rglob("*.py"), *(REPOSITORY / "examples").rglob("*.py")]
+    assert [str(file) for file in files if unchecked.search(file.read_text(encoding="utf-8"))] == []
 
 
 # Tables

@@ -50,7 +50,7 @@ def made_up_run(
         (folder / resolution / "run.json").write_text(json.dumps({"starts": starts}))
         for type_, felt in kinds:
             score = scores[type_](1.0) + 0.005 * (seeds - 1)
-            place = (felt.placement, resolution, felt.noise) if felt else ("", "", "")
+            place = (felt.placement, resolution, felt.noise) if felt else ("", resolution, "")
             bounds = (score, score - 0.1, score + 0.1)
             rows.append(Row(type_, *place, seeds, *bounds, 0.9, 100 * seeds, ITERATIONS * STEPS * ROWS, 25.0))
     write_table(rows, folder / "table.csv")

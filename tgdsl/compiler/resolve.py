@@ -97,7 +97,7 @@ class Resolved:
         model = self.scene.compiled
         return model.body(model.jnt_bodyid[model.joint(joint).id]).name
 
-    def anchor_of(self, joint: str) -> Float[np.ndarray, 3]:
+    def anchor_of(self, joint: str) -> Float[np.ndarray, " 3"]:
         """Return where a joint's anchor is in the frame of the body that it moves [m]."""
         return self.scene.compiled.jnt_pos[self.scene.compiled.joint(joint).id].copy()
 

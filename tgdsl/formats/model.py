@@ -238,5 +238,5 @@ class Model:
         return np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
 
 
-def _matrix(quat: Float[np.ndarray, 4]) -> Float[np.ndarray, "3 3"]:
+def _matrix(quat: Float[np.ndarray, " 4"]) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_quat(quat, scalar_first=True).as_matrix()

@@ -13,7 +13,7 @@ TIE = tie()
 """Lengths [m] that differ by no more than this count as equal, and the first among equals wins."""
 
 
-def signed_distance(shape: str, size: Float[Array, 3], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:
+def signed_distance(shape: str, size: Float[Array, " 3"], point: Float[Array, " 3"]) -> tuple[float, Float[Array, " 3"]]:
     """Return the signed distance [m] of a point to a primitive, and the outward gradient, both in the geom's frame.
 
     Found by way of the nearest surface point, which the module's own `shapes` never form. Where that is not unique, the

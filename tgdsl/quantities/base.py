@@ -129,7 +129,7 @@ class Planning:
     report: Report
     progress: Progress
     joints: tuple[str, ...] = ()
-    anchors: Mapping[str, Float[np.ndarray, 3]] = field(default_factory=dict)
+    anchors: Mapping[str, Float[np.ndarray, " 3"]] = field(default_factory=dict)
 
     def bodies_of(self, taxels: Int[np.ndarray, " taxel"]) -> list[str]:
         """Return the body of each taxel."""

@@ -28,17 +28,17 @@ class ReferenceBody:
         angvel: Angular velocity [rad/s].
     """
 
-    pos: Float[Array, 3]
-    quat: Float[Array, 4]
-    linvel: Float[Array, 3]
-    angvel: Float[Array, 3]
+    pos: Float[Array, " 3"]
+    quat: Float[Array, " 4"]
+    linvel: Float[Array, " 3"]
+    angvel: Float[Array, " 3"]
 
     @cached_property
     def rotation(self) -> Float[Array, "3 3"]:
         """Rotates body vectors into the world."""
         return Rotation.from_quat(self.quat, scalar_first=True).as_matrix()
 
-    def velocity_at(self, point: Float[Array, 3]) -> Float[Array, 3]:
+    def velocity_at(self, point: Float[Array, " 3"]) -> Float[Array, " 3"]:
         """Velocity [m/s] of the body's material at a world point."""
         return self.linvel + np.cross(self.angvel, point - self.pos)
 
@@ -63,7 +63,7 @@ class ReferenceScene:
     bodies: tuple[str, ...]
     contact_pairs: tuple[Pair, ...]
     fields: Mapping[str, Array]
-    shift: Float[Array, 3]
+    shift: Float[Array, " 3"]
 
     def body(self, name: str) -> ReferenceBody:
         """Return a body where the state has it."""
@@ -86,7 +86,7 @@ class ReferenceScene:
         """Return which of its variants an object has."""
         return int(self.fields["variant"][target.varied]) if target.num_variants > 1 else 0
 
-    def size(self, target: PairedObject) -> Float[Array, 3] | None:
+    def size(self, target: PairedObject) -> Float[Array, " 3"] | None:
         """Return an object's size [m], if that is part of the state."""
         return self.fields["object_size"][target.varied] if target.is_sized else None
 

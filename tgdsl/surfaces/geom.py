@@ -31,8 +31,8 @@ class Geom:
     mesh: str
     body: str
     shape: str
-    size: Float[np.ndarray, 3]
-    pos: Float[np.ndarray, 3]
+    size: Float[np.ndarray, " 3"]
+    pos: Float[np.ndarray, " 3"]
     rotation: Float[np.ndarray, "3 3"]
     is_colliding: bool
 

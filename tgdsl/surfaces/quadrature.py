@@ -225,7 +225,7 @@ def _areas(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, " f"]:
     return 0.5 * np.linalg.norm(_cross(corners), axis=1)
 
 
-def primitive_area(shape: str, size: Float[np.ndarray, 3]) -> float:
+def primitive_area(shape: str, size: Float[np.ndarray, " 3"]) -> float:
     """Return the area of a primitive [m²]; of an ellipsoid by Carlson's integral (DLMF 19.33.2).
 
     Args:
@@ -246,7 +246,7 @@ def primitive_area(shape: str, size: Float[np.ndarray, 3]) -> float:
             return float(4.0 * np.pi * elliprg((a * b) ** 2, (b * c) ** 2, (c * a) ** 2))
 
 
-def _triangles(shape: str, size: Float[np.ndarray, 3], spacing: float) -> Float[np.ndarray, "f 3 3"]:
+def _triangles(shape: str, size: Float[np.ndarray, " 3"], spacing: float) -> Float[np.ndarray, "f 3 3"]:
     """Return triangles of a primitive in its own frame."""
     if shape == "box":
         return np.concatenate([_box_face(size, axis, sign) for axis in range(3) for sign in (-1.0, 1.0)])

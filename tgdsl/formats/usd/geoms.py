@@ -48,7 +48,7 @@ class Gprim:
     is_hull: bool
     friction: tuple[float | None, float | None, float | None]
     density: float
-    color: Float[np.ndarray, 4] | None
+    color: Float[np.ndarray, " 4"] | None
     mass_model: str = ""
     mjcf_attributes: dict[str, str] = field(default_factory=dict)
     mesh: dict[str, str] = field(default_factory=dict)
@@ -220,7 +220,7 @@ def _material(stage: Stage, prim: Prim, is_solref: bool) -> tuple[tuple[float | 
     return (sliding, torsional, rolling), density
 
 
-def _color(stage: Stage, prim: Prim) -> Float[np.ndarray, 4] | None:
+def _color(stage: Stage, prim: Prim) -> Float[np.ndarray, " 4"] | None:
     """Return the display colour; of several, the first."""
     colors = stage.authored(prim, "primvars:displayColor")
     if not colors:

@@ -55,7 +55,7 @@ class Joint:
     path: str
     prim: Prim
     kind: str
-    axis: Float[np.ndarray, 3]
+    axis: Float[np.ndarray, " 3"]
     bodies: tuple[str | None, str | None]
     targets: tuple[str, str]
     frames: tuple[Matrix, Matrix]
@@ -200,7 +200,7 @@ def _constraint(stage: Stage, prim: Prim) -> str:
     return next((schema for schema in CONSTRAINTS if stage.has(prim, schema)), "")
 
 
-def _moved(kind: str, axis: Float[np.ndarray, 3], position: float) -> Matrix:
+def _moved(kind: str, axis: Float[np.ndarray, " 3"], position: float) -> Matrix:
     """Return where frame 1 of a hinge or slide is in frame 0."""
     matrix = np.eye(4)
     if kind == "hinge":
@@ -210,7 +210,7 @@ def _moved(kind: str, axis: Float[np.ndarray, 3], position: float) -> Matrix:
     return matrix
 
 
-def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | None, str]:
+def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, " 3"], Range | None, str]:
     """Return the kind of a joint, its axis, its range [rad or m] and which drive is its own."""
     schema = str(prim.GetTypeName())
     axis = AXES.get(str(stage.value(prim, "physics:axis")), AXES["X"])
@@ -233,7 +233,7 @@ def _kind(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | 
     return kind, axis, _range(low, high, unit), "angular" if kind == "hinge" else "linear"
 
 
-def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, 3], Range | None, str]:
+def _generic(stage: Stage, prim: Prim) -> tuple[str, Float[np.ndarray, " 3"], Range | None, str]:
     """Return what a joint that is defined by its limits amounts to."""
     free: dict[str, Range | None] = {}
     for dof in DOFS:

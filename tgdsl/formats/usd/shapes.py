@@ -70,7 +70,7 @@ class Shape:
         own = trimesh.Trimesh(*merge_vertices(self.vertices, self.faces), process=False)
         return own if own.is_volume else None
 
-    def mass_properties(self, is_hull: bool) -> tuple[float, Float[np.ndarray, 3], Float[np.ndarray, "3 3"]]:
+    def mass_properties(self, is_hull: bool) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
         """Return volume [m³], centre of mass [m] and inertia about it at density one [m⁵], in the body's frame.
 
         Args:
@@ -158,7 +158,7 @@ def _sizes(stage: Stage, prim: Prim, *names: str, is_least_zero: bool = False) -
     return values
 
 
-def _scales(scale: Float[np.ndarray, 3] | None, axis: str) -> tuple[float, float]:
+def _scales(scale: Float[np.ndarray, " 3"] | None, axis: str) -> tuple[float, float]:
     """Return the scale across an axis and along it; zero across if it is not the same all around, or there is shear."""
     if scale is None:
         return 0.0, 0.0
@@ -180,7 +180,7 @@ def mesh_shape(vertices: Vertices, faces: Faces, place: Matrix) -> Shape:
     return Shape("mesh", (), pose, vertices * scale, faces)
 
 
-def box_shape(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matrix) -> Shape:
+def box_shape(low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], place: Matrix) -> Shape:
     """Return the box between two corners of a prim's space, as a mesh where shear makes it none."""
     split = rotation_and_scale(place[:3, :3])
     if split is None:
@@ -194,7 +194,7 @@ def box_shape(low: Float[np.ndarray, 3], high: Float[np.ndarray, 3], place: Matr
     return Shape("box", (x, y, z), pose)
 
 
-def _sphere_shape(radius: float, centre: Float[np.ndarray, 3], place: Matrix) -> Shape:
+def _sphere_shape(radius: float, centre: Float[np.ndarray, " 3"], place: Matrix) -> Shape:
     """Return a ball under any linear map: an ellipsoid along its singular vectors."""
     linear, pose = place[:3, :3] * radius, place.copy()
     pose[:3, 3] += place[:3, :3] @ centre
@@ -256,6 +256,6 @@ def collision_shape(stage: Stage, prim: Prim, shape: Shape, place: Matrix) -> tu
     return shape, wanted == "convexHull"
 
 
-def quaternion(matrix: Matrix) -> Float[np.ndarray, 4]:
+def quaternion(matrix: Matrix) -> Float[np.ndarray, " 4"]:
     """Return the rotation of a rigid transform as w, x, y, z."""
     return Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True, scalar_first=True)

@@ -208,7 +208,7 @@ class Stage:
             raise self.error(prim, "its transform is not finite")
         return self.world_from_stage @ own
 
-    def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, 3]]:
+    def frame(self, prim: Prim) -> tuple[Matrix, Float[np.ndarray, " 3"]]:
         """Return a prim's rigid frame in the world [m] and the scale [m per unit of its space] along its axes.
 
         Raises:
@@ -243,7 +243,7 @@ def _is_rounded(exact: Any, value: Any) -> bool:
         return False
 
 
-def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, 3]] | None:
+def rotation_and_scale(linear: Float[np.ndarray, "3 3"]) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]] | None:
     """Decompose a linear map into a rotation and a scale along the axes (negative for a reflection); None if it shears."""
     lengths = np.linalg.norm(linear, axis=0)
     if not (lengths > 0).all():

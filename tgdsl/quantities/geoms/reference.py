@@ -19,12 +19,12 @@ class ReferenceGeom:
     """A geom in its body's frame: MuJoCo's type name and size [m], position [m], rotation matrix."""
 
     shape: str
-    size: Float[Array, 3]
-    pos: Float[Array, 3]
+    size: Float[Array, " 3"]
+    pos: Float[Array, " 3"]
     rotation: Float[Array, "3 3"]
 
 
-def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[Array, 3] | None = None) -> list[ReferenceGeom]:
+def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[Array, " 3"] | None = None) -> list[ReferenceGeom]:
     """Return the geoms of a case of a table; with a size, that of its only geom [m]."""
     found = []
     for g, shape in enumerate(table.shapes):
@@ -34,7 +34,7 @@ def geoms_of(table: GeomTable[np.ndarray], case: int, size: Float[Array, 3] | No
     return found
 
 
-def distance_to(geoms: Sequence[ReferenceGeom], point: Float[Array, 3]) -> tuple[float, Float[Array, 3]]:
+def distance_to(geoms: Sequence[ReferenceGeom], point: Float[Array, " 3"]) -> tuple[float, Float[Array, " 3"]]:
     """Return the signed distance [m] of a point in a body's frame to its geoms, and its gradient; the first of equals wins."""
     least, outward = np.inf, np.zeros(3)
     for geom in geoms:

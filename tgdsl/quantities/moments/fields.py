@@ -292,7 +292,7 @@ def moment_sums(
 
 
 def _node_sums(
-    surface: Quadrature, origin: Float[np.ndarray, 3], num: tuple[int, int, int], cell: float, radius: float, channels: int
+    surface: Quadrature, origin: Float[np.ndarray, " 3"], num: tuple[int, int, int], cell: float, radius: float, channels: int
 ) -> Float[np.ndarray, "x y z channel"]:
     """Return moments at the nodes of a lattice, brick by brick."""
     index = np.stack(np.unravel_index(np.arange(int(np.prod(num))), num), axis=1)
@@ -325,7 +325,9 @@ def _splines(values: Float[np.ndarray, "x y z channel"]) -> Float[np.ndarray, "x
     return found
 
 
-def _errors(values: Float[np.ndarray, "x y z channel"], origin: Float[np.ndarray, 3], cell: float, true: Truth) -> FieldErrors:
+def _errors(
+    values: Float[np.ndarray, "x y z channel"], origin: Float[np.ndarray, " 3"], cell: float, true: Truth
+) -> FieldErrors:
     x, y, z, channels = values.shape
     place, side = split(torch.from_numpy(origin)), torch.tensor(cell, dtype=torch.float64)
     flat = torch.from_numpy(values.reshape(-1, channels))

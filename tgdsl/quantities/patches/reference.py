@@ -23,10 +23,10 @@ class Patch:
 
     force: float
     polygon: float
-    pos: Float[Array, 3]
-    normal: Float[Array, 3]
-    object_pos: Float[Array, 3]
-    object_normal: Float[Array, 3]
+    pos: Float[Array, " 3"]
+    normal: Float[Array, " 3"]
+    object_pos: Float[Array, " 3"]
+    object_normal: Float[Array, " 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,8 @@ class ReferenceObject:
     volume: float
     area: float
     curvature: float
-    corner: Float[Array, 3]
-    size: Float[Array, 3]
+    corner: Float[Array, " 3"]
+    size: Float[Array, " 3"]
 
 
 @dataclass(frozen=True, eq=False)

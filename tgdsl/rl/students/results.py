@@ -35,7 +35,7 @@ class Row(NamedTuple):
     Attributes:
         type: What they feel.
         placement: Where.
-        resolution: How densely.
+        resolution: How densely whoever feels in the same simulation does.
         noise: With what noise.
         seeds: How many they are.
         score: Mean of the score.
@@ -69,7 +69,7 @@ def rows_of(
     Args:
         keys: The students.
         found: How good each is.
-        resolution: How densely they feel.
+        resolution: How densely those who feel do.
         samples: Control steps of each.
         minutes: How long all have learned together [min].
     """
@@ -81,8 +81,7 @@ def rows_of(
         low, high = interval(own)
         score, held = fmean(each.score for each in own), fmean(each.held for each in own)
         episodes = sum(each.episodes for each in own)
-        place = resolution if placement else ""
-        rows.append(Row(type_, placement, place, noise, len(own), score, low, high, held, episodes, samples, minutes))
+        rows.append(Row(type_, placement, resolution, noise, len(own), score, low, high, held, episodes, samples, minutes))
     return rows
 
 

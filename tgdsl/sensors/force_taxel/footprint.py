@@ -134,7 +134,7 @@ class Bodies(NamedTuple):
     padded: Float[Tensor, "6 body padded"]
 
 
-def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, 6]:
+def box(pos: Float[np.ndarray, "taxel 3"]) -> Float[np.ndarray, " 6"]:
     """Return the least and the largest coordinates of taxels [m], 0 of none."""
     return np.concatenate([pos.min(axis=0), pos.max(axis=0)]) if len(pos) else np.zeros(6)
 
@@ -283,7 +283,7 @@ def reference(
     normal: Float[np.ndarray, "contact 3"],
     radius: float,
     levenberg: Sequence[float],
-) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, 3]]:
+) -> tuple[Float[np.ndarray, "contact taxel"], Float[np.ndarray, " 3"]]:
     """Return what `footprint` does, for one environment: shares γ_c λ_cj, and the moment that is left [N·m].
 
     `outward` are the taxels' own normals n, `normal` those of the contacts.
@@ -313,9 +313,9 @@ def reference_beta(
     weight: Float[np.ndarray, "contact taxel"],
     lever: Sequence[Float[np.ndarray, "taxel 3"]],
     load: Float[np.ndarray, " contact"],
-    wanted: Float[np.ndarray, 3],
+    wanted: Float[np.ndarray, " 3"],
     levenberg: Sequence[float],
-) -> Float[np.ndarray, 3]:
+) -> Float[np.ndarray, " 3"]:
     """Return β [1] after the given steps."""
     beta = np.zeros(3)
     for least in levenberg:

@@ -49,7 +49,7 @@ def reference(
     return pressure, after | {"track": track, "emitted": sound[num:], "ages": ages}
 
 
-def age_of_sound(listener: Float[np.ndarray, 3], track: Float[np.ndarray, "node 3"], dt: float, speed: float) -> float:
+def age_of_sound(listener: Float[np.ndarray, " 3"], track: Float[np.ndarray, "node 3"], dt: float, speed: float) -> float:
     """Return how long ago a source emitted what is heard now [s], its places at the last steps being given, now first."""
 
     def early(age: float) -> float:

@@ -67,9 +67,9 @@ class StageWriter:
 
 def set_pose(
     prim: Any,
-    pos: Float[np.ndarray, 3],
-    quat: Float[np.ndarray, 4],
-    scale: Float[np.ndarray, 3] | None = None,
+    pos: Float[np.ndarray, " 3"],
+    quat: Float[np.ndarray, " 4"],
+    scale: Float[np.ndarray, " 3"] | None = None,
 ) -> None:
     """Give a prim its pose in its parent's frame, in double precision.
 

@@ -13,7 +13,7 @@ MASS_MODELS = ("legacy", "convex", "exact", "shell")
 """MJCF's ways to take a mesh; `shell` is there for all shapes."""
 
 
-def mujoco_mass_properties(shape: Shape, model: str) -> tuple[float, Float[np.ndarray, 3], Float[np.ndarray, "3 3"]]:
+def mujoco_mass_properties(shape: Shape, model: str) -> tuple[float, Float[np.ndarray, " 3"], Float[np.ndarray, "3 3"]]:
     """Return volume [m³] or a shell's area [m²], centre of mass [m] and inertia about it at density one, in the body's frame.
 
     Args:

@@ -143,5 +143,5 @@ def opened(sheet: Sheet) -> Sheet:
     return Sheet(sheet.vertices[source], faces)
 
 
-def _point(place: Float[np.ndarray, 3]) -> str:
+def _point(place: Float[np.ndarray, " 3"]) -> str:
     return "({}) mm".format(", ".join(f"{1e3 * x:.3g}" for x in place))
