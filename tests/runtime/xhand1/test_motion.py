@@ -181,7 +181,13 @@ def driven(emulator: Emulator) -> list[float]:
 
 
 def becomes_passive(emulator: Emulator) -> bool:
-    return wait_until(lambda: emulator.hand.is_passive)
+    """Wait until the hand was last told to be passive, and is: a request is noted before it is obeyed."""
+
+    def is_so() -> bool:
+        last = list(emulator.requests)[-1][1]
+        return last.payload[14:16] != MODE_POSITION and emulator.hand.is_passive
+
+    return wait_until(is_so)
 
 
 def test_an_emulated_hand_goes_where_it_is_told_and_close_makes_it_passive():
