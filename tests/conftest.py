@@ -64,6 +64,11 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     return made
 
 
+def pytest_collection_finish() -> None:
+    """By now all that tests import is imported, but for what compiles."""
+    quick_compiles.settle()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark as slow what slow.txt lists, and what is slow in the suite that kinds inherit; take taxels as they are in some rooms.

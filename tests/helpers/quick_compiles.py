@@ -1,8 +1,8 @@
 """torch.compile in less time: what it compiles stays as it is, to the byte.
 
 Most of the time that a test of compiled kernels takes is Inductor's and sympy's, in Python. A third of it is spared by caches
-that hold all expressions of a module, where theirs hold the last 128 or 1,000, and by a garbage collector that runs seldom.
-Both are emptied after each file of tests that compiles, so that memory does not grow from one to the next.
+that hold all expressions of a module, where theirs hold the last 128 or 1,000, and by a garbage collector that runs seldom and
+does not look at what was imported. What is kept is forgotten after each file of tests that compiles: memory does not grow.
 """
 
 import functools
@@ -22,14 +22,34 @@ def prepare() -> None:
     gc.set_threshold(*COLLECTED_AFTER)
 
 
+def settle() -> None:
+    """Have the collector leave alone what is there by now, some million objects: it lives as long as the process."""
+    gc.collect()
+    gc.freeze()
+
+
+@cache
+def _settle_once() -> None:
+    settle()
+
+
 _widened: list[functools._lru_cache_wrapper] = []
 
 
 def forget() -> None:
-    """Free what was kept for expressions of graphs that are gone, and these."""
+    """Free what was kept for graphs of modules that are gone, and these, if anything was compiled."""
+    if not any(wide.cache_info().currsize for wide in _widened):
+        return
+    import torch
+    from sympy.core.cache import clear_cache
+    from torch._subclasses.fake_tensor import FakeTensorMode
+
     for wide in _widened:
         wide.cache_clear()
-    gc.collect()
+    torch.compiler.reset()
+    FakeTensorMode.cache_clear()
+    clear_cache()
+    _settle_once() or gc.collect()
 
 
 @cache

@@ -23,7 +23,9 @@ SIZES = {
 
 def geom(shape, size=None, pos=(0.0, 0.0, 0.0), rotation=None) -> Geom:
     size = SIZES.get(shape, (0.0,) * 3) if size is None else size
-    return Geom(0, "", "", "body", shape, np.array(size), np.array(pos, dtype=float), np.eye(3) if rotation is None else rotation, True)
+    return Geom(
+        0, "", "", "body", shape, np.array(size), np.array(pos, dtype=float), np.eye(3) if rotation is None else rotation, True
+    )
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
