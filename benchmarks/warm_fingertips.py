@@ -16,11 +16,12 @@ import itertools
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
 import tgdsl
+from tgdsl.fields.materials import MATERIALS
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 
@@ -28,16 +29,38 @@ LINK = "right_hand_mid_link2"
 FINGERTIPS = {1.0: "glass", 10.0: "stainless_steel", 100.0: "aluminium", 150.0: "aluminium"}
 """Conductivities of the paper's table [W/(m·K)], and what else the fingertip is like."""
 EMISSIVITIES, FLUXES = (0.5, 0.85), (500.0, 5000.0)
-COLUMNS: tuple[tuple[str, str, str, float | None], ...] = (
-    ("paper", "rubber", "δ = 1 mm", 3.1416e-3),
-    ("paper", "aluminium", "δ = 1 mm", 3.1416e-3),
-    ("paper", "none", "", None),
-    ("physical", "rubber", "Hertz", None),
-    ("physical", "aluminium", "Hertz", None),
-    ("physical", "aluminium", "1 cm²", 1e-4),
-    ("physical", "none", "", None),
+
+
+class Column(NamedTuple):
+    """What a fingertip is pressed on, and by whose physics.
+
+    Attributes:
+        model: "paper" or "physical".
+        ball: Material of the ball; "none" if there is none.
+        patch: What its area is called.
+        area: Area of the patch [m²]; None: that of the force.
+        solid: Share of the fingertip's box that is solid, the rest being hollow.
+    """
+
+    model: str
+    ball: str
+    patch: str = ""
+    area: float | None = None
+    solid: float = 1.0
+
+
+COLUMNS = (
+    Column("paper", "rubber", "δ = 1 mm", 3.1416e-3),
+    Column("paper", "aluminium", "δ = 1 mm", 3.1416e-3),
+    Column("paper", "none"),
+    Column("physical", "rubber", "Hertz"),
+    Column("physical", "aluminium", "Hertz"),
+    Column("physical", "aluminium", "1 cm²", 1e-4),
+    Column("physical", "aluminium", "1 cm², thin walls", 1e-4, 0.1),
+    Column("physical", "none"),
+    Column("physical", "none", "thin walls", solid=0.1),
 )
-"""Model, material of the ball, and area of the patch [m²]: that of the force if None. The paper's πδ is a number for it."""
+"""The paper's πδ is a number for an area."""
 LATCH, SECONDS = 42.2, 20.0
 
 
@@ -54,9 +77,10 @@ class Run:
     curve: list[float]
 
 
-def module_of(model: str, ball: str, area: float | None, conductivity: float, emissivity: float, flux: float) -> TactileModule:
+def module_of(column: Column, conductivity: float, emissivity: float, flux: float) -> TactileModule:
     """Return the module of a fingertip and a ball."""
-    material = {"like": FINGERTIPS[conductivity], "conductivity": conductivity}
+    ball, area, density = column.ball, column.area, column.solid * MATERIALS[FINGERTIPS[conductivity]].density
+    material = {"like": FINGERTIPS[conductivity], "conductivity": conductivity, "density": density}
     sensor: dict[str, Any] = {
         "kind": "temperature_grid",
         "links": LINK,
@@ -67,7 +91,7 @@ def module_of(model: str, ball: str, area: float | None, conductivity: float, em
         "emissivity": emissivity,
         "source": {"flux": flux, "face": "-z"},
         "outputs": "max",
-        "model": model,
+        "model": column.model,
     }
     return tgdsl.compile(
         {
@@ -105,17 +129,16 @@ def pressed(module: TactileModule, force: float, dt: float) -> SceneState:
     return SceneState(body_pos=pose, body_quat=quat, contact_netforce=net, contact_found=found, dt=dt, **values)
 
 
-def name_of(column: tuple[str, str, str, float | None]) -> str:
+def name_of(column: Column) -> str:
     """Return what a column is called."""
-    model, ball, area, _ = column
-    return ", ".join(part for part in (model, "no ball" if ball == "none" else ball, area) if part)
+    ball = "no ball" if column.ball == "none" else column.ball
+    return ", ".join(part for part in (column.model, ball, column.patch) if part)
 
 
-def run(column: tuple[str, str, str, float | None], k: float, emissivity: float, flux: float, force: float, dt: float) -> Run:
+def run(column: Column, k: float, emissivity: float, flux: float, force: float, dt: float) -> Run:
     """Press a fingertip on a ball for 20 s."""
-    model, ball, _, area = column
-    module = module_of(model, ball, area, k, emissivity, flux)
-    state, latched, curve = pressed(module, 0.0 if ball == "none" else force, dt), None, []
+    module = module_of(column, k, emissivity, flux)
+    state, latched, curve = pressed(module, 0.0 if column.ball == "none" else force, dt), None, []
     reading = 22.0
     for step in range(round(SECONDS / dt) + 1):
         reading = float(module(state)["heat"][0, 0, 0])
@@ -147,15 +170,15 @@ def plot(runs: list[Run], file: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    columns = [name_of(column) for column in COLUMNS if column[0] == "physical"]
-    figure, axes = pyplot.subplots(1, len(columns), figsize=(12, 3.6), sharey=True, layout="constrained")
+    columns = [name_of(column) for column in COLUMNS if column.model == "physical"]
+    figure, axes = pyplot.subplots(1, len(columns), figsize=(17, 3.6), sharey=True, layout="constrained")
     for ax, name in zip(axes, columns, strict=True):
         for colour, k in zip(("tab:gray", "tab:blue", "tab:orange", "tab:red"), FINGERTIPS, strict=True):
             for style, q in zip((":", "-"), FLUXES, strict=True):
                 own = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, 0.5, q))
                 ax.plot(range(len(own.curve)), own.curve, style, color=colour, label=f"k = {k:g}, q = {q:g}")
         ax.axhline(LATCH, color="black", lw=0.8)
-        ax.set(title=name, xlabel="time [s]")
+        ax.set(title=name.removeprefix("physical, "), xlabel="time [s]")
     axes[0].set(ylabel="warmest cell [°C]")
     axes[-1].legend(fontsize="x-small")
     figure.savefig(file, dpi=130)

@@ -1,5 +1,6 @@
 """Types and shapes are checked at run time in tests, and only there; and the command line is run as users run it."""
 
+import gc
 import sys
 import warnings
 from collections.abc import Generator
@@ -67,6 +68,11 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 def pytest_collection_finish() -> None:
     """By now all that tests import is imported, but for what compiles."""
     quick_compiles.settle()
+
+
+def pytest_unconfigure() -> None:
+    """Have all freed, or else nanobind tells at the end of what was not."""
+    gc.unfreeze()
 
 
 @pytest.hookimpl(tryfirst=True)
