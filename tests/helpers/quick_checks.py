@@ -3,19 +3,22 @@
 At each call jaxtyping binds arguments to their names, for messages and for shapes that are written as f-strings, and checks
 them twice; and it has checks of inner functions written and compiled anew whenever the outer one is called. Here parameters are
 checked once, then the result; and checks are made when a function is first called, once for each that is written. Names that
-stand further below in its file are known by then, which jaxtyping takes for anything.
+stand further below in its file are known by then, which jaxtyping takes for anything; others mean what they do at first.
 """
 
 import functools
 import typing
 from collections.abc import Callable
-from inspect import Parameter, signature
+from inspect import Parameter, Signature, signature
 from types import CodeType, FunctionType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import jaxtyping
 from jaxtyping import AbstractArray, _decorator, config
 from jaxtyping._storage import pop_shape_memo, push_shape_memo
+
+ANYTHING = (Any, NoReturn, Parameter.empty)
+"""Annotations of which nothing is to be checked."""
 
 
 class Checks(NamedTuple):
@@ -36,6 +39,8 @@ class Checks(NamedTuple):
 
 _made: dict[int, Checks] = {}
 """By number of the code: constructors of data classes have codes that are equal, and other annotations."""
+_signatures: dict[int, tuple[Signature, CodeType]] = {}
+"""Likewise, from when a function is defined."""
 
 
 def prepare() -> None:
@@ -55,6 +60,7 @@ def checked(fn: FunctionType, typechecker: Callable[..., Any]) -> Callable[..., 
     """Return a function that checks its parameters and its result, unless jaxtyping is disabled."""
     if hasattr(fn, "__checked__"):  # a constructor that a class inherits
         return fn
+    _signature_of(fn)
 
     @functools.wraps(fn)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -81,12 +87,12 @@ def checked(fn: FunctionType, typechecker: Callable[..., Any]) -> Callable[..., 
 
 def _make(fn: FunctionType, typechecker: Callable[..., Any]) -> Checks:
     """Return what checks a function, and remember it for the inner functions of the same code."""
-    own = signature(fn)
+    own = _signature_of(fn)
     known = [p.replace(annotation=_known(p.annotation, fn)) for p in own.parameters.values()]
     value = Parameter("result", Parameter.POSITIONAL_OR_KEYWORD, annotation=_known(own.return_annotation, fn))
 
     def check_of(parameters: list[Parameter]) -> Callable[..., Any] | None:
-        if all(p.annotation in (Any, Parameter.empty) for p in parameters):
+        if all(p.annotation in ANYTHING for p in parameters):
             return None
         names, wanted = (fn.__name__, fn.__qualname__, fn.__module__), own.replace(parameters=parameters, return_annotation=Any)
         return typechecker(_decorator._make_fn_with_signature(*names, wanted, output=False))
@@ -96,9 +102,22 @@ def _make(fn: FunctionType, typechecker: Callable[..., Any]) -> Checks:
     return made
 
 
-def _known(hint: Any, fn: FunctionType) -> Any:
-    """Return what an annotation means; anything, if it names what is not known at run time."""
-    return hint if hint is Parameter.empty else _decorator._destring_annotation(hint, fn.__globals__)
+def _signature_of(fn: FunctionType) -> Signature:
+    """Return a function's signature, with what its annotations mean by now; those that name what is not known stay text."""
+    if id(fn.__code__) not in _signatures:
+        own = signature(fn)
+        parameters = [p.replace(annotation=_known(p.annotation, fn, p.annotation)) for p in own.parameters.values()]
+        result = _known(own.return_annotation, fn, own.return_annotation)
+        _signatures[id(fn.__code__)] = own.replace(parameters=parameters, return_annotation=result), fn.__code__
+    return _signatures[id(fn.__code__)][0]
+
+
+def _known(hint: Any, fn: FunctionType, unknown: Any = Any) -> Any:
+    """Return what an annotation means."""
+    if not isinstance(hint, str):
+        return hint
+    found = _decorator._destring_annotation(hint, fn.__globals__)
+    return found if found is not Any or hint == "Any" else unknown
 
 
 def _has_array(hint: Any) -> bool:
