@@ -53,7 +53,7 @@ def test_other_errors_and_variants_are_named():
     assert "errors and counts are those of the earlier bench" not in found.lines()
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rows": [{"subject": 1}]}', '{"rows": 3}'])
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"rows": [{"subject": 1}]}', '{"rows": 3}', '{"rows": [3]}'])
 def test_a_file_that_is_no_bench_is_named(tmp_path, text):
     (tmp_path / "b.json").write_text(text)
     with pytest.raises(TgdslError, match=r"b\.json: found no rows of a bench, expected the bench\.json of one"):

@@ -61,6 +61,8 @@ def read_rows(file: Path) -> list[Row]:
     """
     try:
         rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise TypeError("rows of a bench are mappings in a list")
         _by_name(rows)
     except OSError as error:
         raise TgdslError(f"{file}: cannot read this file: {error.strerror}") from error
