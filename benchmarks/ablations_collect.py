@@ -61,6 +61,8 @@ def collect(
         KeptError: If something is missing, does not fit together, or is too large; nothing is written.
         FileError: If it cannot be written.
     """
+    if rows < 1:
+        raise KeptError(f"--rows {rows}: expected at least 1")
     if not NAME.fullmatch(name):
         raise KeptError(f'"{name}" is no name for an ablation, expected small letters, digits and _')
     asked = read_json(run / "distill.json", "a run of tgdsl distill")
@@ -85,10 +87,10 @@ def collect(
     plain = {"document": _shown(document), "unit": task.score_unit, "is_less_better": task.is_less_better} | asked
     files["distill.json"] = _json(_without_paths(plain | {"simulations": made}))
     for given, kept in ((teacher, "teacher.json"), (rest, "rest.json")):
-        if given is not None:
-            files[kept] = _json(_of_task(given, made))
-        elif (into / name / kept).is_file():
-            files[kept] = read_text(into / name / kept)
+        own = given or into / name / kept
+        if given is not None or own.is_file():
+            files[kept] = _json(_of_task(own, made))
+    _refuse_other_teacher(into / name, asked["teacher"], teacher)
     size = sum(len(text.encode()) for text in files.values())
     if size > LIMIT:
         raise KeptError(f"{name}: {size:,} bytes, expected at most {LIMIT:,}: take fewer --rows than {rows}")
@@ -97,7 +99,8 @@ def collect(
         with_folder(file)
     atomic_write_all(contents)
     for file in set((into / name).rglob("*.*")) - contents.keys():  # of resolutions that are no longer there
-        file.unlink()
+        if file.is_file():
+            file.unlink()
     return size
 
 
@@ -211,6 +214,18 @@ def _of_task(file: Path, made: Mapping[str, Mapping[str, Any]]) -> dict[str, Any
     if found.get("task") != task:
         raise KeptError(f'{file}: an evaluation in "{found.get("task")}", expected one in "{task}"')
     return _rounded(found)
+
+
+def _refuse_other_teacher(kept: Path, asked: str, given: Path | None) -> None:
+    """Refuse the evaluation of another teacher, which was kept under the name.
+
+    Raises:
+        KeptError: If the teacher was another one, and no evaluation is given.
+    """
+    if given is None and (kept / "teacher.json").is_file() and (kept / "distill.json").is_file():
+        before = read_json(kept / "distill.json", "an ablation")["teacher"]
+        if before != _shown(asked):
+            raise KeptError(f"{kept / 'teacher.json'} is of {before}, and this run was taught by {asked}: give --teacher")
 
 
 def _rounded(value: Any) -> Any:

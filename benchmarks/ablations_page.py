@@ -11,7 +11,7 @@ from ablations_kept import KEPT, ROOT, Ablation, KeptError, Taught, kept_ablatio
 from ablations_plots import plot, png_of
 from ablations_verdicts import FLAT, Trend, is_worse, trend
 
-from tgdsl.files.write import atomic_write
+from tgdsl.files.write import atomic_write_all, with_folder
 from tgdsl.rl.students.keys import NONE
 
 PAGE = ROOT / "docs" / "ablations.md"
@@ -36,6 +36,11 @@ class Judged(NamedTuple):
     taught: Taught
     trend: Trend | None
     is_flat: bool | None
+
+    @property
+    def is_told(self) -> bool:
+        """Whether they can be worse or better than others: of one seed the interval knows nothing of seeds."""
+        return bool(self.is_flat) and self.taught.row.seeds > 1
 
 
 def paper_samples(task: str) -> int | None:
@@ -67,10 +72,10 @@ def judged(ablation: Ablation) -> list[Judged]:
 
 
 def worse_than(one: Judged, others: Sequence[Judged], is_less_better: bool) -> list[Judged]:
-    """Return those of others that some students are worse than: all curves flat, intervals apart."""
-    if not one.is_flat:
+    """Return those of others that some students are worse than: all curves flat, of several seeds, intervals apart."""
+    if not one.is_told:
         return []
-    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.is_flat]
+    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.is_told]
     return [other for other, own in ends if is_worse((one.taught.row.low, one.taught.row.high), own, is_less_better)]
 
 
@@ -152,12 +157,13 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
         KeptError: If something that is kept cannot be read, or the page has no markers.
         FileError: If something cannot be written.
     """
-    atomic_write(page, written(read_text(page), tables(folder), page).encode())
-    files = [page]
-    for ablation in kept_ablations(folder):
-        files.append(page.parent / "images" / f"ablation_{ablation.name}.png")
-        atomic_write(files[-1], png_of(plot(ablation)))
-    return files
+    images = page.parent / "images"
+    contents = {images / f"ablation_{own.name}.png": png_of(plot(own)) for own in kept_ablations(folder)}
+    contents[page] = written(read_text(page), tables(folder), page).encode()
+    for file in contents:
+        with_folder(file)
+    atomic_write_all(contents)
+    return [page, *(file for file in contents if file != page)]
 
 
 def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
@@ -167,7 +173,7 @@ def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
     steps = _millions(row.samples) + (f" ({_percent(row.samples / paper, 2)} of the paper's)" if paper else "")
     moved = "–" if change is None else "{} ({} to {})".format(*map(_signed, change))
     flat = {True: "yes", False: "no", None: "–"}[own.is_flat]
-    names = _named(worse, _beside(own, found)) or ("–" if own.is_flat else "open")
+    names = _named(worse, _beside(own, found)) or ("–" if own.is_told else "open")
     score = [f"{row.score:.3f}", _bounds(row.low, row.high), _percent(row.held)]
     return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, names]
 
@@ -183,10 +189,9 @@ def _conditions(ablation: Ablation) -> str:
     said += f" for each of {len(simulations)} resolutions. " if len(simulations) > 1 else ". "
     if made["overrides"]:
         said += "Overrides: " + ", ".join(f"`{name}={value}`" for name, value in made["overrides"].items()) + ". "
-    spans = {span_of(ablation, resolution) for resolution in made["resolutions"]}
-    spans.discard(None)
+    spans = [span for resolution in made["resolutions"] if (span := span_of(ablation, resolution)) is not None]
     if spans:
-        low, high = min(filter(None, spans)), max(filter(None, spans))
+        low, high = min(spans), max(spans)
         bound = f"{FLAT * low:.3g}" if low == high else f"{FLAT * low:.3g} to {FLAT * high:.3g}"
         said += f"Flat: within ±{bound} over the last third. "
     else:

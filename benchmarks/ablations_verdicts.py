@@ -6,12 +6,14 @@ of Student's distribution with two degrees of freedom fewer than points,
 
     change   b N/3,   95 %: (b ± t σ_b) N/3          flat: both ends within ± 5 % of |s_teacher − s_rest|
 
-so that a curve which is too noisy to tell is not flat, and one that gets worse is not either. Where joints at rest were not
+so that a curve which is too noisy to tell is not flat, and one that gets worse is not either; nor is one whose scores are not
+known at either end of that third, as when its last leg was shorter than an episode. Where joints at rest were not
 measured, students that feel nothing stand in for them. Points are taken as independent, which those closer than an episode are
 not.
 
 One student is worse than another if both curves have flattened and the 95 % intervals of their scores, over seeds and episodes,
-do not overlap: a curve that still rises says nothing of what can be learned from a type.
+do not overlap: a curve that still rises says nothing of what can be learned from a type, and neither does one seed, whose
+interval is of episodes alone.
 
 Shapes: `point` points of a curve.
 """
@@ -30,6 +32,8 @@ FLAT = 0.05
 """Change over that part below which a curve is flat, relative to the range of scores."""
 LEAST_POINTS = 5
 """Points of the last part below which nothing is said."""
+LEAST_SPAN = 0.75
+"""Share of the last part that the points must span."""
 Array = np.ndarray
 
 
@@ -63,7 +67,7 @@ def trend(samples: Float[Array, " point"], score: Float[Array, " point"]) -> Tre
     end = float(samples[-1])
     kept = (samples > (1.0 - TAIL) * end * (1.0 + 1e-9)) & np.isfinite(score)  # a point is of the steps before it
     x, y = samples[kept] / end, score[kept]
-    if len(x) < LEAST_POINTS:
+    if len(x) < LEAST_POINTS or x[0] > 1.0 - TAIL * LEAST_SPAN or x[-1] < 1.0 - TAIL * (1.0 - LEAST_SPAN):
         return None
     centred = x - x.mean()
     squares = float(centred @ centred)

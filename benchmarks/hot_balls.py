@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ablations_kept import read_json
 from ruamel.yaml import YAML
 
 from tgdsl.errors import TgdslError
@@ -125,9 +125,11 @@ def table(folder: Path) -> str:
         file = folder / f"{setting.name}.json"
         if not file.is_file():
             continue
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = read_json(file, "what tgdsl evaluate --out wrote")
         if found.get("task") != "hot_ball":
             raise TgdslError(f'{file}: an evaluation in "{found.get("task")}", expected one in "hot_ball"')
+        if missing := {"score", "score_interval", "episodes"} - found.keys():
+            raise TgdslError(f"{file}: there is no {min(missing)}: this is not what tgdsl evaluate --out wrote")
         own = "physics, thin walls" if setting.model == "physics" else "the paper's formula"
         bounds, mark = "{:.2f} to {:.2f}".format(*found["score_interval"]), "✓" if setting.is_found_by_the_paper else "–"
         cells = (

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from ablations_kept import KeptError, read_rows
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from tgdsl.files.write import atomic_write, with_folder
 
 ROOT = Path(__file__).parents[1]
 KEPT = ROOT / "docs" / "measured" / "train"
@@ -58,34 +61,37 @@ def curve(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     with (KEPT / f"{name}.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["Episode/score"] not in ("", "nan")]
     seconds, samples, score = (np.array([float(row[key]) for row in rows]) for key in ("seconds", "samples", "Episode/score"))
-    smooth = np.convolve(score, np.ones(WINDOW) / WINDOW, mode="valid")
-    return seconds[WINDOW - 1 :] / 60, samples[WINDOW - 1 :] / 1e6, smooth
+    window = min(WINDOW, len(score))
+    smooth = np.convolve(score, np.ones(window) / window, mode="valid")
+    return seconds[window - 1 :] / 60, samples[window - 1 :] / 1e6, smooth
 
 
 def keep(run: Path, name: str) -> Path:
     """Write a thinned copy of a run's curve; return its file.
 
     Raises:
-        KeptError: If there is no curve.
+        KeptError: If there is no curve; nothing is written.
     """
-    rows = read_rows(run / "curve.csv")
+    file = run / "curve.csv"
+    rows = read_rows(file)
+    if missing := sorted({"iteration", "samples", "seconds", "episodes"} - rows[0].keys()):
+        raise KeptError(f"{file}: there is no column {missing[0]}: this is not what tgdsl train writes")
     names, size = [column for column in COLUMNS if column in rows[0]], -(-len(rows) // ROWS)
-    found = KEPT / f"{name}.csv"
-    found.parent.mkdir(parents=True, exist_ok=True)
-    with found.open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        for first in range(0, len(rows), size):
-            part = rows[first : first + size]
-            writer.writerow([_mean(part, column) for column in names])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    for first in range(0, len(rows), size):
+        writer.writerow([_mean(rows[first : first + size], column) for column in names])
+    found = with_folder(KEPT / f"{name}.csv")
+    atomic_write(found, text.getvalue().encode())
     return found
 
 
 def _mean(rows: list[dict[str, str]], column: str) -> str:
-    """Return a column's mean, of episodes' values that over their episodes; what counts on is that of the last row."""
+    """Return a column's mean, of what is of episodes that over their episodes; what counts on is that of the last row."""
     if column in ("iteration", "samples", "seconds"):
         return f"{float(rows[-1][column]):.5g}" if column != "iteration" else rows[-1][column]
-    weights = [float(row["episodes"]) if column.startswith("Episode/") else 1.0 for row in rows]
+    weights = [float(row["episodes"]) if column.startswith(("Episode/", "Reward/")) else 1.0 for row in rows]
     told = [(float(row[column]), weight) for row, weight in zip(rows, weights, strict=True) if row[column] and weight]
     return f"{sum(value * weight for value, weight in told) / sum(weight for _, weight in told):.5g}" if told else ""
 

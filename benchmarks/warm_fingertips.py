@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,9 @@ from typing import Any, NamedTuple
 import torch
 
 import tgdsl
+from tgdsl.errors import TgdslError
 from tgdsl.fields.materials import MATERIALS
+from tgdsl.files.write import check_writable
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
 
@@ -66,15 +69,15 @@ LATCH, SECONDS = 42.2, 20.0
 
 @dataclass(frozen=True)
 class Run:
-    """One fingertip on one ball: when it latched [s], None if never; and readings every second [°C]."""
+    """One fingertip on one ball: when it latched [s], None if never; readings every second [°C], None if no numbers."""
 
     column: str
     conductivity: float
     emissivity: float
     flux: float
     latched: float | None
-    last: float
-    curve: list[float]
+    last: float | None
+    curve: list[float | None]
 
 
 def module_of(column: Column, conductivity: float, emissivity: float, flux: float) -> TactileModule:
@@ -145,8 +148,12 @@ def run(column: Column, k: float, emissivity: float, flux: float, force: float, 
         if latched is None and reading >= LATCH:
             latched = step * dt
         if step % round(1.0 / dt) == 0:
-            curve.append(round(reading, 3))
-    return Run(name_of(column), k, emissivity, flux, latched, round(reading, 3), curve)
+            curve.append(_number(reading))
+    return Run(name_of(column), k, emissivity, flux, latched, _number(reading), curve)
+
+
+def _number(reading: float) -> float | None:
+    return round(reading, 3) if math.isfinite(reading) else None
 
 
 def table(runs: list[Run]) -> str:
@@ -157,7 +164,7 @@ def table(runs: list[Run]) -> str:
         cells = []
         for name in names:
             own = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, e, q))
-            end = f"{own.last:.1f} °C" if abs(own.last) < 1e4 else "diverges"
+            end = "diverges" if own.last is None or abs(own.last) >= 1e4 else f"{own.last:.1f} °C"
             cells.append(end if own.latched is None else f"**{own.latched:.2f} s** ({end})")
         lines.append(f"| {k:g} | {e:g} | {q:g} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
@@ -176,7 +183,8 @@ def plot(runs: list[Run], file: Path) -> None:
         for colour, k in zip(("tab:gray", "tab:blue", "tab:orange", "tab:red"), FINGERTIPS, strict=True):
             for style, q in zip((":", "-"), FLUXES, strict=True):
                 own = next(r for r in runs if (r.column, r.conductivity, r.emissivity, r.flux) == (name, k, 0.5, q))
-                ax.plot(range(len(own.curve)), own.curve, style, color=colour, label=f"k = {k:g}, q = {q:g}")
+                curve = [math.nan if reading is None else reading for reading in own.curve]
+                ax.plot(range(len(curve)), curve, style, color=colour, label=f"k = {k:g}, q = {q:g}")
         ax.axhline(LATCH, color="black", lw=0.8)
         ax.set(title=name.removeprefix("physical, "), xlabel="time [s]")
     axes[0].set(ylabel="warmest cell [°C]")
@@ -192,11 +200,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--plot", type=Path)
     given = parser.parse_args()
+    if given.dt <= 0 or abs(round(1.0 / given.dt) * given.dt - 1.0) > 1e-9:
+        parser.error(f"--dt {given.dt}: expected a whole number of readings per second")
+    try:
+        for file in filter(None, (given.out, given.plot)):
+            check_writable(file)
+    except TgdslError as error:
+        parser.error(str(error))
     cases = itertools.product(COLUMNS, FINGERTIPS, EMISSIVITIES, FLUXES)
     runs = [run(*case, given.force, given.dt) for case in cases]
     print(table(runs))
     if given.out:
-        given.out.write_text(json.dumps([asdict(own) for own in runs]) + "\n")
+        given.out.write_text(json.dumps([asdict(own) for own in runs], allow_nan=False) + "\n")
     if given.plot:
         plot(runs, given.plot)
 

@@ -83,6 +83,50 @@ def test_verdicts_are_those_of_flat_curves_whose_intervals_lie_apart(kept):
     }
 
 
+def test_of_one_seed_nothing_is_called_worse(kept):
+    """Its interval knows nothing of seeds."""
+    found = judged(read_ablation(kept(seeds=1) / "made_up"))
+    assert sum(bool(own.is_flat) for own in found) == 4 and not any(worse_than(own, found, False) for own in found)
+    assert "0 of 10 pairs of types" in tables(kept("again", seeds=1))
+
+
+def test_a_teacher_that_is_no_better_than_rest(kept, tmp_path):
+    """No curve can be flat within nothing."""
+    folder = kept()
+    evaluation(folder / "made_up" / "rest.json", 12.0)
+    assert "Flat: within ±0 over the last third" in tables(folder) and "0 of 5 curves have flattened" in tables(folder)
+
+
+def test_page_and_plots_are_written_together_into_folders_that_are_made(kept, tmp_path):
+    page = tmp_path / "docs" / "page.md"
+    page.parent.mkdir()
+    page.write_text(f"before\n{BEGIN}\n{END}\nafter\n")
+    files = write_page(kept(), page)
+    assert files == [page, page.parent / "images" / "ablation_made_up.png"] and all(file.is_file() for file in files)
+    assert "### made_up" in page.read_text()
+
+
+def test_what_was_kept_of_another_teacher_or_task_is_no_yardstick(kept, tmp_path):
+    folder = kept()
+    other = made_up_run(tmp_path / "other", BLIND)
+    asked = json.loads((other / "distill.json").read_text())
+    (other / "distill.json").write_text(json.dumps(asked | {"teacher": "policies/y.pt"}))
+    with pytest.raises(KeptError, match=r"is of policies/x.pt, and this run was taught by policies/y.pt: give --teacher"):
+        collect(other, "made_up", into=folder)
+    collect(other, "made_up", evaluation(tmp_path / "y.json", 11.0), into=folder)
+    assert read_ablation(folder / "made_up").teacher["score"] == 11.0
+    gripped = made_up_run(tmp_path / "gripped", BLIND, task="grip_force")
+    with pytest.raises(KeptError, match='an evaluation in "in_palm_rotate", expected one in "grip_force"'):
+        collect(gripped, "made_up", into=folder)
+
+
+def test_resolutions_with_a_dot_in_their_names(tmp_path):
+    run = made_up_run(tmp_path / "run", LEVEL, places=[("hand", "1.5mm", "clean")])
+    for _ in range(2):
+        collect(run, "dots", into=tmp_path / "kept")
+    assert read_ablation(tmp_path / "kept" / "dots").taught[0].row.resolution == "1.5mm"
+
+
 def test_of_an_error_less_is_better(kept):
     text = tables(kept(task="grip_force"))
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
@@ -191,6 +235,7 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
         return str(error.value)
 
     assert '"a/b" is no name for an ablation' in refused(name="a/b")
+    assert "--rows 0: expected at least 1" in refused(rows=0)
     assert "distill.json: cannot read this file" in refused(lambda run: (run / "distill.json").unlink())
     assert "table.csv: cannot read this file" in refused(lambda run: (run / "table.csv").unlink())
     assert "found the columns a, b, expected type, placement" in refused(

@@ -63,6 +63,15 @@ def test_of_few_points_nothing_is_said():
     assert trend(SAMPLES, score) is not None
 
 
+def test_of_a_curve_whose_end_or_beginning_is_not_known_nothing_is_said():
+    """It has levelled off as far as is known, and rises by half where it is not: scores of a last leg of parts of episodes."""
+    share = SAMPLES / END
+    score = 0.3 + np.clip((share - 0.76) * 2.0, 0.0, 0.5)
+    for unknown in (share > 0.76, share < 0.9):
+        assert trend(SAMPLES, np.where(unknown, np.nan, score)) is None
+    assert not trend(SAMPLES, score).is_flat(1.0)
+
+
 @pytest.mark.parametrize(
     ("one", "other", "is_less_better", "expected"),
     [

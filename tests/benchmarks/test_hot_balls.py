@@ -49,7 +49,16 @@ def test_the_table_has_what_was_evaluated_beside_the_papers_mark(tmp_path, capsy
         "| the paper's formula | 10 | 0.5 | 11.25 | 11.15 to 11.35 | 1000 | – |",
     ]
     evaluation("paper_1_0.5", 1.0, task="grip_force")
-    for folder, message in ((tmp_path, 'an evaluation in "grip_force", expected one'), (tmp_path / "none", "no evaluation of")):
+    for name, text in (("broken", "{"), ("list", "[]"), ("lacking", '{"task": "hot_ball", "score": 1}')):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "physics_150_0.5.json").write_text(text)
+    for folder, message in (
+        (tmp_path, 'an evaluation in "grip_force", expected one'),
+        (tmp_path / "none", "no evaluation of"),
+        (tmp_path / "broken", "this is no JSON"),
+        (tmp_path / "list", "found a list, expected what tgdsl evaluate --out wrote"),
+        (tmp_path / "lacking", "there is no episodes"),
+    ):
         with pytest.raises(SystemExit) as ended:
             hot_balls.main(["table", str(folder)])
         assert ended.value.code == 2 and message in capsys.readouterr().err

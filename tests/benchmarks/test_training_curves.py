@@ -21,18 +21,25 @@ def test_a_curve_is_thinned_to_means_over_equal_numbers_of_iterations(tmp_path, 
         writer.writerow(["iteration", "samples", "seconds", "episodes", "Episode/score", "Reward/spin", "rollout"])
         for i in range(num):
             score = "nan" if i < 2 else i
-            writer.writerow([i + 1, 100 * (i + 1), 0.5 * (i + 1), 0 if i < 2 else 1 + 2 * (i % 2), score, i, ""])
+            writer.writerow([i + 1, 100 * (i + 1), 0.5 * (i + 1), 0 if i < 2 else 1 + 2 * (i % 2), score, i, i])
     found = training_curves.keep(tmp_path, "task/run")
     assert found == tmp_path / "kept" / "task" / "run.csv"
     with found.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == training_curves.ROWS
     assert rows[0] == {
-        "iteration": "2", "samples": "200", "seconds": "1", "Episode/score": "", "Reward/spin": "0.5", "rollout": "",
+        "iteration": "2", "samples": "200", "seconds": "1", "Episode/score": "", "Reward/spin": "", "rollout": "0.5",
     }  # fmt: skip
-    assert float(rows[4]["Episode/score"]) == (8 + 3 * 9) / 4 and float(rows[4]["Reward/spin"]) == 8.5
+    assert float(rows[4]["Episode/score"]) == (8 + 3 * 9) / 4 and rows[4]["Reward/spin"] == "8.75"
+    assert rows[4]["rollout"] == "8.5"
 
 
-def test_no_curve(tmp_path):
-    with pytest.raises(KeptError, match=r"curve\.csv: cannot read this file"):
-        training_curves.keep(tmp_path, "task/run")
+def test_no_curve_or_none_of_a_run_leaves_what_was_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(training_curves, "KEPT", tmp_path)
+    (tmp_path / "run.csv").write_text("kept")
+    for text, message in ((None, r"curve\.csv: cannot read this file"), ("iteration,seconds\n1,2\n", "no column episodes")):
+        if text is not None:
+            (tmp_path / "curve.csv").write_text(text)
+        with pytest.raises(KeptError, match=message):
+            training_curves.keep(tmp_path, "run")
+    assert (tmp_path / "run.csv").read_text() == "kept"
