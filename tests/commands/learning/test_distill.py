@@ -82,6 +82,34 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
 
 
+def test_what_is_refused_leaves_a_run_as_it_was(base, here):
+    """An override that does not fit is not kept; a folder that holds a run takes no other; one killed early begins anew."""
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
+    code, _, error = here(base, "distill", "task.yaml", *few, "--set", "distill.decoders={size: {}}", "-o", "run")
+    assert code == 2 and 'no privileged number "size"' in error and not (base / "run").exists()
+    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")
+    assert code == 0, error
+    kept = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    on = ("--resume", "run", "--device", "cpu", "--episodes", "0", "--iterations", "2")
+    code, _, error = here(base, "distill", "task.yaml", *on, "--set", "distill.networks.hidden=[9]")
+    assert code == 2 and "its networks are of other sizes" in error
+    for more in ((), ("--resolutions", "low")):
+        code, _, error = here(base, "distill", "task.yaml", *few, *more, "-o", "run")
+        assert code == 2 and "run: this folder holds a run; go on with --resume run, or give another --out" in error
+    assert kept == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    code, _, error = here(base, "distill", "task.yaml", *on, "--set", "distill.learning_rate=1e-5")
+    assert code == 0, error
+    assert json.loads((base / "run" / "distill.json").read_text())["overrides"]["distill.learning_rate"] == "1e-5"
+    (base / "run" / "default" / "checkpoint.pt").unlink()
+    code, _, error = here(base, "distill", "task.yaml", *on)
+    assert code == 0, error
+    assert [row["iteration"] for row in rows_of(base / "run" / "default" / "curve.csv")] == ["1", "2"]
+    (base / "run" / "distill.json").unlink()
+    (base / "run" / "table.csv").unlink()
+    code, _, error = here(base, "distill", "task.yaml", *few, "-o", "run")
+    assert code == 2 and "run: this folder holds default/run.json of a run; give another --out" in error
+
+
 def test_resolutions_are_simulations_one_after_the_other(base, here):
     """One that the layout lacks is named before the first begins."""
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
@@ -104,6 +132,10 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
     assert 'has no sensor of kind "elastomer", expected one' in fails(*TEACHER, "--types", "elastomer")
     assert 'there is no type "forces"; did you mean "force"' in fails(*TEACHER, "--types", "forces")
     assert "types bool, bool: one is named twice" in fails(*TEACHER, "--types", "bool,bool")
+    assert "--resolutions low,low: one is named twice" in fails(*TEACHER, "--resolutions", "low,low")
+    assert "--resolutions: expected one at least" in fails(*TEACHER, "--resolutions", ",")
+    alike = fails(*TEACHER, "--types", "depth", "--placements", "fing*,fing_", "--seeds", "1")
+    assert "two students would have the name depth-fing_-clean-s0" in alike
     assert "--teacher FILE is missing" in fails("--device", "cpu")
     assert "--seeds 0: expected at least 1" in fails(*TEACHER, "--seeds", "0")
     assert "there is no run of tgdsl distill to go on with" in fails("--resume", "nothing")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import runpy
 import sys
 from pathlib import Path
 
@@ -9,9 +10,8 @@ import pytest
 from small_runs import SMALL
 from small_tasks import small_task
 
-from tgdsl.commands.learning import sweep
-from tgdsl.commands.learning.sweep import run_trial
 from tgdsl.commands.learning.sweep_document import Trial, load_sweep
+from tgdsl.commands.learning.sweep_trial import left, run_trial
 from tgdsl.errors import SpecError
 from tgdsl.rl.train.checkpoint import read_checkpoint
 
@@ -76,6 +76,22 @@ def test_the_example():
         ({"matrix": {"action.scael": [0.1]}}, "action", "scael"),
         ({"matrix": {"action.scale": [0.1, -1]}}, "action", "scale"),
         ({"matrix": {"--seed": [1]}, "gpus": -1}, "1:", "gpus"),
+        (
+            {"matrix": {"--iterations": [3, 2.5]}},
+            "matrix.--iterations[1]",
+            "--iterations is 2.5, expected a whole number of at",
+        ),
+        (
+            {"matrix": {"--seed": [1]}, "fixed": {"--envs": 0}},
+            "fixed.--envs",
+            "--envs is 0, expected a whole number of at least 1",
+        ),
+        (
+            {"matrix": {"--seed": [1]}, "fixed": {"--minutes": "5 min"}},
+            "1:",
+            '--minutes is "5 min", expected a positive number',
+        ),
+        ({"matrix": {"--minutes": [0]}, "fixed": {"--envs": True}}, "1:", "(?s)--envs is true.*--minutes is 0"),
         ({"matrix": {"--seed": [1]}, "command": "trian"}, "1:", "command"),
     ],
 )
@@ -88,12 +104,12 @@ def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
 def test_a_run_that_goes_on_learns_the_minutes_that_are_left(base):
     """9 of 30 seconds were learned: 0.35 minutes are left; and none where more was."""
     words = ["train", "task.yaml", "--minutes", "0.5", "--seed", "1"]
-    assert sweep._left(words, base) == words
-    for seconds, left in (("9.0", 0.35), ("42", 0.0)):
+    assert left(words, base) == words
+    for seconds, expected in (("9.0", 0.35), ("42", 0.0)):
         with (base / "curve.csv").open("w", newline="") as file:
             csv.writer(file).writerows([["iteration", "seconds"], ["1", "3.0"], ["2", seconds]])
-        found = sweep._left(words, base)
-        assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(left)
+        found = left(words, base)
+        assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(expected)
 
 
 def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base, monkeypatch):
@@ -105,6 +121,19 @@ def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base,
     assert not (base / "x" / "ended.json").exists()
     (base / "x" / "ended.json").write_text("{}")
     assert run_trial(trial, str(base / "x")) == "was made before"
+    other = Trial("x", {"--seed": 1}, ("train", "nowhere.yaml", "--envs", "4"))
+    what = "its folder holds a run of other settings, `tgdsl train nowhere.yaml`; give another --out"
+    assert run_trial(other, str(base / "x")) == f"failed: {what}"
+
+
+def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
+    for name in ("argv", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, getattr(sys, name))
+    (base / "broken.py").write_text("raise ZeroDivisionError('of this test')")
+    monkeypatch.setattr("runpy.run_module", lambda *_, **__: runpy.run_path(str(base / "broken.py")))
+    assert run_trial(Trial("y", {}, ("train", "task.yaml")), str(base / "y")) == "failed: ZeroDivisionError: of this test"
+    assert 'broken.py", line 1' in (base / "y" / "log.txt").read_text()
+    assert not (base / "y" / "ended.json").exists()
 
 
 @pytest.mark.slow

@@ -190,6 +190,33 @@ def test_passes_go_through_rollouts_that_are_kept(make, aggregate, kind):
         assert all(map(torch.equal, noted(), rollouts[-1]))
 
 
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_a_clip_bounds_from_where_a_pass_begins(make, kind):
+    """In a rollout that earlier weights made too: a_0 is what the present ones ask for, and the bounded error has a gradient."""
+    found, whole, passes = make(aggregate=3, epochs=6, clip=1e-3, networks__touch_kind=kind), [], []
+    learned = found._learned
+
+    def noted():
+        is_latest = all(map(torch.equal, [own.x for own in found.rollouts], latest))
+        for own in found.rollouts:
+            memory = own.begun
+            for t in range(len(own.x)):
+                made = own.stack(own.x[t], memory)
+                passes.append((is_latest, torch.equal(own.before[t], made.action)))
+                memory = torch.where(own.split(found._ended[t])[..., None], 0.0, made.memory)
+        learned()
+
+    found._learned = noted
+    for _ in range(3):
+        found.roll()
+        latest = [own.x.clone() for own in found.rollouts]
+        whole.append([own.before.clone() for own in found.rollouts])
+        found.learn()
+        assert all(map(torch.equal, [own.before for own in found.rollouts], whole[-1]))
+    earlier = [is_same for is_latest, is_same in passes if not is_latest]
+    assert earlier and all(earlier) and not all(is_same for is_latest, is_same in passes if is_latest)
+
+
 @pytest.mark.parametrize("kind", ["mlp", "convrnn"])
 def test_to_stop_and_go_on_is_to_go_on(make, tmp_path, kind):
     """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes anew."""

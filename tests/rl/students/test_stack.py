@@ -106,6 +106,26 @@ def test_means_and_variances_are_those_of_all_rows_of_a_student():
     torch.testing.assert_close(stack.buffers["var"], seen.var(dim=1, correction=0), rtol=1e-12, atol=1e-12)
 
 
+def test_adams_options_are_the_devices_own(monkeypatch):
+    """Whatever they were where it was saved, and before `step` is placed: it lies by the weights if Adam is capturable."""
+    one, other = (Stack(architecture("mlp"), SEEDS, 1e-3, 1.0) for _ in range(2))
+    found = one(*inputs(one, 5, torch.float32))
+    one.descend(found.action.square().mean(dim=(1, 2)) + found.told.square().mean(dim=(1, 2)))
+    saved = one.state_dict()
+    for group in saved["optimiser"]["param_groups"]:
+        group |= {"lr": 1.0, "capturable": True, "fused": True}
+    other.load_state_dict(saved)
+    assert [(group["lr"], group["capturable"], group["fused"]) for group in other.optimiser.param_groups] == [
+        (1e-3, False, None)
+    ]
+    assert all(kept["step"].device.type == "cpu" for kept in other.optimiser.state.values())
+    on_gpu = Stack(architecture("mlp"), SEEDS, 1e-3, 1.0, device="meta")
+    monkeypatch.setattr(on_gpu, "_options", lambda: {"lr": 1e-3, "capturable": True, "fused": None})
+    on_gpu.load_state_dict(one.state_dict())
+    assert len(on_gpu.optimiser.state) == len(on_gpu.parameters)
+    assert all(kept["step"].is_meta for kept in on_gpu.optimiser.state.values())
+
+
 def test_an_lstm_is_torchs_own():
     own = Lstm(14, ENCODERS["lstm"])
     cell = nn.LSTMCell(14, 6)

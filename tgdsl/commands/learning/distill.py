@@ -83,13 +83,14 @@ class Distill:
         self._check()
         asked = self._asked(loaded, before)
         prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
+        if self.resume is None:
+            _check_new(folder, asked["resolutions"])
         for part in prepared:
             part.check(is_resumed=self.resume is not None)
-        _write(folder / "distill.json", asked | {"overrides": overrides})
         rows: list[Row] = []
         unit = ""
         for part in prepared:
-            own, unit = part.taught()
+            own, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
             rows += own
         if rows:
             write_table(rows, folder / "table.csv")
@@ -105,7 +106,7 @@ class Distill:
         """Return who is taught, by whom and where, as plain values.
 
         Raises:
-            TgdslError: If a run that goes on shall teach others, or there is no teacher.
+            TgdslError: If a run that goes on shall teach others, there is no teacher, or no resolution, or one is named twice.
         """
         spec = loaded.spec
         given: dict[str, Any] = {
@@ -126,6 +127,11 @@ class Distill:
         asked = {name: value if value is not None else before.get(name, default[name]) for name, value in given.items()}
         if asked["teacher"] is None:
             raise TgdslError("--teacher FILE is missing: a policy, as tgdsl train writes it")
+        names = asked["resolutions"]
+        if not names:
+            raise TgdslError("--resolutions: expected one at least")
+        if len(set(names)) < len(names):
+            raise TgdslError(f"--resolutions {_text(names)}: one is named twice")
         return asked
 
 
@@ -146,7 +152,7 @@ class _Part:
 
         self._command, self._resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
         own = {} if resolution == "default" else {"resolution": resolution}
-        self._overrides = overrides | own
+        self._given, self._overrides = overrides, overrides | own
         self._loaded = load_task(command.task, self._overrides)
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
@@ -163,16 +169,21 @@ class _Part:
         Raises:
             TgdslError: If not.
         """
+        from tgdsl.files.write import check_writable
         from tgdsl.rl.sensed import compile_sensed
 
         self._goes_on = is_resumed and self._folder.checkpoint.is_file()
-        self._folder.check(is_resumed=self._goes_on)
+        check_writable(self._folder.checkpoint)
         self._teacher.check_taxels()
         if len(self._asked["resolutions"]) > 1:  # else it is compiled next
             compile_sensed(self._loaded, "cpu", feels=self._felt)
 
-    def taught(self) -> tuple[list[Row], str]:
-        """Teach, write and evaluate; return the table's rows, and the unit of the score."""
+    def taught(self, file: Path | None) -> tuple[list[Row], str]:
+        """Teach, write and evaluate; return the table's rows, and the unit of the score.
+
+        Args:
+            file: Where what the run goes on with is written, once nothing is refused any more; None: it has been.
+        """
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import read_checkpoint, restore
@@ -190,6 +201,8 @@ class _Part:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
+            if file is not None:
+                _write(file, self._asked | {"overrides": self._given})
             folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             total = command.iterations or loaded.spec.distill.iterations
@@ -220,6 +233,21 @@ class _Part:
         plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
         _write(self._folder.evaluation, plain)
         return rows_of(keys, found, self._resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
+
+
+def _check_new(folder: Path, resolutions: list[str]) -> None:
+    """See that a folder holds no run yet.
+
+    Raises:
+        TgdslError: If it does.
+    """
+    kept = folder / "distill.json"
+    others = [folder / "table.csv", *(folder / name / file for name in resolutions for file in ("run.json", "checkpoint.pt"))]
+    if kept.exists():
+        raise TgdslError(f"{folder}: this folder holds a run; go on with --resume {folder}, or give another --out")
+    for file in others:
+        if file.exists():
+            raise TgdslError(f"{folder}: this folder holds {file.relative_to(folder)} of a run; give another --out")
 
 
 def _known(loaded: LoadedTask, types: list[str]) -> list[str]:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import runpy
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
 from tgdsl.commands.arguments import Document
 from tgdsl.errors import TgdslError
-
-if TYPE_CHECKING:
-    from tgdsl.commands.learning.sweep_document import Trial
 
 
 @dataclass(frozen=True)
@@ -35,11 +29,12 @@ class Sweep:
             TgdslError: If Ray is not installed, or some run failed.
         """
         from tgdsl.commands.learning.sweep_document import load_sweep
+        from tgdsl.commands.learning.sweep_trial import run_trial
 
         spec, trials = load_sweep(self.document)
         try:
             import ray
-            from ray.exceptions import RayError
+            from ray.exceptions import LocalRayletDiedError, NodeDiedError, OutOfMemoryError, RayError, WorkerCrashedError
         except ImportError as error:
             raise TgdslError(f'a sweep needs Ray: pip install "tgdsl[sweep]" ({error})') from error
         out = (self.out or Path("out") / self.document.stem).resolve()
@@ -58,49 +53,13 @@ class Sweep:
                 trial = waiting.pop(done)
                 try:
                     told = ray.get(done)
-                except RayError as error:
+                except (LocalRayletDiedError, NodeDiedError, OutOfMemoryError, WorkerCrashedError) as error:
                     told = f"failed: its worker died {spec.retries + 1} times ({type(error).__name__})"
+                except RayError as error:
+                    told = f"failed: {type(error).__name__}: {(str(error).splitlines() or [''])[-1]}"
                 failed += [trial.name] if told.startswith("failed") else []
                 print(f"{len(trials) - len(waiting)}/{len(trials)} {trial.name}: {told}", flush=True)
         finally:
             ray.shutdown()
         if failed:
             raise TgdslError(f"{len(failed)} of {len(trials)} runs failed; what they printed is in log.txt of each folder")
-
-
-def run_trial(trial: Trial, folder: str) -> str:
-    """Run a trial in this process, in which nothing else runs; go on where its folder holds a checkpoint; say how it ended."""
-    from tgdsl.files.write import atomic_write
-
-    place = Path(folder)
-    end, words = place / "ended.json", [*trial.words, "--out", folder]
-    if end.is_file():
-        return "was made before"
-    if (place / "checkpoint.pt").is_file():
-        words = [*_left(words, place), "--resume", folder]
-    place.mkdir(parents=True, exist_ok=True)
-    with (place / "log.txt").open("a") as log:
-        sys.argv, sys.stdout, sys.stderr = ["tgdsl", *words], log, log
-        try:
-            runpy.run_module("tgdsl", run_name="__main__")  # the command line itself; commands.cli imports this file
-        except SystemExit as ended:
-            if ended.code:
-                return f"failed: exit code {ended.code}"
-    atomic_write(end, json.dumps(trial.settings).encode())
-    found = place / "evaluation.json"
-    if not found.is_file():
-        return "done"
-    score = json.loads(found.read_text())
-    return "score {score:.3g} [{score_interval[0]:.3g}, {score_interval[1]:.3g}] {unit}".format(**score)
-
-
-def _left(words: list[str], folder: Path) -> list[str]:
-    """Return a command's words with those minutes alone that a run has not learned yet."""
-    from tgdsl.rl.train.folder import RunFolder
-
-    rows = RunFolder(folder).rows()
-    if "--minutes" not in words or not rows:
-        return words
-    at = words.index("--minutes") + 1
-    left = max(0.0, float(words[at]) - float(rows[-1]["seconds"]) / 60.0)
-    return [*words[:at], str(left), *words[at + 1 :]]

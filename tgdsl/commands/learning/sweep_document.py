@@ -21,6 +21,8 @@ from tgdsl.schema.yaml import Source
 
 OWN = ("task", "out", "resume", "set")
 """Options that a sweep gives itself."""
+WHOLE = {"--iterations": 1, "--envs": 1, "--episodes": 0}
+"""Options that are whole numbers, and the least value of each."""
 
 
 class SweepSpec(SpecModel):
@@ -65,6 +67,7 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
     if problems or not isinstance(spec, SweepSpec):
         raise SpecError(problems)
     _check_options(source, spec)
+    _check_values(source, spec)
     trials = []
     for values in itertools.product(*spec.matrix.values()):
         settings = dict(zip(spec.matrix, values, strict=True))
@@ -88,3 +91,24 @@ def _check_options(source: Source, spec: SweepSpec) -> None:
             if name.startswith("--") and name not in known:
                 what = f"`tgdsl {spec.command}` has no option {name} that a sweep may set"
                 raise SpecError([source.problem((place, name), what, did_you_mean(name, known, "options"), on_key=True)])
+
+
+def _check_values(source: Source, spec: SweepSpec) -> None:
+    """See that options which are numbers have such values.
+
+    Raises:
+        SpecError: All values that are none.
+    """
+    fixed = [(("fixed", name), name, value) for name, value in spec.fixed.items()]
+    listed = [(("matrix", name, i), name, value) for name, values in spec.matrix.items() for i, value in enumerate(values)]
+    problems = []
+    for path, name, value in (*fixed, *listed):
+        expected = ""
+        if name in WHOLE and not (type(value) is int and value >= WHOLE[name]):
+            expected = f"a whole number of at least {WHOLE[name]}"
+        if name == "--minutes" and not (type(value) in (int, float) and 0.0 < value < float("inf")):
+            expected = "a positive number"
+        if expected:
+            problems.append(source.problem(path, f"{name} is {json.dumps(value, default=str)}, expected {expected}"))
+    if problems:
+        raise SpecError(problems)

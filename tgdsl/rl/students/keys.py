@@ -62,7 +62,7 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
         seeds: How many of each.
 
     Raises:
-        StudentError: If there is no such type, something is named twice, or nobody is taught.
+        StudentError: If there is no such type, something is named twice, two have one name, or nobody is taught.
     """
     known = [NONE, *SENSED]
     chosen = [name for type_ in types for name in (known if type_ == "all" else [type_])]
@@ -82,7 +82,13 @@ def student_keys(types: Sequence[str], placements: Sequence[str], noises: Sequen
         for placement in placements
         for noise in noises
     ]
-    return [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
+    keys = [StudentKey(felt, seed) for felt in dict.fromkeys(felts) for seed in range(seeds)]
+    named: dict[str, StudentKey] = {}
+    for key in keys:
+        if (other := named.setdefault(key.name, key)) is not key:
+            both = " and ".join(" ".join(part for part in each.kind if part) for each in (other, key))
+            raise StudentError(f"two students would have the name {key.name}: those of {both}")
+    return keys
 
 
 def feels(dealt: Sequence[StudentKey], also: Felt | None = None) -> list[Felt]:

@@ -115,7 +115,10 @@ class Distiller:
             self._gathered.append([value.clone() for value in self._of_rollout()])
         for i in range(self._spec.epochs):
             if i and self._gathered:
-                copy_each(self._of_rollout(), self._gathered[self._chance.randrange(len(self._gathered))])
+                chosen = self._chance.randrange(len(self._gathered))
+                copy_each(self._of_rollout(), self._gathered[chosen])
+                if self._spec.clip is not None and chosen < len(self._gathered) - 1:
+                    self._answered()
             self._learned()
         if self._gathered:
             copy_each(self._of_rollout(), self._gathered[-1])
@@ -135,7 +138,7 @@ class Distiller:
         """
         for own, saved in zip(self.rollouts, state["stacks"], strict=True):
             own.stack.load_state_dict(saved)
-        for captured in (self._chosen, self._learned, self._looked):
+        for captured in (self._chosen, self._answered, self._learned, self._looked):
             captured.forget()
 
     def go_on(self, steps: Tensor) -> None:
@@ -175,6 +178,16 @@ class Distiller:
             self._action.copy_(self._asked)
             if self._spec.std:
                 self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
+
+    def _answer(self) -> None:
+        """Have the students say what they would ask for now in the rollout: an earlier one's a_0 bounds nothing any more."""
+        with torch.no_grad():
+            for own in self.rollouts:
+                memory = own.begun
+                for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
+                    made = own.stack(x, memory)
+                    before.copy_(made.action)
+                    memory = forgotten(made.memory, own.split(ended))
 
     def _epoch(self) -> None:
         """Go through the rollout once."""
@@ -241,6 +254,7 @@ class Distiller:
         self._scores = torch.zeros((2, num), dtype=torch.float64, device=device)
         has_tf32 = spec.precision == "tf32"
         self._chosen = Captured(self._choose, device, has_tf32)
+        self._answered = Captured(self._answer, device, has_tf32)
         self._learned = Captured(self._epoch, device, has_tf32)
         self._looked = Captured(self._look, device)
         self._gathered: deque[list[Tensor]] = deque(maxlen=spec.aggregate)

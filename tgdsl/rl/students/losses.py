@@ -1,7 +1,8 @@
 """What students are taught by: errors of their actions, and of what their decoders tell; a loss per student.
 
 With a_s a student's action, a_t the teacher's, σ_t the standard deviation of the teacher's (1 for `mse`), a_0 what the student
-asked for in the rollout, and a_c = a_0 + clamp(a_s − a_0, ±clip):
+asked for in the rollout (in an earlier one that is kept: would ask for when the pass begins), and
+a_c = a_0 + clamp(a_s − a_0, ±clip):
 
     behaviour    mean of (a_s − a_t)²/σ_t²;  with a clip, of max((a_s − a_t)², (a_c − a_t)²)/σ_t²
     decoder k    w_k · mean of (d_k − s_k y_k)²,  y_k being the privileged number

@@ -90,7 +90,8 @@ class DistillSpec(SpecModel):
     """Mean of (a_s − a_t)², or of (a_s − a_t)²/σ_t², σ_t the standard deviation of the teacher's actions."""
     clip: Positive | None = None
     """Bound of a student's change of an action within an update, as PPO bounds values: of the losses of a_s and of
-    a_0 + clamp(a_s − a_0, ±clip) the larger one counts, a_0 being what it asked for in the rollout; null: there is none."""
+    a_0 + clamp(a_s − a_0, ±clip) the larger one counts, a_0 being what it asked for in the rollout,
+    and in an earlier one what it would ask for when the pass begins; null: there is none."""
     std: NonNegative = 0.0
     """Standard deviation of what is added to a student's actions in rollouts."""
     groups: Groups | None = None

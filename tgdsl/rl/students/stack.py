@@ -61,10 +61,7 @@ class Stack:
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
         self.seen = torch.zeros((), dtype=torch.float64, device=device)
         self._shape = copy.deepcopy(students[0]).to("meta")
-        is_cuda = self.seen.is_cuda
-        self.optimiser = torch.optim.Adam(
-            list(self.parameters.values()), lr=learning_rate, capturable=is_cuda, fused=True if is_cuda else None
-        )
+        self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
         self._called: Any = vmap(self._call)
 
     def __call__(self, x: Float[Tensor, "student row feature"], memory: Float[Tensor, "student row memory"]) -> Made:
@@ -127,9 +124,13 @@ class Stack:
             for part in ("networks", "seen"):
                 for name, value in own[part].items():
                     value.copy_(state[part][name])
-        self.optimiser.load_state_dict(dict(state["optimiser"]))
-        for group in self.optimiser.param_groups:  # it may have been saved on another device, and at another rate
-            group |= {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
+        optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`
+        groups = [group | self._options() for group in optimiser["param_groups"]]
+        self.optimiser.load_state_dict({"state": optimiser["state"], "param_groups": groups})
+
+    def _options(self) -> dict[str, Any]:
+        """Return what of Adam's groups depends on the device and the document."""
+        return {"lr": self._rate, "capturable": self.seen.is_cuda, "fused": True if self.seen.is_cuda else None}
 
     def _call(self, parameters: dict[str, Tensor], buffers: dict[str, Tensor], x: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
         return tuple(functional_call(self._shape, (parameters, buffers), (x, memory)))

@@ -1,0 +1,65 @@
+"""One run of a sweep, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shlex
+import sys
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tgdsl.commands.learning.sweep_document import Trial
+
+
+def run_trial(trial: Trial, folder: str) -> str:
+    """Run a trial in this process, in which nothing else runs; go on where its folder holds a checkpoint; say how it ended.
+
+    `trial.json` has its words, by which a run of other settings is told from it; `ended.json` is there once it is whole.
+    """
+    from tgdsl.files.write import atomic_write
+
+    place = Path(folder)
+    asked, end, words = place / "trial.json", place / "ended.json", [*trial.words, "--out", folder]
+    if asked.is_file() and (before := json.loads(asked.read_text())) != list(trial.words):
+        return f"failed: its folder holds a run of other settings, `tgdsl {shlex.join(before)}`; give another --out"
+    if end.is_file():
+        return "was made before"
+    if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
+        words = [*left(words, place), "--resume", folder]
+    place.mkdir(parents=True, exist_ok=True)
+    atomic_write(asked, json.dumps(trial.words).encode())
+    with (place / "log.txt").open("a") as log:
+        sys.argv, sys.stdout, sys.stderr = ["tgdsl", *words], log, log
+        try:
+            runpy.run_module("tgdsl", run_name="__main__")  # the command line itself; commands.cli imports this package
+        except SystemExit as ended:
+            if ended.code:
+                return f"failed: exit code {ended.code}"
+        except Exception as error:
+            traceback.print_exc(file=log)
+            return f"failed: {type(error).__name__}: {error}"
+    atomic_write(end, json.dumps(trial.settings).encode())
+    found = place / "evaluation.json"
+    if not found.is_file():
+        return "done"
+    score = json.loads(found.read_text())
+    return "score {score:.3g} [{score_interval[0]:.3g}, {score_interval[1]:.3g}] {unit}".format(**score)
+
+
+def left(words: list[str], folder: Path) -> list[str]:
+    """Return a command's words with those minutes alone that a run has not learned yet.
+
+    Students of several resolutions learn so many minutes each, and go on for all of them.
+    """
+    from tgdsl.rl.train.folder import RunFolder
+
+    inner = [file.parent for file in folder.glob("*/curve.csv")]
+    rows = RunFolder(inner[0] if len(inner) == 1 else folder).rows()
+    if "--minutes" not in words or not rows:
+        return words
+    at = words.index("--minutes") + 1
+    left = max(0.0, float(words[at]) - float(rows[-1]["seconds"]) / 60.0)
+    return [*words[:at], str(left), *words[at + 1 :]]
