@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -59,15 +60,30 @@ def robot_document(hand: str, layout: Path | None) -> Path | dict[str, object]:
 
 
 def parsed_overrides(pairs: tuple[str, ...]) -> dict[str, str]:
-    """Return `KEY=VALUE` arguments as a mapping.
+    """Return `KEY=VALUE` arguments as a mapping; a key that is repeated has its last value and place.
 
     Raises:
         TgdslError: If one has no equals sign.
     """
+    found: dict[str, str] = {}
     for pair in pairs:
         if "=" not in pair:
             raise TgdslError(f'--set {pair}: expected KEY=VALUE, such as "resolution=high"')
-    return {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
+        key, _, value = pair.partition("=")
+        found.pop(key, None)
+        found[key] = value
+    return found
+
+
+def joined_overrides(before: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return older overrides and newer ones, in the order in which they are set.
+
+    Args:
+        before: The older ones, of which those at or below a newer one's key are left out.
+        new: The newer ones.
+    """
+    kept = {key: value for key, value in before.items() if not any(f"{key}.".startswith(f"{other}.") for other in new)}
+    return kept | dict(new)
 
 
 def module_of(document: Path, overrides: tuple[str, ...] = (), progress: Progress | None = None) -> TactileModule:

@@ -76,6 +76,8 @@ class ActionSpec(SpecModel):
             if self.mode == "absolute" and value != type(self).model_fields[name].default:
                 what = f"{name} is {value:g} {unit}, but absolute actions have none: their ends are those of the joint's range"
                 raise ValueError(f"{what}; leave it out, or take mode relative or offset")
+        if self.smoothing >= 1.0:
+            raise ValueError(f"smoothing is {self.smoothing:g}, expected less than 1: targets would never move")
         return self
 
 
@@ -102,6 +104,12 @@ class DriveSpec(SpecModel):
     """How many control steps late a target arrives; whole numbers, both ends included."""
     top_speed: Annotated[float, Quantity("number", gt=0.0)] | Literal["robot"] | None = None
     """q̇_max, speed at which the largest torque that drives on has fallen to zero [rad/s]; `robot`: τ_max over joint damping."""
+
+    @model_validator(mode="after")
+    def _check(self) -> DriveSpec:
+        if any(end != int(end) for end in self.delay):
+            raise ValueError(f"delay is {self.delay[0]:g} to {self.delay[1]:g} control steps, expected whole numbers")
+        return self
 
     @property
     def is_ideal(self) -> bool:

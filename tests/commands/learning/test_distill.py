@@ -146,7 +146,7 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
     ("change", "message"),
     [
         ({"task": "screwdriver"}, 'this teacher was learned in the task "screwdriver", not "in_palm_rotate"'),
-        ({"action": {"mode": "absolute"}}, 'this teacher was learned with other actions: {"mode": "absolute"}, here {'),
+        ({"action": {"mode": "absolute"}}, 'this teacher was learned with other actions: {"mode": "absolute", "scale": '),
         ({"physics": {"timestep": 0.005, "substeps": 4}}, "learned with other control steps [s]: 0.02, here 0.025"),
     ],
 )

@@ -93,6 +93,17 @@ def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
     assert [read_checkpoint(base / name / "checkpoint.pt")["iteration"] for name in ("a run", "other")] == [3, 4]
 
 
+def test_rates_that_are_set_when_a_run_goes_on_count(base, here):
+    start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS]
+    assert here(base, *start, "--iterations", "1")[0] == 0
+    set_ = ["--set", "train.adaptive=false", "--set", "train.learning_rate=5e-4", "--set", "train.networks.initial_std=0.5"]
+    code, out, error = here(base, *start, "--iterations", "2", "--resume", "out/task", *set_)
+    assert code == 0, error
+    assert "train.networks.initial_std: 1.0, now 0.5; a run that goes on keeps its deviations" in out
+    rows = [line.split(",") for line in (base / "out" / "task" / "curve.csv").read_text().splitlines()]
+    assert rows[2][rows[0].index("Loss/learning_rate")] == "0.0005"
+
+
 def test_time_is_a_limit_too(base, here):
     code, out, error = here(base, "train", "task.yaml", *ON, "--minutes", "0.0", "--episodes", "0", *ARGUMENTS)
     assert code == 0, error
@@ -117,3 +128,40 @@ def test_mistakes(fails, here, base):
     assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
     said = fails("train", "task.yaml", *ON)
     assert said == "tgdsl: out/task: this folder holds a run; go on with --resume out/task, or give another --out\n"
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(base, here):
+    train = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
+    assert here(base, *train)[0] == 0
+    folder = base / "out" / "task"
+    for name in ("checkpoint.pt", "curve.csv"):
+        (folder / name).unlink()
+    code, _, error = here(base, *train)
+    assert code == 0, error
+    assert len(json.loads((folder / "run.json").read_text())["starts"]) == 1
+    assert "this folder holds a run" in here(base, *train)[2]
+
+
+def test_what_is_set_anew_replaces_what_stands_below_it(base, here):
+    """And speed is that of the iterations made since, in as many environments as there are now."""
+    train = ("train", "task.yaml", "--device", "cpu", "--episodes", "0", *ARGUMENTS)
+    first = ("--envs", "64", "--iterations", "1", "--set", "randomise={}", "--set", "randomise.friction=[0.5, 1.5]")
+    assert here(base, *train, *first)[0] == 0
+    again = ("--envs", "2", "--iterations", "2", "--resume", "out/task", "--set", "randomise={}")
+    code, _, error = here(base, *train, *again)
+    assert code == 0, error
+    starts = json.loads((base / "out" / "task" / "run.json").read_text())["starts"]
+    assert [start["spec"]["randomise"]["friction"] for start in starts] == [[0.5, 1.5], [1.0, 1.0]]
+    rows = (base / "out" / "task" / "curve.csv").read_text().splitlines()
+    names = rows[0].split(",")
+    own = [dict(zip(names, row.split(","), strict=True)) for row in rows[1:]]
+    made = float(own[1]["samples"]) - float(own[0]["samples"])
+    assert made < 0.1 * float(own[0]["samples"])
+    assert float(own[1]["steps_per_second"]) <= 1.01 * made / (float(own[1]["rollout"]) + float(own[1]["update"]))
+
+
+def test_an_evaluation_is_written_into_a_folder_that_is_made(base, here, fails):
+    code, _, error = here(base, "evaluate", "task.yaml", "--episodes", "2", "--envs", "2", "--out", "no/such/found.json")
+    assert code == 0, error
+    assert json.loads((base / "no" / "such" / "found.json").read_text())["episodes"] == 2
+    assert "--groups are those of a policy" in fails("evaluate", "task.yaml", "--groups", "proprio")

@@ -82,3 +82,15 @@ def test_groups_that_are_not_there_are_located(tmp_path):
         small_learner(tmp_path, touch="none", train__actor="[tactile_sensors]")
     with pytest.raises(SpecError, match=r'train\.rnd\.groups\[0\]: the group of observations "empty" is empty'):
         observed(loaded(tmp_path, "train: {rnd: {groups: [empty]}}\n"), GROUPS | {"empty": 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("action.smoothing", 1.0, "action: smoothing is 1, expected less than 1"),
+        ("randomise.drive.delay", [0.9, 2.2], "drive: delay is 0.9 to 2.2 control steps, expected whole numbers"),
+    ],
+)
+def test_what_no_drive_can_do_is_refused(tmp_path, name, value, message):
+    with pytest.raises(SpecError, match=message):
+        load_task(small_task(tmp_path), {name: value})

@@ -46,6 +46,19 @@ def test_a_policy_brings_its_card(tmp_path):
         write_policy(learner, card | {"spec": learned | other}, file)
         with pytest.raises(PolicyError, match=message):
             policy_for(env, file)
+    less = {name: value for name, value in learned["action"].items() if name != "smoothing"}  # of an older tgdsl
+    rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm are not quite 7 mm
+    for action in (less, rounded):
+        write_policy(learner, card | {"spec": learned | {"action": action}}, file)
+        assert policy_for(env, file).groups == ("tactile_sensors", "proprio")
+    for lacking, message in (
+        ({**card, "spec": {}}, "has no spec.task"),
+        ({"groups": {}}, "has no joints"),
+        ([], "has no groups"),
+    ):
+        torch.jit.save(torch.jit.load(file), file, _extra_files={"card.json": json.dumps(lacking)})
+        with pytest.raises(PolicyError, match=f"its card.json {message}: this is not what tgdsl train writes"):
+            card_of(file)
     blind, _ = small_learner(tmp_path)
     write_policy(blind, card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
     assert policy_for(env, file).groups == ("priv_proprio", "goal", "priv_obj_state")

@@ -60,6 +60,28 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
     assert other.iteration == 4
 
 
+@pytest.mark.parametrize(
+    ("rates", "expected"),
+    [
+        ({}, 4e-4),
+        ({"train__learning_rate": 2e-3}, 2e-3),
+        ({"train__adaptive": False}, 1e-3),
+    ],
+)
+def test_rates_of_a_run_that_goes_on(tmp_path, rates, expected):
+    """One that adapts stays where it was, unless the document has another than before."""
+    run, learner = begun(tmp_path)
+    learner.algorithm.learning_rate = 4e-4
+    run.save()
+    other, _ = small_learner(tmp_path, train__rnd__learning_rate=3e-3, **rates)
+    restore(other, read_checkpoint(run._folder.checkpoint), run._folder.checkpoint)
+    other.change_rates(run._folder.last_start()["spec"]["train"])
+    assert other.algorithm.learning_rate == pytest.approx(expected)
+    assert other.algorithm.optimizer.param_groups[0]["lr"] is other.algorithm.rate
+    assert other.algorithm.rnd.optimizer.param_groups[0]["lr"] == 3e-3
+    other.iterate()
+
+
 def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
     run, learner = begun(tmp_path)
     run.learn(1, float("inf"))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from tgdsl.commands.arguments import Overrides, parsed_overrides
+from tgdsl.commands.arguments import Overrides, joined_overrides, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -78,7 +78,7 @@ class Distill:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
         before = _read(folder / "distill.json") if self.resume else {}
-        overrides = {**before.get("overrides", {}), **parsed_overrides(self.set)}
+        overrides = joined_overrides(before.get("overrides", {}), parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
         asked = self._asked(loaded, before)

@@ -39,7 +39,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Play, and print."""
-        from tgdsl.files.write import atomic_write, check_writable
+        from tgdsl.files.write import atomic_write, check_writable, with_folder
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.playing.actions import ZeroActor
         from tgdsl.rl.playing.evaluation import SEED, evaluate
@@ -47,6 +47,8 @@ class Evaluate:
 
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
+        if self.groups and self.policy is None:
+            raise TgdslError("--groups are those of a policy; give one with --policy")
         if self.out is not None:
             check_writable(self.out)
         if self.policy is not None:
@@ -63,4 +65,4 @@ class Evaluate:
             env.close()
         print(found)
         if self.out is not None:
-            atomic_write(self.out, (json.dumps(found.plain(), indent=2) + "\n").encode())
+            atomic_write(with_folder(self.out), (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())

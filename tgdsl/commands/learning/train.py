@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from tgdsl.commands.arguments import Overrides, parsed_overrides
+from tgdsl.commands.arguments import Overrides, joined_overrides, parsed_overrides
 from tgdsl.console.progress import StatusLine
 from tgdsl.errors import TgdslError
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 Folder = tyro.conf.arg(metavar="FOLDER")
 ENVS = 8192
+INITIAL_STD = "train.networks.initial_std:"
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Train:
         source = RunFolder(self.resume) if self.resume else None
         before = source.last_start() if source else {}
         is_same = source is not None and folder.path.resolve() == source.path.resolve()
-        overrides = {**(before.get("overrides", {}) if is_same else {}), **parsed_overrides(self.set)}
+        overrides = joined_overrides(before.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
         if ranks.is_first:
@@ -120,10 +121,12 @@ class Train:
             learner = Learner(env, loaded, seed, ranks)
             if state is not None and self.resume is not None:
                 restore(learner, state, self.resume / "checkpoint.pt")
+                learner.change_rates(before.get("spec", {}).get("train", {}))
             origin = made_from(loaded, env, seed, overrides, ranks.size)
             if ranks.is_first:
                 for line in differences(before.get("spec", origin["spec"]), origin["spec"]):
-                    print(f"changed since the run began: {line}")
+                    end = "; a run that goes on keeps its deviations" if line.startswith(INITIAL_STD) else ""
+                    print(f"changed since the run began: {line}{end}")
                 folder.begin(origin, loaded, env)
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and not run.has_board:
@@ -157,5 +160,5 @@ class Train:
         if self.episodes:
             found = evaluate(learner.env, policy_for(learner.env, folder.policy), self.episodes)
             write_policy(learner, card | {"score": found.plain()}, folder.policy)
-            atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2) + "\n").encode())
+            atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(found)

@@ -115,7 +115,7 @@ def prepare(
     """
     loaded = load_task(task, overrides)
     card = card_of(policy)
-    if card is not None and "spec" in card:
+    if card is not None:
         check_learned(card, policy, loaded.spec)
         own = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
         loaded = _with(loaded, own)

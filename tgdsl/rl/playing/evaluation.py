@@ -54,8 +54,8 @@ class Evaluation:
     faults: int
 
     def plain(self) -> dict[str, Any]:
-        """Return plain values."""
-        return asdict(self)
+        """Return plain values as JSON has them: None for what is not finite, such as the interval of one episode."""
+        return {name: _finite(value) for name, value in asdict(self).items()}
 
     def __str__(self) -> str:
         low, high = self.score_interval
@@ -64,6 +64,12 @@ class Evaluation:
             f"score {self.score:.3f} {self.unit} (95 %: {low:.3f} to {high:.3f}) in {self.episodes:,} episodes; "
             f"{self.held:.1%} (95 %: {least:.1%} to {most:.1%}) without a drop"
         )
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_finite(part) for part in value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def evaluate(env: TouchEnv, actor: Actor, episodes: int = 1000, seed: int = SEED) -> Evaluation:

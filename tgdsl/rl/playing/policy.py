@@ -10,6 +10,7 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -152,14 +153,24 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
     Raises:
         PolicyError: If not.
     """
-    theirs, ours = card["spec"], spec.model_dump(mode="json")
+    theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
+    theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
     if theirs["task"] != ours["task"]:
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
     steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
     for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
-        if before != now:
+        if not _is_close(before, now):
             texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
             raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
+
+
+def _is_close(one: Any, other: Any) -> bool:
+    """Return whether plain values are equal, numbers but for rounding: 0.7 cm are not quite 7 mm."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_is_close(value, other[name]) for name, value in one.items())
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return one == other
 
 
 def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxels: str) -> None:
@@ -195,7 +206,25 @@ def _read(file: Path, device: torch.device | str) -> tuple[torch.jit.ScriptModul
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself, which rsl_rl writes
         try:
             module = torch.jit.load(content, map_location=device, _extra_files=extra).eval()
-            return module, json.loads(extra[CARD]) if extra[CARD] else None
+            card = json.loads(extra[CARD]) if extra[CARD] else None
         except (RuntimeError, ValueError, OSError) as error:
             what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
             raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
+    if card is not None:
+        _check_fields(card, file)
+    return module, card
+
+
+def _check_fields(card: Any, file: Path) -> None:
+    """See that a card has what is asked of it.
+
+    Raises:
+        PolicyError: If not.
+    """
+    spec = card.get("spec") if isinstance(card, dict) else None
+    missing = [name for name in ("groups", "joints", "taxels", "spec") if not isinstance(card, dict) or name not in card]
+    missing = missing or [
+        f"spec.{name}" for name in ("task", "action", "physics") if not isinstance(spec, dict) or name not in spec
+    ]
+    if missing:
+        raise PolicyError(f"{file}: its {CARD} has no {missing[0]}: this is not what tgdsl train writes")

@@ -73,6 +73,11 @@ class RunFolder:
         """How good that is."""
         return self.path / "evaluation.json"
 
+    @property
+    def has_run(self) -> bool:
+        """Whether there is a run: one that was killed before its first checkpoint is none."""
+        return self.checkpoint.exists() or bool(self.rows())
+
     def check(self, is_resumed: bool) -> None:
         """See that a run can begin or go on here; nothing is made.
 
@@ -80,7 +85,7 @@ class RunFolder:
             FileError: If the folder cannot be written.
             TgdslError: If there is a run already, or none to go on with.
         """
-        if not is_resumed and (self.run.exists() or self.checkpoint.exists()):
+        if not is_resumed and self.has_run:
             raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
         if is_resumed and not self.checkpoint.is_file():
             raise TgdslError(f"{self.path}: there is no checkpoint.pt to go on with")
@@ -98,14 +103,14 @@ class RunFolder:
             raise FileError(self.checkpoint, what)
 
     def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:
-        """Write what a run is made from, or that it is made to go on.
+        """Write what a run is made from, or that it is made to go on; starts that made no run are discarded.
 
         Raises:
             FileError: If it cannot be written.
         """
         with_folder(self.run)
         self._clean()
-        before = self._read()
+        before = self._read() if self.has_run else {}
         starts = [*before.get("starts", []), dict(made_from)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
         for file in documents(loaded):

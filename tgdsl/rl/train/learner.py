@@ -119,6 +119,19 @@ class Learner:
         if self.algorithm.rnd:
             self.algorithm.rnd.update_counter = state["rnd_steps"]
 
+    def change_rates(self, before: Mapping[str, Any]) -> None:
+        """Take over the document's learning rates, once a state was loaded; one that adapts only if the document had another.
+
+        Args:
+            before: The document's `train` with which the state was saved, as plain values.
+        """
+        own = self._train
+        if not own.adaptive or before.get("learning_rate", own.learning_rate) != own.learning_rate:
+            self.algorithm.learning_rate = own.learning_rate
+        if self.algorithm.rnd and own.rnd != "off":
+            for group in self.algorithm.rnd.optimizer.param_groups:
+                group["lr"] = own.rnd.learning_rate
+
     def go_on(self, steps: torch.Tensor) -> None:
         """Begin episodes that count as having lasted so many control steps, in place of any at random."""
         self._obs = self._seen(self.env.reset())

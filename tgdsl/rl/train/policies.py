@@ -84,7 +84,7 @@ def write_module(scripted: Callable[[], Any], touch: TactileModule, card: Mappin
         FileError: If it cannot be written.
     """
     content = io.BytesIO()
-    text = json.dumps(card, indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(card, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself
         torch.jit.save(scripted(), content, _extra_files={CARD: text, "taxels.csv": taxel_csv(touch)})

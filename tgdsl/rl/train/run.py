@@ -42,7 +42,7 @@ class Run:
             FileError: If no checkpoint can be written, or the disk has no room for others.
         """
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
-        self._rate = 0.0
+        self._rate, self._samples = 0.0, learner.samples
         self._writes = learner.ranks.is_first
         if self._writes:
             folder.keep_rows(learner.iteration)
@@ -99,7 +99,7 @@ class Run:
         if not self._writes:
             return
         learner = self._learner
-        samples = learner.samples // learner.iteration
+        samples, self._samples = learner.samples - self._samples, learner.samples
         self._rate = duration if not self._rate else 0.9 * self._rate + 0.1 * duration
         perf = {"Perf/total_fps": samples / duration, "Perf/collection_time": made.rollout, "Perf/learning_time": made.update}
         row: dict[str, float | int] = {
