@@ -260,8 +260,9 @@ def _task(ablation: Ablation) -> str:
     return next(iter(ablation.made["simulations"].values()))["task"]
 
 
-def _bounds(low: float, high: float) -> str:
-    return f"{low:.3f} to {high:.3f}" if math.isfinite(low) and math.isfinite(high) else "–"
+def _bounds(low: float | None, high: float | None) -> str:
+    is_known = low is not None and high is not None and math.isfinite(low) and math.isfinite(high)
+    return f"{low:.3f} to {high:.3f}" if is_known else "–"
 
 
 def _percent(share: float, digits: int = 1) -> str:

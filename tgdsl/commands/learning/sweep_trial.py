@@ -46,7 +46,8 @@ def run_trial(trial: Trial, folder: str) -> str:
     if not found.is_file():
         return "done"
     score = json.loads(found.read_text())
-    return "score {score:.3g} [{score_interval[0]:.3g}, {score_interval[1]:.3g}] {unit}".format(**score)
+    low, high = ("–" if end is None else f"{end:.3g}" for end in score["score_interval"])  # of one episode there is none
+    return f"score {score['score']:.3g} [{low}, {high}] {score['unit']}"
 
 
 def left(words: list[str], folder: Path) -> list[str]:
