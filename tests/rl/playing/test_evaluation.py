@@ -55,6 +55,12 @@ def test_scores_are_those_of_the_task_and_the_same_each_time(env):
     assert again[0] == again[1]
 
 
+def test_what_is_not_known_of_one_episode_is_null(env):
+    found = evaluate(env, ZeroActor(env), 1)
+    assert found.score_interval == (-math.inf, math.inf)
+    assert json.loads(json.dumps(found.plain(), allow_nan=False))["score_interval"] == [None, None]
+
+
 def test_intervals():
     """Against NumPy's standard error; and Wilson's interval of 8 of 10, as tables have it."""
     values = np.random.default_rng(0).normal(3.0, 2.0, 500)

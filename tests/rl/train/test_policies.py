@@ -46,6 +46,17 @@ def test_a_policy_brings_its_card(tmp_path):
         write_policy(learner, card | {"spec": learned | other}, file)
         with pytest.raises(PolicyError, match=message):
             policy_for(env, file)
+    write_policy(learner, card | {"spec": learned | {"touch": "depth"}}, file)
+    with pytest.raises(PolicyError, match=f"this policy feels depth, not {learned['touch']}; try --set touch=depth"):
+        policy_for(env, file)
+    write_policy(learner, card | {"spec": learned | {"action": {"mode": "other"}}}, file)
+    with pytest.raises(PolicyError, match=r'was learned with other actions: {"mode": "other"}, here'):
+        policy_for(env, file)
+    write_policy(learner, card, file)
+    with pytest.raises(
+        PolicyError, match=r"takes tactile_sensors \(4\) \+ proprio \(6\), not proprio \(6\) \+ tactile_sensors"
+    ):
+        policy_for(env, file, ("proprio", "tactile_sensors"))
     less = {name: value for name, value in learned["action"].items() if name != "smoothing"}  # of an older tgdsl
     rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm are not quite 7 mm
     for action in (less, rounded):

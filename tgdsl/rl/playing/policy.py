@@ -13,11 +13,13 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
+from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
@@ -88,6 +90,9 @@ class Policy(Actor):
         wanted = sum(card["groups"].values()) if card else first
         if wanted != total:
             raise PolicyError(f"{file}: this policy takes {wanted} numbers, not {taken}; name its groups, in its order")
+        if card and not _is_in_order(card["groups"], groups):
+            own = " + ".join(f"{name} ({size})" for name, size in card["groups"].items())
+            raise PolicyError(f"{file}: this policy takes {own}, not {taken}; name its groups, in its order")
         try:
             with torch.no_grad():
                 made = self._module(torch.zeros((num_envs, total), device=device))
@@ -122,12 +127,15 @@ def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
         named: Groups of observations that it takes, in its order; default: see `actor_groups`.
 
     Raises:
-        PolicyError: If it cannot be read, or is for other environments.
+        PolicyError: If it cannot be read, is for other environments, or feels something else than they do.
     """
     card = card_of(file)
     if card is not None:
         check_learned(card, file, env.spec)
         check_card(card, file, env.joint_names, env.touch.taxels_id)
+        felt = card["spec"].get("touch", env.spec.touch)
+        if GROUP in card["groups"] and felt != env.spec.touch:
+            raise PolicyError(f"{file}: this policy feels {felt}, not {env.spec.touch}; try --set touch={felt}")
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
     return Policy(file, groups, env.num_envs, env.num_actions, env.device)
 
@@ -154,7 +162,8 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
         PolicyError: If not.
     """
     theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
-    theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
+    with suppress(ValidationError):  # what is no action here differs
+        theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
     if theirs["task"] != ours["task"]:
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
     steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
@@ -162,6 +171,15 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
         if not _is_close(before, now):
             texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
             raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
+
+
+def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
+    """Whether groups are those of a card, in its order; that of touch may be named by what is felt, as `Felt.group`."""
+    pairs = zip(card.items(), groups.items(), strict=False)
+    return len(card) == len(groups) and all(
+        size == found and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))
+        for (name, size), (other, found) in pairs
+    )
 
 
 def _is_close(one: Any, other: Any) -> bool:
