@@ -131,7 +131,8 @@ def table(folder: Path) -> str:
         if missing := {"score", "score_interval", "episodes"} - found.keys():
             raise TgdslError(f"{file}: there is no {min(missing)}: this is not what tgdsl evaluate --out wrote")
         own = "physics, thin walls" if setting.model == "physics" else "the paper's formula"
-        bounds, mark = "{:.2f} to {:.2f}".format(*found["score_interval"]), "✓" if setting.is_found_by_the_paper else "–"
+        mark, ends = "✓" if setting.is_found_by_the_paper else "–", found["score_interval"]
+        bounds = "–" if None in ends else "{:.2f} to {:.2f}".format(*ends)  # of one episode there is none
         cells = (
             own,
             f"{setting.conductivity:g}",

@@ -108,8 +108,8 @@ def _read(folder: Path) -> tuple[list[tuple[float, float, float]], str]:
     if not file.is_file():
         return rows, "–"
     found = json.loads(file.read_text())
-    low, high = (scale * bound for bound in found["score_interval"])
-    return rows, f"{scale * found['score']:.2f} ({low:.2f} to {high:.2f}) rad/s, {found['held']:.1%} held"
+    bounds = " to ".join("–" if bound is None else f"{scale * bound:.2f}" for bound in found["score_interval"])
+    return rows, f"{scale * found['score']:.2f} ({bounds}) rad/s, {found['held']:.1%} held"
 
 
 def _plot(runs: dict[str, list[tuple[float, float, float]]], file: Path) -> None:

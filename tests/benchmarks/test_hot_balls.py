@@ -48,6 +48,10 @@ def test_the_table_has_what_was_evaluated_beside_the_papers_mark(tmp_path, capsy
         "| physics, thin walls | 150 | 0.5 | 3.00 | 2.90 to 3.10 | 1000 | ✓ |",
         "| the paper's formula | 10 | 0.5 | 11.25 | 11.15 to 11.35 | 1000 | – |",
     ]
+    one = {"task": "hot_ball", "score": 2.0, "score_interval": [None, None], "episodes": 1}
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "physics_10_0.5.json").write_text(json.dumps(one))
+    assert hot_balls.table(tmp_path / "one").endswith("| 10 | 0.5 | 2.00 | – | 1 | – |")
     evaluation("paper_1_0.5", 1.0, task="grip_force")
     for name, text in (("broken", "{"), ("list", "[]"), ("lacking", '{"task": "hot_ball", "score": 1}')):
         (tmp_path / name).mkdir()

@@ -2,12 +2,15 @@
 
 import csv
 import json
+import sys
 
 import pytest
 import torch
 from felt_tasks import felt_task
 from written_teachers import teacher
 
+from tgdsl.commands.learning.sweep_document import Trial
+from tgdsl.commands.learning.sweep_trial import run_trial
 from tgdsl.rl.load import load_task
 from tgdsl.rl.train.checkpoint import read_checkpoint
 
@@ -166,3 +169,17 @@ def test_a_teacher_of_other_taxels_or_without_a_card_is_refused(base, fails):
     teacher(base / "teacher.pt", task, ["proprio"])
     divided = ("--set", "distill.loss=inverse_variance")
     assert "its card has no deviations of actions, `std`" in fails(*TEACHER, *FIVE, "--envs", "10", *divided)
+
+
+def test_students_of_a_sweep_go_on(base, here, monkeypatch):
+    """A trial whose worker died after it had begun, with a checkpoint, goes on in its folder."""
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)
+    assert here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "x")[0] == 0
+    (base / "x" / "table.csv").unlink()
+    for name in ("argv", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, getattr(sys, name))
+    trial = Trial("x", {}, ("distill", "task.yaml", *few, "--iterations", "3"))
+    assert run_trial(trial, str(base / "x")) == "done", (base / "x" / "log.txt").read_text()
+    with (base / "x" / "default" / "curve.csv").open(newline="") as file:
+        assert [row["iteration"] for row in csv.DictReader(file)] == ["1", "2", "3"]
+    assert (base / "x" / "table.csv").is_file()

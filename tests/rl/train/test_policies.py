@@ -64,6 +64,7 @@ def test_a_policy_brings_its_card(tmp_path):
         assert policy_for(env, file).groups == ("tactile_sensors", "proprio")
     for lacking, message in (
         ({**card, "spec": {}}, "has no spec.task"),
+        ({**card, "spec": learned | {"physics": {"timestep": 0.005}}}, r"has no spec\.physics\.substeps"),
         ({"groups": {}}, "has no joints"),
         ([], "has no groups"),
     ):

@@ -28,7 +28,7 @@ def run_trial(trial: Trial, folder: str) -> str:
     if end.is_file():
         return "was made before"
     if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
-        words = [*left(words, place), "--resume", folder]
+        words = [*left([*trial.words], place), "--resume", folder]
     place.mkdir(parents=True, exist_ok=True)
     atomic_write(asked, json.dumps(trial.words).encode())
     with (place / "log.txt").open("a") as log:

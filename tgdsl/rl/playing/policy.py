@@ -244,5 +244,7 @@ def _check_fields(card: Any, file: Path) -> None:
     missing = missing or [
         f"spec.{name}" for name in ("task", "action", "physics") if not isinstance(spec, dict) or name not in spec
     ]
+    physics = {} if missing or not isinstance(spec, dict) else spec["physics"]
+    missing = missing or [f"spec.physics.{name}" for name in ("timestep", "substeps") if name not in physics]
     if missing:
         raise PolicyError(f"{file}: its {CARD} has no {missing[0]}: this is not what tgdsl train writes")
