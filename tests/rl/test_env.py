@@ -253,6 +253,36 @@ def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
         assert torch.equal(made.info.episode_return, before.info.episode_return)
     with pytest.raises(SimulationError, match="of other environments"):
         make(5, more=more).load_state_dict(saved)
+    fresh = make(more=more, seed=9)
+    assert same(fresh.load_state_dict(saved), saved["obs"])
+    assert torch.equal(fresh.step(actions(env, 1, 1)[0]).reward, expected[0].reward)
+
+
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_a_state_of_other_environments_changes_nothing(make, is_begun):
+    env, other = make(more=NOISY + RANDOM, seed=1), make(more=NOISY + RANDOM, seed=9)
+    for each in (env, other) if is_begun else (env,):
+        each.step(torch.ones(4, 2))
+    saved, before = env.state_dict(), other.state_dict()
+    cases = [({name: own for name, own in saved.items() if name != part}, part) for part in saved if part != "sim"]
+    cases += [
+        ({name: own for name, own in saved.items() if name != "sim"}, "the state of another simulation: state/time"),
+        (saved | {"speeds": {}}, "speeds missing or not known"),
+        (saved | {"sim": dict(list(saved["sim"].items())[1:])}, "the state of another simulation: state/time missing"),
+    ]
+    for part in ("touch", "obs", "seed", "actuation"):
+        match = f"the {part} that was saved is of other environments"
+        cases.append((saved | {part: dict(list(saved[part].items())[1:])}, match))
+    if is_begun:
+        cases.append((saved | {"episodes": saved["episodes"] | {"sums/other": torch.zeros(4)}}, "sums/other missing"))
+    for state, match in cases:
+        with pytest.raises(SimulationError, match=match):
+            other.load_state_dict(state)
+    after = other.state_dict()
+    assert after.keys() == before.keys()
+    for part, own in before.items():
+        assert own.keys() == after[part].keys() and all(torch.equal(own[name], after[part][name]) for name in own)
+    other.step(torch.ones(4, 2))
 
 
 def test_measured_velocities_are_those_of_a_hands_driver(make):

@@ -257,11 +257,13 @@ class TouchEnv:
         Raises:
             SimulationError: If they were others; nothing has changed.
         """
-        names = (name.partition("/") for name in state.get("episodes", {}))
-        self._episodes.expect(tuple(name for part, _, name in names if part == "sums"))
-        for part, memory in self._memory().items():
-            saving.refuse_other(memory, state.get(part, {}), part)
-        self.sim.load_state_dict(state["sim"])
+        sums = [name for name in state.get("episodes", {}) if name.startswith("sums/")]
+        own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
+        if not self._episodes.terms:  # no step was made, so that any may be
+            own["episodes"] |= dict.fromkeys(sums, self._episodes.total)
+        saving.refuse_other_parts(own, {part: kept for part, kept in state.items() if part != "sim"})
+        self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
+        self._episodes.expect(tuple(name.removeprefix("sums/") for name in sums))
         for part, memory in self._memory().items():
             saving.restore(memory, state[part])
         self.touch.load_state_dict(dict(state["touch"]))

@@ -28,6 +28,18 @@ def refuse_other(own: Mapping[str, Tensor], given: Mapping[str, Tensor], what: s
         )
 
 
+def refuse_other_parts(own: Mapping[str, Mapping[str, Tensor]], given: Mapping[str, Mapping[str, Tensor]]) -> None:
+    """Refuse what was saved of something else, part by part.
+
+    Raises:
+        SimulationError: If parts, or names or shapes in one, differ.
+    """
+    if wrong := sorted(own.keys() ^ given.keys()):
+        raise SimulationError(f"the state that was saved is of other environments: {listed(wrong)} missing or not known")
+    for part, tensors in own.items():
+        refuse_other(tensors, given[part], part)
+
+
 def restore(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
     """Put what was saved into the tensors of the same names."""
     with torch.no_grad():
