@@ -91,6 +91,43 @@ def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
     assert here(base, *start, "--iterations", "4", "--resume", "a run", "-o", "other", *ARGUMENTS)[0] == 0
     assert json.loads((base / "other" / "run.json").read_text())["starts"][0]["spec"]["rewards"]["spin"] == 2.0
     assert [read_checkpoint(base / name / "checkpoint.pt")["iteration"] for name in ("a run", "other")] == [3, 4]
+    from_where = [[each.get("goes_on_from") for each in starts], *_starts(base / "other", "goes_on_from")]
+    assert from_where == [[None, "a run"], "a run"]
+
+
+def _starts(folder, name):
+    return [each[name] for each in json.loads((folder / "run.json").read_text())["starts"]]
+
+
+def test_another_seed_and_other_sensors_are_told_and_what_a_version_did_not_know_is_not(base, here):
+    start = ["train", "task.yaml", "--device", "cpu", "--episodes", "0"]
+    assert here(base, *start, "--envs", "3", "--iterations", "1", "-o", "a run", *ARGUMENTS)[0] == 0
+    told = json.loads((base / "a run" / "run.json").read_text())
+    del told["starts"][0]["spec"]["goal_tolerance"]
+    (base / "a run" / "run.json").write_text(json.dumps(told))
+    (base / "sensors.yaml").write_text((base / "sensors.yaml").read_text() + "# the same\n")
+    code, out, error = here(base, *start, "--iterations", "2", "--resume", "a run", "--seed", "5")
+    assert code == 0, error
+    assert [line for line in out.splitlines() if "changed" in line] == ["changed since the run began: seed: 0, now 5"]
+    code, out, error = here(base, *start, "--iterations", "3", "--resume", "a run", "--set", "touch=none")
+    assert code == 0, error
+    begun = "changed since the run began: "
+    assert [line.removeprefix(begun) for line in out.splitlines() if begun in line] == [
+        'touch: "bool", now "none"',
+        "what is compiled of the sensors' document",
+    ]
+
+
+def test_two_documents_of_one_name_are_both_kept(base, here):
+    (base / "sub").mkdir()
+    task = (base / "task.yaml").read_text().replace("document: sensors.yaml", "document: ../sensors.yaml")
+    (base / "sub" / "sensors.yaml").write_text(task)
+    code, _, error = here(
+        base, "train", "sub/sensors.yaml", *ON, "--episodes", "0", "--iterations", "1", "-o", "run", *ARGUMENTS
+    )
+    assert code == 0, error
+    assert (base / "run" / "sub_sensors.yaml").read_text() == task
+    assert (base / "run" / f"{base.name}_sensors.yaml").read_text() == (base / "sensors.yaml").read_text()
 
 
 def test_rates_that_are_set_when_a_run_goes_on_count(base, here):

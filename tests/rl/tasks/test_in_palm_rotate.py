@@ -21,12 +21,13 @@ def random_actions(env, num, seed=0):
     return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
 
 
-def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
+@pytest.mark.parametrize("direction", ["counterclockwise", "clockwise"])
+def test_rewards_ends_and_scores_equal_the_reference(tmp_path, direction):
     push = "randomise: {xy: [-5 mm, 5 mm], yaw: [-1, 1], push: {x: [-2 N, 2 N], interval: [0.1 s, 0.2 s]}}\n"
-    env = tiny_env(tmp_path, 4, more=MORE + push)
+    env = tiny_env(tmp_path, 4, more=MORE + push + f"direction: {direction}\n")
     recorder = Recorder(env)
     for i, action in enumerate(random_actions(env, 80)):
-        env.sim.qvel[:2, 8] = 6.0  # spun by hand: nothing else turns a ball
+        env.sim.qvel[:2, 8] = 6.0 if direction == "counterclockwise" else -6.0  # spun by hand: nothing else turns a ball
         recorder.step(action if i < 40 else torch.ones_like(action))
     assert sum(len(episodes) for episodes in recorder.episodes) >= 12
     every = {*Rewards.model_fields, "is_over", "score"}
@@ -54,9 +55,10 @@ def turned(env, rate, steps=8):
     return total / steps
 
 
-def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path):
-    env = tiny_env(tmp_path, 5, gravity="0 0 0")
-    wrong, slowly_wrong, rest, slow, right = turned(env, [-2.0, -0.5, 0.0, 0.5, 2.0]).tolist()
+@pytest.mark.parametrize(("direction", "way"), [("counterclockwise", 1.0), ("clockwise", -1.0)])
+def test_the_right_way_beats_rest_and_rest_beats_the_wrong_way(tmp_path, direction, way):
+    env = tiny_env(tmp_path, 5, gravity="0 0 0", more=f"direction: {direction}\n")
+    wrong, slowly_wrong, rest, slow, right = turned(env, [way * rate for rate in (-2.0, -0.5, 0.0, 0.5, 2.0)]).tolist()
     assert wrong < slowly_wrong < rest < slow < right
     # Without goals it is the rate alone that pays.
     dt = env.control_step
@@ -81,19 +83,20 @@ def test_turning_to_and_fro_pays_nothing(tmp_path):
     assert total[0].item() == pytest.approx(Rewards().success * env.control_step, abs=0.02)
 
 
-def test_goals_are_quarter_turns(tmp_path):
-    env = tiny_env(tmp_path, 1, gravity="0 0 0", more="episode: 10 s\n")
+@pytest.mark.parametrize(("direction", "way"), [("counterclockwise", 1.0), ("clockwise", -1.0)])
+def test_goals_are_quarter_turns(tmp_path, direction, way):
+    env = tiny_env(tmp_path, 1, gravity="0 0 0", more=f"episode: 10 s\ndirection: {direction}\n")
     obs = env.reset()
-    assert obs["goal"][0].tolist() == pytest.approx([0, 1, 0, -1, 0, 0, math.pi / 2], abs=1e-6)
+    assert obs["goal"][0].tolist() == pytest.approx([0, way, 0, -way, 0, 0, math.pi / 2], abs=1e-6)
     reached = []
     for i in range(1, 140):
-        angle = torch.tensor(0.05 * i, dtype=torch.float64)
+        angle = torch.tensor(way * 0.05 * i, dtype=torch.float64)
         env.sim.qpos[0, 6:10] = torch.stack([(0.5 * angle).cos(), 0 * angle, 0 * angle, (0.5 * angle).sin()])
         env.sim.qvel[:] = 0
         made = env.step(torch.zeros(1, 2))
         if made.info.terms["success"][0] > 0:
             reached.append(0.05 * i)
-        goal = (len(reached) + 1) * math.pi / 2
+        goal = way * (len(reached) + 1) * math.pi / 2
         expected = [math.cos(goal), math.sin(goal), 0, -math.sin(goal), math.cos(goal), 0]
         assert made.obs["goal"][0, :6].tolist() == pytest.approx(expected, abs=1e-5)
     assert reached == pytest.approx([k * math.pi / 2 - 0.1 for k in (1, 2, 3, 4)], abs=0.051)

@@ -108,7 +108,7 @@ class Train:
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.checkpoint import restore
-        from tgdsl.rl.train.folder import differences, made_from
+        from tgdsl.rl.train.folder import changes, made_from
         from tgdsl.rl.train.learner import Learner
         from tgdsl.rl.train.run import Run
         from tgdsl.rl.train.telling import ProgressBar
@@ -123,8 +123,10 @@ class Train:
                 restore(learner, state, self.resume / "checkpoint.pt")
                 learner.change_rates(before.get("spec", {}).get("train", {}))
             origin = made_from(loaded, env, seed, overrides, ranks.size)
+            if self.resume is not None:
+                origin["goes_on_from"] = str(self.resume)
             if ranks.is_first:
-                for line in differences(before.get("spec", origin["spec"]), origin["spec"]):
+                for line in changes(before, origin, type(loaded.spec)) if before else ():
                     end = "; a run that goes on keeps its deviations" if line.startswith(INITIAL_STD) else ""
                     print(f"changed since the run began: {line}{end}")
                 folder.begin(origin, loaded, env)

@@ -2,6 +2,7 @@
 
 An episode begins with the object upright near the middle of the palm. The goal is a quarter turn further about the vertical n,
 and each time that it is reached, another one. With q the object's orientation, q_0 that at the start, p and p_0 its positions,
+and n up for `direction: counterclockwise`, down for `clockwise`, as seen from above,
 
     ψ_t = ψ_{t−1} + twist_n(q_t q_{t−1}⁻¹)                      angle turned so far [rad]
     θ   = swing_n(q q_0⁻¹)                                      tilt [rad]
@@ -34,7 +35,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -93,6 +94,8 @@ class InPalmRotateSpec(TaskSpec):
     """What is random."""
     rewards: Rewards = Rewards()
     """Weights of the reward's terms."""
+    direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
+    """Which way the object is to turn, seen from above."""
     goal_tolerance: Angle = 0.1
     """ε: a goal is reached this close to it [rad]."""
     max_tilt: Angle = 0.4
@@ -118,12 +121,12 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
             `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, limits [rad].
         dt: Δt [s].
     """
-    weights = spec.rewards
+    weights, way = spec.rewards, _way(spec)
     pos, quat, low, high = record["pos"], record["quat"], record["low"], record["high"]
     angle, reached, rows = 0.0, 0, []
     for t in range(1, len(pos)):
         w, x, y, z = _quat_product(quat[t], quat[t - 1] * [1, -1, -1, -1])
-        step = 2.0 * math.atan2(z if w >= 0 else -z, abs(w))
+        step = 2.0 * way * math.atan2(z if w >= 0 else -z, abs(w))
         angle += step
         w, x, y, z = _quat_product(quat[t], quat[0] * [1, -1, -1, -1])
         tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
@@ -148,6 +151,11 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
+def _way(spec: InPalmRotateSpec) -> float:
+    """Return the axis' component along the vertical."""
+    return 1.0 if spec.direction == "counterclockwise" else -1.0
+
+
 def _quat_product(left: np.ndarray, right: np.ndarray) -> Any:
     (a, *v), (b, *u) = left, right
     return np.concatenate([[a * b - np.dot(v, u)], a * np.array(u) + b * np.array(v) + np.cross(v, u)])
@@ -162,7 +170,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):
         """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
-        self.up = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
+        self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
         limits = (setup.actuators.low, setup.actuators.high)
         self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
@@ -181,10 +189,10 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         """Add up what the object has turned, and give it another goal where it has reached one."""
         quat = now.object.quat
         since = rotations.product(quat.expand(2, -1, -1), rotations.inverse(torch.stack([self.quat, self.start_quat])))
-        step = rotations.twist(since[0], self.up)
+        step = rotations.twist(since[0], self.axis)
         self.angle += step
         self.rate.copy_(step / self.setup.control_step)
-        self.tilt.copy_(rotations.swing(since[1], self.up))
+        self.tilt.copy_(rotations.swing(since[1], self.axis))
         self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
         self.reached += self.is_reached
         self.quat.copy_(quat)
@@ -212,7 +220,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""
-        goal = rotations.product(rotations.about(self.up, self._goal()), self.start_quat)
+        goal = rotations.product(rotations.about(self.axis, self._goal()), self.start_quat)
         error = rotations.between(goal, now.object.quat)
         return {
             "goal": torch.cat([rotations.six_numbers(goal), error[:, None]], dim=1),

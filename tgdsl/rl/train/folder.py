@@ -20,14 +20,17 @@ import platform
 import re
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 
 from tgdsl.errors import FileError, TgdslError
+from tgdsl.fields.models import SpecModel
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
@@ -113,8 +116,8 @@ class RunFolder:
         before = self._read() if self.has_run else {}
         starts = [*before.get("starts", []), dict(made_from)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
-        for file in documents(loaded):
-            atomic_write(self.path / file.name, file.read_bytes())
+        for name, file in documents(loaded).items():
+            atomic_write(self.path / name, file.read_bytes())
         atomic_write(self.path / "taxels.csv", taxel_csv(env.touch).encode())
 
     def last_start(self) -> dict[str, Any]:
@@ -175,10 +178,15 @@ class RunFolder:
                 file.unlink(missing_ok=True)
 
 
-def documents(loaded: LoadedTask) -> Sequence[Path]:
-    """Return the files of the task's and the sensors' documents, those that are files."""
-    own = [Path(loaded.source.file), loaded.folder / loaded.spec.document]
-    return [file for file in own if file.is_file()]
+def documents(loaded: LoadedTask) -> dict[str, Path]:
+    """Return the files of the task's and the sensors' documents, those that are files, by the names of their copies.
+
+    Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
+    """
+    own = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
+    if len({file.name for file in own}) == len(own):
+        return {file.name: file for file in own}
+    return {f"{file.resolve().parent.name}_{file.name}": file for file in own}
 
 
 def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[str, Any], processes: int) -> dict[str, Any]:
@@ -198,6 +206,23 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
         "taxels": env.touch.taxels_id,
         "versions": versions(),
     }
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[SpecModel]) -> list[str]:
+    """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors.
+
+    Args:
+        before: What the last start was made from; what its version of tgdsl did not know has its default.
+        now: What this one is made from.
+        model: Model of the task's document.
+    """
+    spec = before["spec"]
+    with suppress(ValidationError):  # of a version with other names: what it had is told as it was
+        spec = model.model_validate(spec).model_dump(mode="json")
+    lines = differences(spec, now["spec"])
+    lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
+    told = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
+    return lines + [what for name, what in told.items() if before[name] != now[name]]
 
 
 def differences(before: Any, now: Any, path: str = "") -> list[str]:
