@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import contact_patches
 import heat_steps
 import meetings
 import moment_fields
@@ -95,6 +96,11 @@ EXAMPLES = {
         lambda dtype: heat_steps.arguments("five objects", dtype),
         lambda found, _: [found.cells, found.nodes, torch.stack(found.got), torch.stack(found.nodes_got)],
         (2e-5, 2e-5, 1e-5, 1e-5),
+    ),
+    "contact_patch": Example(
+        lambda dtype: contact_patches.arguments("four slots", dtype),
+        lambda found, _: [found.force, found.polygon, torch.stack(found.pos), torch.stack(found.normal)],
+        (2e-5, 2e-8, 2e-5, 2e-5),
     ),
 }
 

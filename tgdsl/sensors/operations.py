@@ -6,6 +6,7 @@ from typing import Any
 
 from tgdsl.quantities.contact_depth.search import DEEPEST
 from tgdsl.quantities.moments.nearby import FELT_MOMENTS
+from tgdsl.quantities.patches.patch import CONTACT_PATCH
 from tgdsl.quantities.points.points import LINK_POINTS
 from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, SHEAR_LOADS
 from tgdsl.sensors.force_taxel.footprint import SHARED_FORCES
@@ -22,4 +23,5 @@ OPERATIONS: tuple[Operation[..., Any], ...] = (
     POINT_SUM,
     SHARED_FORCES,
     HEAT_STEP,
+    CONTACT_PATCH,
 )

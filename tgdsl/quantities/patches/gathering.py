@@ -5,9 +5,6 @@ Shapes: `env` environments, `body` bodies that carry the sensor, `object` object
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
-
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -16,9 +13,12 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.base import Scene
 from tgdsl.quantities.patches.part import PatchesPart, PatchesUse
-from tgdsl.quantities.patches.polygon import polygon_area
-from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects, cancelled
-from tgdsl.quantities.patches.slots import slots_of
+from tgdsl.quantities.patches.patch import CONTACT_PATCH
+from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects
+from tgdsl.quantities.patches.slots import Contacts, Sides
+
+FIELDS = (*(f"contact_{name}" for name in ("force", "torque", "normal", "pos", "netforce")), "body_pos", "body_quat")
+"""Fields of the state that patches follow from."""
 
 
 def gather(part: PatchesPart[Tensor], scene: Scene) -> tuple[ContactPatch, ...]:
@@ -33,43 +33,12 @@ def _patches(use: PatchesUse[Tensor], scene: Scene) -> ContactPatch:
         none = use.start.new_zeros((1, use.topology.num_bodies, use.topology.num_objects)).to(scene.dtype)
         nowhere = (none, none, none)
         return ContactPatch(none, none, nowhere, nowhere, None, None, objects, use.topology, use.sides, cells, boxes)
-    slots = slots_of(use, scene)
-    force = [slot.force for slot in slots]
-    total = sum(force[1:], start=force[0])
-    inverse = 1.0 / torch.where(total > 0, total, 1.0)
-    share = [part * inverse for part in force]
-    centre = _mean(share, [slot.pos for slot in slots])
-    normal = _direction(force, share, [slot.normal for slot in slots])
-    area = polygon_area([planes.sub(slot.pos, centre) for slot in slots], normal, [part > 0 for part in force])
-    turn = planes.rotation(scene.tensors["body_quat"][:, use.bodies])
-    turn = planes.rot(part.to(scene.dtype)[..., None] for part in turn)
-    centre, normal = planes.rotate_back(turn, centre), planes.rotate_back(turn, normal)
+    tensors, sides = scene.tensors, Sides(use.bodies, use.pairs, len(use.topology.met) == use.pairs.numel())
+    force, area, centre, normal = CONTACT_PATCH(Contacts(*(tensors[name] for name in FIELDS)), sides, scene.dtype)
     seen: tuple[Vec | None, Vec | None] = None, None
     if use.topology.interfaces:
         seen = _as_objects_see(use, scene, centre, normal)
-    return ContactPatch(total, area, centre, normal, *seen, objects, use.topology, use.sides, cells, boxes)
-
-
-def _mean(share: Sequence[Tensor], of: Sequence[Vec]) -> Vec:
-    """Return the sum of vectors, each times its share."""
-    parts = [planes.scale(weight, vector) for weight, vector in zip(share, of, strict=True)]
-    return reduce(planes.add, parts)
-
-
-def _direction(force: Sequence[Tensor], share: Sequence[Tensor], normals: Sequence[Vec]) -> Vec:
-    """Return the direction of the mean of normals, or of the first that counts where they cancel."""
-    mean, first = _mean(share, normals), normals[-1]
-    for weight, normal in zip(reversed(force[:-1]), reversed(normals[:-1]), strict=True):
-        first = planes.where(weight > 0, normal, first)
-    is_none = (planes.dot(mean, mean) < cancelled() ** 2) & (sum(force[1:], start=force[0]) > 0)
-    return _unit(planes.where(is_none, first, mean))
-
-
-def _unit(vector: Vec) -> Vec:
-    """Return a direction; zero where there is none."""
-    squared = planes.dot(vector, vector)
-    inverse = torch.where(squared > 0, torch.rsqrt(torch.where(squared > 0, squared, 1.0)), 0.0)
-    return planes.scale(inverse, vector)
+    return ContactPatch(force, area, centre, normal, *seen, objects, use.topology, use.sides, cells, boxes)
 
 
 def _as_objects_see(use: PatchesUse[Tensor], scene: Scene, centre: Vec, normal: Vec) -> tuple[Vec, Vec]:

@@ -13,8 +13,42 @@ from torch import Tensor
 
 from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
-from tgdsl.quantities.base import Scene
-from tgdsl.quantities.patches.part import PatchesUse
+
+
+class Contacts(NamedTuple):
+    """What the solver says of contacts, and where bodies are: fields of `SceneState`.
+
+    Attributes:
+        force: Of each contact (env, pair, slot, 3) [N].
+        torque: Likewise [N·m].
+        normal: Likewise.
+        pos: Likewise [m].
+        whole: Force of all contacts of a pair (env, pair, 3) [N].
+        body_pos: Origins of bodies (env, body, 3) [m].
+        body_quat: Their orientations (env, body, 4).
+    """
+
+    force: Tensor
+    torque: Tensor
+    normal: Tensor
+    pos: Tensor
+    whole: Tensor
+    body_pos: Tensor
+    body_quat: Tensor
+
+
+class Sides(NamedTuple):
+    """Which contacts make a patch.
+
+    Attributes:
+        bodies: Indices of the sensor's bodies (body,).
+        pairs: Of which pair each body's contacts with each object are (body, object); the number of pairs for none.
+        are_all: Whether each body may meet each object.
+    """
+
+    bodies: Tensor
+    pairs: Tensor
+    are_all: bool
 
 
 class Slot(NamedTuple):
@@ -41,15 +75,18 @@ class Touch(NamedTuple):
     is_used: Tensor
 
 
-def slots_of(use: PatchesUse[Tensor], scene: Scene) -> list[Slot]:
-    """Return a body's contacts with an object, of a use in which some may meet.
+def slots_of(contacts: Contacts, sides: Sides, dtype: torch.dtype) -> list[Slot]:
+    """Return each body's contacts with each object, of which some may meet.
 
     What the forces of a pair lack of its whole force is shared out as `contacts` does; the force of a contact without normal is
     not a number.
+
+    Args:
+        contacts: What there is.
+        sides: Which of it counts.
+        dtype: Dtype of what is returned; sums are those of the contacts' dtype.
     """
-    state = scene.tensors
-    names = ("contact_force", "contact_torque", "contact_normal", "contact_pos")
-    fields = [_of_pairs(state[name], use).flatten(3).unbind(-1) for name in names]
+    fields = [_of_pairs(field, sides).flatten(3).unbind(-1) for field in contacts[:4]]
     touches = []
     for i in range(0, len(fields[0]), 3):
         force, torque, normal, pos = (planes.vec(field[i : i + 3]) for field in fields)
@@ -57,12 +94,12 @@ def slots_of(use: PatchesUse[Tensor], scene: Scene) -> list[Slot]:
         for part in (*force[1:], *torque, *normal):
             is_used = is_used | (part != 0)
         touches.append(Touch(force, torque, normal, pos, is_used))
-    forces = _normal_forces(planes.split(_of_pairs(state["contact_netforce"], use)), touches)
-    origin = planes.split(state["body_pos"][:, use.bodies, None])
+    forces = _normal_forces(planes.split(_of_pairs(contacts.whole, sides)), touches)
+    origin = planes.split(contacts.body_pos[:, sides.bodies, None])
     found = []
     for force, touch in zip(forces, touches, strict=True):
-        away = planes.vec(torch.where(touch.is_used, part, 0.0).to(scene.dtype) for part in planes.sub(touch.pos, origin))
-        found.append(Slot(force.to(scene.dtype), away, planes.vec(part.to(scene.dtype) for part in touch.normal)))
+        away = planes.vec(torch.where(touch.is_used, part, 0.0).to(dtype) for part in planes.sub(touch.pos, origin))
+        found.append(Slot(force.to(dtype), away, planes.vec(part.to(dtype) for part in touch.normal)))
     return found
 
 
@@ -85,10 +122,10 @@ def _normal_forces(whole: Vec, touches: list[Touch]) -> list[Tensor]:
     return found
 
 
-def _of_pairs(field: Tensor, use: PatchesUse[Tensor]) -> Tensor:
+def _of_pairs(field: Tensor, sides: Sides) -> Tensor:
     """Return a field (env, pair, *rest) as (env, body, object, *rest), zero where there is no pair."""
-    index, num_pairs = use.pairs, field.shape[1]
-    if len(use.topology.met) == index.shape[0] * index.shape[1]:
+    index, num_pairs = sides.pairs, field.shape[1]
+    if sides.are_all:
         return field[:, index]
     is_pair = (index < num_pairs).reshape(*index.shape, *[1] * (field.ndim - 2))
     return torch.where(is_pair, field[:, index.clamp(max=num_pairs - 1)], 0.0)

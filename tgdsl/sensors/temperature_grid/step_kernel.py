@@ -29,10 +29,10 @@ LEAST = tl.constexpr(least_width())
 PI = tl.constexpr(3.141592653589793)
 UNROLLED = tl.constexpr(8)
 """Modes up to which they are written out one by one."""
-FEWEST = 256
+FEWEST = 512
 """Numbers of a program's block at least: more environments are taken together."""
-OF_WARP = 512
-"""Numbers of a block for each warp: between warps, sums go through shared memory."""
+OF_WARP = (256, 512)
+"""Numbers of a block for each warp: an environment's, within these bounds. Between warps, sums go through shared memory."""
 
 
 @triton_op("tgdsl::heat_step", mutates_args={})
@@ -94,7 +94,7 @@ def launch(
         *around, dt if convection is None else convection, gained, nodes_gained, got, nodes_got, num_envs, num_rows,
         NX=x, NY=y, NZ=z, SIDES=num_sides, ENVS=envs, ROWS=block[0], SIDE=block[1], CELLS=block[2],
         RADIATES=emissivity is not None, BLOWS=convection is not None, HAS_SOURCE=source is not None,
-        num_warps=max(1, min(8, envs * size // OF_WARP)),
+        num_warps=max(1, min(8, envs * size // max(OF_WARP[0], min(OF_WARP[1], size)))),
     )  # fmt: skip
     return gained, nodes_gained, got, nodes_got
 
