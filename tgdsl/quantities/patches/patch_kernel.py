@@ -23,9 +23,9 @@ from tgdsl.geometry.shapes_kernel import dot
 from tgdsl.quantities.patches.request import cancelled
 
 CANCELLED = tl.constexpr(cancelled())
-BLOCK = 64
+BLOCK = 16
 """Pairs of a program."""
-WARPS = 4
+WARPS = 1
 """Warps of a program."""
 
 
