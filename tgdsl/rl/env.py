@@ -37,7 +37,7 @@ from tgdsl.tensors.threads import one_thread
 from tgdsl.tensors.torch_internals import below_autograd
 
 MOST_OF_ONE_THREAD = 2**16
-"""Up to so many taxels of all environments are read by one thread on a CPU: more would get less than 2¹⁵ each of torch."""
+"""Up to so many taxels of all environments one thread reads on a CPU: each of two would get less than 2¹⁵ numbers."""
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
 
@@ -116,8 +116,7 @@ class TouchEnv:
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
-        random = self.spec.randomise
-        arrays = self.sim.arrays
+        random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         body = int(setup.model.body(setup.object).id)
@@ -133,8 +132,10 @@ class TouchEnv:
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
-        self._dispatch, self._few = (nullcontext,) * 2 if is_compiled or is_cuda else (below_autograd, one_thread)
-        self._reads_few = num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
+        is_plain = not (is_compiled or is_cuda)
+        is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
+        self._dispatch = below_autograd if is_plain else nullcontext
+        self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
         self._readings: dict[str, Tensor] = {}
         self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
@@ -211,7 +212,7 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.inference_mode(False), torch.no_grad(), self._dispatch():  # memory is written outside of inference mode too
+        with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
             made = self._call()
             made = saving.copied(made) if self.device.type == "cuda" else made
@@ -306,13 +307,12 @@ class TouchEnv:
     def _advance(self) -> Step:
         """Make one control step with the action that was copied: see the top of this page."""
         sim = self.sim
-        with self._few():
+        with self._logic_by():
             self._before.copy_(self._used)
             control = self._commanded(self._action, sim.ctrl)
         sim.step(control)
-        with self._few() if self._reads_few else nullcontext():
-            readings = sim.read()
-        with self._few():
+        readings = sim.read()
+        with self._logic_by():
             return self._conclude(readings)
 
     def _conclude(self, readings: dict[str, Tensor]) -> Step:
