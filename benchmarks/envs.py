@@ -344,6 +344,7 @@ def main() -> None:
     parser.add_argument("--simulator", choices=("mujoco", "warp"))
     parser.add_argument("--envs", type=int, default=256)
     parser.add_argument("--threads", type=int, default=2, help="of physics and torch, on the CPU")
+    parser.add_argument("--torch-threads", type=int, help="of torch alone: more than one are in the way of physics")
     parser.add_argument("--cpu-time", action="store_true", help="of this process, which others disturb less")
     parser.add_argument("--compiled", action="store_true", help="compile module and logic on a CPU too, alone and in the step")
     parser.add_argument("--cones", nargs="+", default=["elliptic", "pyramidal"])
@@ -356,7 +357,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="writes OUT.json and OUT.csv")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(options.torch_threads or options.threads)
     tasks = options.tasks or sorted(file for file in TASKS.glob("*.yaml") if "\ntask:" in file.read_text(encoding="utf-8"))
     rows = []
     for task in tasks:

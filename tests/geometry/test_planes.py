@@ -38,3 +38,11 @@ def test_length_and_direction_of_a_vector_that_vanishes():
     np.testing.assert_array_equal(stacked([part.detach() for part in direction]), [[1, 0, 0], [1, 0, 0], [0, 1, 0]])
     (gradient,) = torch.autograd.grad(length.sum() + direction[1].sum(), x)
     assert torch.isfinite(gradient).all()
+
+
+def test_powers_of_depths_that_are_all_none_are_the_zeros_of_a_look_at_each():
+    exponent = torch.tensor(1.2)
+    for depth in (torch.tensor([0.0, -0.0, -torch.inf, -1e-3]), torch.tensor([0.0, torch.nan]), torch.tensor([0.0, 1e-3])):
+        with torch.no_grad():
+            found = planes.power(depth, exponent)
+        assert found.numpy().tobytes() == planes.power(depth, exponent).numpy().tobytes()

@@ -200,6 +200,7 @@ def test_the_same_seed_gives_the_same_bytes(make):
     for env in envs[:2]:
         torch.set_num_threads(2 if env is envs[1] else 1)
         env.found = [env._obs, *(env.step(action).obs for action in actions(env, STEPS))]
+        assert torch.get_num_threads() == (2 if env is envs[1] else 1)
     torch.set_num_threads(1)
     assert all(same(a, b) for a, b in zip(envs[0].found, envs[1].found, strict=True))
     assert not same(envs[2]._obs, envs[0].found[0])

@@ -1,9 +1,11 @@
 """What a task is told of its simulation."""
 
 import pytest
+import torch
 from tiny_tasks import write_task
 
 from tgdsl.errors import SpecError
+from tgdsl.rl import env as env_file
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.sensed import num_variants
@@ -61,3 +63,25 @@ def varied_task(folder):
     task, sensors = write_task(folder), folder / "sensors.yaml"
     sensors.write_text(sensors.read_text().replace("objects: {ball: {body: ball}}\n", VARIANTS))
     return task
+
+
+@pytest.mark.parametrize(("most", "threads"), [(0, 2), (2**16, 1)])
+def test_logic_has_one_thread_and_readings_of_many_taxels_have_all(tmp_path, monkeypatch, most, threads):
+    monkeypatch.setattr(env_file, "MOST_OF_ONE_THREAD", most)
+    env, seen = TouchEnv(varied_task(tmp_path), 4, threads=1), {}
+
+    def noted(owner, name):
+        method = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *given: (seen.setdefault(name, torch.get_num_threads()), method(*given))[1])
+
+    for owner, name in ((env.sim, "read"), (env, "_judged"), (env, "_commanded"), (env, "_begin")):
+        noted(owner, name)
+    env.steps.fill_(env.max_steps)  # so that all episodes end
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        env.step(torch.zeros(4, env.num_actions))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    assert seen == {"read": threads, "_judged": 1, "_commanded": 1, "_begin": 1}

@@ -2,17 +2,24 @@
 
 A vector is a tuple `(x, y, z)` of equally shaped tensors, a rotation a tuple of nine, row by row. Written so, every
 operation is pointwise and a compiler fuses a whole sensor into one loop; a trailing axis of 3 costs several times more.
+What adds and multiplies alone takes NumPy's arrays too: see `tensors.on_host`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-Vec = tuple[Tensor, Tensor, Tensor]
-Rot = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+from tgdsl.tensors.env_ids import may_look
+
+Plane = TypeVar("Plane", Tensor, np.ndarray)
+VecOf = tuple[Plane, Plane, Plane]
+RotOf = tuple[Plane, Plane, Plane, Plane, Plane, Plane, Plane, Plane, Plane]
+Vec, Rot = VecOf[Tensor], RotOf[Tensor]
 
 # Functions, not floats of the module: under dynamic shapes torch.compile makes those inputs of the graph.
 
@@ -41,17 +48,17 @@ def pi() -> float:
     return 3.141592653589793
 
 
-def split(stacked: Tensor) -> Vec:
+def split(stacked: Plane) -> VecOf[Plane]:
     """Return the components of a `(..., 3)` tensor, as views."""
     return stacked[..., 0], stacked[..., 1], stacked[..., 2]
 
 
-def add(a: Vec, b: Vec) -> Vec:
+def add(a: VecOf[Plane], b: VecOf[Plane]) -> VecOf[Plane]:
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-def sub(a: Vec, b: Vec) -> Vec:
+def sub(a: VecOf[Plane], b: VecOf[Plane]) -> VecOf[Plane]:
     """Return a − b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
@@ -61,12 +68,12 @@ def scale(factor: Tensor, a: Vec) -> Vec:
     return factor * a[0], factor * a[1], factor * a[2]
 
 
-def dot(a: Vec, b: Vec) -> Tensor:
+def dot(a: VecOf[Plane], b: VecOf[Plane]) -> Plane:
     """Return the inner product of a and b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def cross(a: Vec, b: Vec) -> Vec:
+def cross(a: VecOf[Plane], b: VecOf[Plane]) -> VecOf[Plane]:
     """Return a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
@@ -92,7 +99,7 @@ def rot(parts: Iterable[Tensor]) -> Rot:
     return xx, xy, xz, yx, yy, yz, zx, zy, zz
 
 
-def rotate(r: Rot, a: Vec) -> Vec:
+def rotate(r: RotOf[Plane], a: VecOf[Plane]) -> VecOf[Plane]:
     """Return R a."""
     return (
         r[0] * a[0] + r[1] * a[1] + r[2] * a[2],
@@ -101,7 +108,7 @@ def rotate(r: Rot, a: Vec) -> Vec:
     )
 
 
-def rotate_back(r: Rot, a: Vec) -> Vec:
+def rotate_back(r: RotOf[Plane], a: VecOf[Plane]) -> VecOf[Plane]:
     """Return Rᵀ a."""
     return (
         r[0] * a[0] + r[3] * a[1] + r[6] * a[2],
@@ -110,16 +117,16 @@ def rotate_back(r: Rot, a: Vec) -> Vec:
     )
 
 
-def transpose_times(a: Rot, b: Rot) -> Rot:
+def transpose_times(a: RotOf[Plane], b: RotOf[Plane]) -> RotOf[Plane]:
     """Return Aᵀ B."""
     columns = [rotate_back(a, (b[j], b[j + 3], b[j + 6])) for j in range(3)]
     (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = columns
     return xx, xy, xz, yx, yy, yz, zx, zy, zz
 
 
-def rotation(quat: Tensor) -> Rot:
+def rotation(quat: Plane) -> RotOf[Plane]:
     """Return the rotation of a `(..., 4)` quaternion w, x, y, z, which need not have unit length."""
-    w, x, y, z = quat.unbind(-1)
+    w, x, y, z = (quat[..., i] for i in range(4))
     two = 2.0 / (w * w + x * x + y * y + z * z)
     tw, tx, ty = two * w, two * x, two * y
     xx, yy, zz = tx * x, ty * y, two * z * z
@@ -159,5 +166,7 @@ def _safe_roots(squared: Tensor) -> tuple[Tensor, Tensor]:
 def power(depth: Tensor, exponent: Tensor) -> Tensor:
     """Return d^α of depths d ≥ 0, to α |log₂ d| roundings; where d = 0 its derivatives are 0, not infinite, even for α < 1."""
     is_none = depth <= 0
+    if may_look(depth) and bool(is_none.all()):
+        return torch.zeros_like(depth)
     logarithm = torch.log2(torch.where(is_none, 1.0, depth))  # a general power takes ten times as many instructions
     return torch.where(is_none, torch.zeros_like(depth), torch.exp2(exponent * logarithm))

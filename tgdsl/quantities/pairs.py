@@ -15,7 +15,8 @@ from torch import Tensor
 
 from tgdsl.fields.indices import indices
 from tgdsl.geometry import planes
-from tgdsl.geometry.planes import Rot, Vec
+from tgdsl.geometry.planes import Plane, Rot, Vec
+from tgdsl.tensors.on_host import on_host
 
 Array = TypeVar("Array")
 
@@ -126,23 +127,35 @@ def relate(
     Returns:
         The pairs, in `dtype`.
     """
-    link_rotation, target_rotation = (planes.rotation(quat.index_select(1, own)) for own in (link, target))
-    apart = planes.sub(planes.split(pos[:, link]), planes.split(pos[:, target]))
-    rotation = planes.transpose_times(target_rotation, link_rotation)
-    offset = planes.rotate_back(target_rotation, apart)
-    parts = [*rotation, *offset]
-    if linvel is not None and angvel is not None:
-        spin, turn = planes.split(angvel[:, target]), planes.split(angvel[:, link])
-        slide = planes.sub(planes.split(linvel[:, target]), planes.split(linvel[:, link]))
-        parts += planes.rotate_back(link_rotation, planes.add(slide, planes.cross(spin, apart)))
-        parts += planes.rotate_back(link_rotation, planes.sub(spin, turn))
-        parts += planes.rotate_back(link_rotation, turn)
+    velocities = () if linvel is None or angvel is None else (linvel, angvel)
+    fields = (quat, pos, *velocities)
+    parts = on_host(_related, *(own.index_select(1, bodies) for bodies in (link, target) for own in fields))
     is_moving = len(parts) > 12
     parts += [] if gate is None else [gate + 0.0 * parts[9]]  # of the same numbers, so that it is formed beside the others
     # Stacked, they are stored once per pair; a compiler that fuses would else form them anew for every taxel.
     parts = torch.stack(parts, dim=1).to(dtype).unbind(1)
     motion = Motion(planes.vec(parts[12:15]), planes.vec(parts[15:18]), planes.vec(parts[18:21])) if is_moving else None
     return Pairs(planes.rot(parts[:9]), planes.vec(parts[9:12]), motion, None if gate is None else parts[-1])
+
+
+def _related(*fields: Plane) -> list[Plane]:
+    """Return the planes of `relate` without the gate: rotation, offset and, if there are velocities, motion.
+
+    Args:
+        *fields: Quaternion, position and, if motion is wanted, velocity and angular velocity, of each pair's link, (env, pair,
+            …); and the same of its object.
+    """
+    half = len(fields) // 2
+    (link_quat, link_pos, *link_motion), (quat, pos, *motion) = fields[:half], fields[half:]
+    link_rotation, rotation = planes.rotation(link_quat), planes.rotation(quat)
+    apart = planes.sub(planes.split(link_pos), planes.split(pos))
+    parts = [*planes.transpose_times(rotation, link_rotation), *planes.rotate_back(rotation, apart)]
+    if motion:
+        (link_linear, turn), (linear, spin) = map(planes.split, link_motion), map(planes.split, motion)
+        slide = planes.sub(linear, link_linear)
+        for own in (planes.add(slide, planes.cross(spin, apart)), planes.sub(spin, turn), turn):
+            parts += planes.rotate_back(link_rotation, own)
+    return parts
 
 
 def gathered(vector: Vec, own: slice, pair: Tensor) -> Vec:

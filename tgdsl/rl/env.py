@@ -33,8 +33,11 @@ from tgdsl.rl.start import make_setup, make_simulation, moved_joints, simulator_
 from tgdsl.rl.task import Now
 from tgdsl.tensors.env_ids import may_hold
 from tgdsl.tensors.fused import FusedCall
+from tgdsl.tensors.threads import one_thread
 from tgdsl.tensors.torch_internals import below_autograd
 
+MOST_OF_ONE_THREAD = 2**16
+"""Up to so many taxels of all environments one thread reads on a CPU: each of two would get less than 2¹⁵ numbers."""
 PREPARING_STEPS = 3
 """The third step is captured on a GPU, and the second one compiled."""
 
@@ -113,12 +116,12 @@ class TouchEnv:
         except LowerError as error:
             raise loaded.error((error.field,), error.what, error.hint) from error
         self._draws, self._first_env = draws, first_env
-        random = self.spec.randomise
-        arrays = self.sim.arrays
+        random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
         body = int(setup.model.body(setup.object).id)
         self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
+        self._control_step = setup.control_step  # MuJoCo takes a while to tell
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
         self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
@@ -129,7 +132,10 @@ class TouchEnv:
         self._judged = FusedCall(self._judge, is_compiled)
         self._observed = FusedCall(self._observe, is_compiled)
         self._call = self.sim.repeated(self._advance)
-        self._dispatch = nullcontext if is_compiled or is_cuda else below_autograd
+        is_plain = not (is_compiled or is_cuda)
+        is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
+        self._dispatch = below_autograd if is_plain else nullcontext
+        self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
         self._readings: dict[str, Tensor] = {}
         self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
@@ -206,10 +212,10 @@ class TouchEnv:
         """
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
-        with torch.inference_mode(False), torch.no_grad(), self._dispatch():  # memory is written outside of inference mode too
+        with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
             made = self._call()
-            made = _copied(made) if self.device.type == "cuda" else made
+            made = saving.copied(made) if self.device.type == "cuda" else made
         self._obs = made.obs
         return made._replace(obs=dict(made.obs))
 
@@ -301,9 +307,17 @@ class TouchEnv:
     def _advance(self) -> Step:
         """Make one control step with the action that was copied: see the top of this page."""
         sim = self.sim
-        self._before.copy_(self._used)
-        sim.step(self._commanded(self._action, sim.ctrl))
-        now = self._now(sim.read())
+        with self._logic_by():
+            self._before.copy_(self._used)
+            control = self._commanded(self._action, sim.ctrl)
+        sim.step(control)
+        readings = sim.read()
+        with self._logic_by():
+            return self._conclude(readings)
+
+    def _conclude(self, readings: dict[str, Tensor]) -> Step:
+        """Return what a control step has brought, by its readings, and begin episodes where some have ended."""
+        sim, now = self.sim, self._now(readings)
         self._measure(now)
         self.task.advance(now)
         made = self._judged(now, sim.faults)
@@ -334,7 +348,7 @@ class TouchEnv:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
         rates = self.task.reward(now, terminated)
-        earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self.control_step).float()
+        earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self._control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
         self._episodes.add(tuple(rates), earned, reward)
         truncated = (self.steps >= self.max_steps) & ~terminated
@@ -384,12 +398,3 @@ class TouchEnv:
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
         own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)} | self.task.observe(now)
         return {name: value.to(self.device, torch.float32) for name, value in own.items()}
-
-
-def _copied(made: Any) -> Any:
-    """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
-    if isinstance(made, Tensor):
-        return made.clone()
-    if isinstance(made, dict):
-        return {name: _copied(value) for name, value in made.items()}
-    return type(made)(*(_copied(value) for value in made))

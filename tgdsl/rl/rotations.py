@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from tgdsl.geometry.rotations import Quat, Vector, product, rotated
 
@@ -30,7 +31,7 @@ def between(one: Quat, other: Quat) -> Float[Tensor, "*n"]:
 
     Of unit length they are 2 |sin θ/4| and 2 |cos θ/4| apart, as q and −q are the same rotation.
     """
-    apart, against = (one - other).norm(dim=-1), (one + other).norm(dim=-1)
+    apart, against = (vector_norm(own, dim=-1) for own in (one - other, one + other))
     return 4.0 * torch.atan2(torch.minimum(apart, against), torch.maximum(apart, against))
 
 
@@ -44,7 +45,7 @@ def swing(quat: Quat, axis: Vector) -> Float[Tensor, "*n"]:
     """Return the angle by which a rotation tilts an axis, from 0 to π [rad]."""
     turn = quat[..., 1:]
     along = (turn * axis).sum(dim=-1, keepdim=True)
-    return 2.0 * torch.atan2((turn - along * axis).norm(dim=-1), torch.hypot(quat[..., 0], along[..., 0]))
+    return 2.0 * torch.atan2(vector_norm(turn - along * axis, dim=-1), torch.hypot(quat[..., 0], along[..., 0]))
 
 
 def six_numbers(quat: Quat) -> Float[Tensor, "*n 6"]:

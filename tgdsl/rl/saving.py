@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,3 +46,12 @@ def restore(own: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
     with torch.no_grad():
         for name, value in given.items():
             own[name].copy_(value)
+
+
+def copied(made: Any) -> Any:
+    """Return copies of all tensors in dictionaries and named tuples: a graph's own are overwritten at its next replay."""
+    if isinstance(made, Tensor):
+        return made.clone()
+    if isinstance(made, dict):
+        return {name: copied(value) for name, value in made.items()}
+    return type(made)(*(copied(value) for value in made))

@@ -20,6 +20,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from tgdsl.rl.task import Now
 
@@ -47,7 +48,7 @@ def work(now: Now) -> Float[Tensor, " env"]:
 
 def contact_force(now: Now, most: float) -> Float[Tensor, " env"]:
     """Return by how much the object's force on each link exceeds a limit [N], as a share of it, summed."""
-    return ((now.link_force.norm(dim=2) - most).clamp(min=0.0) / most).sum(dim=1)
+    return ((vector_norm(now.link_force, dim=2) - most).clamp(min=0.0) / most).sum(dim=1)
 
 
 def near(now: Now, width: float) -> Float[Tensor, " env"]:

@@ -118,8 +118,10 @@ def penetration(
 
 def _distance(pairs: Pairs, probes: Probes, geoms: Geoms, own: slice, pair: Tensor) -> tuple[Tensor, Vec]:
     """Return signed distance [m] to the union of an object's geoms, and its gradient in the link's frame."""
-    rotation = planes.rot(part[:, own] for part in pairs.rotation)
-    offset = planes.vec(part[:, own] for part in pairs.offset)
+    parts = [*pairs.rotation, *pairs.offset]
+    if own != slice(0, parts[0].shape[1]):
+        parts = [part[:, own] for part in parts]
+    rotation, offset = planes.rot(parts[:9]), planes.vec(parts[9:])
     centred = _at_probes(rotation, offset, pair) if any(geoms.is_centred) else None
     frames = [
         centred if is_centred else _at_probes(*_link_in_geom(rotation, offset, geoms, g), pair)

@@ -14,10 +14,11 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.geometry import planes
-from tgdsl.geometry.planes import Vec
+from tgdsl.geometry.planes import Plane, Vec
 from tgdsl.quantities.base import Scene
 from tgdsl.quantities.contacts.part import SLOT_FIELDS, ContactsPart
 from tgdsl.quantities.contacts.request import ContactPoints
+from tgdsl.tensors.on_host import on_host
 
 
 def gather(part: ContactsPart[Tensor], scene: Scene) -> tuple[ContactPoints, ...]:
@@ -40,9 +41,10 @@ def contacts_of(
         index: Pair of each body and object; their number where there is none.
         dtype: Dtype of the result.
     """
-    rotation = planes.rotation(state["body_quat"][:, bodies])
+    quat = state["body_quat"].index_select(1, bodies)
     whole = _of_pairs(state["contact_netforce"], index)
-    net = planes.rotate_back(rotation, planes.split(whole.sum(dim=2)))
+    *rotation, x, y, z = on_host(_in_frame, quat, whole.sum(dim=2))
+    net = x, y, z
     if not all(name in state for name in SLOT_FIELDS):  # some of them may be there for another quantity
         none = net[0].new_zeros((*net[0].shape, 0), dtype=dtype)
         own = [(none, none, none)] * 4
@@ -58,6 +60,12 @@ def contacts_of(
         own = [planes.rotate_back(each, vector) for vector in (away, force, torque, normal)]
     pos, force, torque, normal, net = (planes.vec(part.to(dtype) for part in vector) for vector in (*own, net))
     return ContactPoints(pos, force, torque, normal, net)
+
+
+def _in_frame(quat: Plane, vector: Plane) -> list[Plane]:
+    """Return the planes of the rotations of bodies, (env, body), and of vectors of the world in their frames."""
+    rotation = planes.rotation(quat)
+    return [*rotation, *planes.rotate_back(rotation, planes.split(vector))]
 
 
 class PairContacts(NamedTuple):

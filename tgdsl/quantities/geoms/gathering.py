@@ -42,9 +42,10 @@ def _had_by_some(geoms: Geoms, is_absent: Bool[Tensor, "env geom"]) -> Geoms:
     own = [g for g, is_missing in enumerate(is_absent.all(dim=0).tolist()) if not is_missing]
     if len(own) == len(geoms.shapes) or not own:
         return geoms
+    ids = torch.tensor(own, device=is_absent.device)
     return geoms._replace(
         **{name: tuple(getattr(geoms, name)[g] for g in own) for name in ("shapes", "is_centred", "surfaces")},
-        **{name: getattr(geoms, name)[:, own] for name in ("size", "pos", "rotation", "is_absent")},
+        **{name: getattr(geoms, name).index_select(1, ids) for name in ("size", "pos", "rotation", "is_absent")},
     )
 
 

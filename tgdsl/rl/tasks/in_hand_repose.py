@@ -55,6 +55,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from pydantic import model_validator
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Angle, Positive, PositiveLength, Quantity, SpecModel
 from tgdsl.rl import groups, rotations, terms
@@ -296,7 +297,7 @@ class InHandRepose(Task[InHandReposeSpec]):
         return self.reached.to(self.setup.dtype)
 
     def _is_dropped(self, now: Now) -> Bool[Tensor, " env"]:
-        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
 
     def _goal_after(self, quat: Float[Tensor, "env 4"]) -> Float[Tensor, "env 4"]:
         """Return orientations turned by a goal's step: those of goal `reached`."""

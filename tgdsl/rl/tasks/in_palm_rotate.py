@@ -41,6 +41,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from tgdsl.fields.models import Angle, PositiveLength, Quantity, SpecModel
 from tgdsl.rl import groups, rotations, terms
@@ -199,12 +200,12 @@ class InPalmRotate(Task[InPalmRotateSpec]):
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped."""
-        return (now.object.pos - self.start_pos).norm(dim=1) > self.spec.drop_distance
+        return vector_norm(now.object.pos - self.start_pos, dim=1) > self.spec.drop_distance
 
     def reward(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
         """Return the terms of the reward: see the top of this page."""
         spec, weights = self.spec, self.spec.rewards
-        distance = (now.object.pos - self.start_pos).norm(dim=1)
+        distance = vector_norm(now.object.pos - self.start_pos, dim=1)
         return {
             "success": weights.success * self.is_reached,
             "spin": weights.spin * self.rate.clamp(max=spec.max_spin),

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from tgdsl.errors import SimulationError, did_you_mean
+from tgdsl.errors import SimulationError
 from tgdsl.rl import rotations
 from tgdsl.rl.draws import within
 from tgdsl.rl.spec import PlacedRandomSpec
 from tgdsl.rl.task import Setup
+from tgdsl.runtime.simulators.model_ids import body_id
 
 
 def object_qpos(setup: Setup) -> slice:
@@ -28,10 +29,7 @@ def free_qpos(model: mujoco.MjModel, name: str) -> slice:
     Raises:
         SimulationError: If there is no such body, or it does not move freely.
     """
-    known = [model.body(i).name for i in range(1, model.nbody)]
-    if name not in known:
-        raise SimulationError(f'the scene has no body "{name}"; {did_you_mean(name, known, "bodies")}')
-    body = model.body(name)
+    body = model.body(body_id(model, name))
     if int(body.dofnum[0]) != 6 or int(body.jntnum[0]) != 1:
         raise SimulationError(f'the object\'s body "{name}" has no free joint, by which it could be put elsewhere')
     first = int(model.jnt_qposadr[int(body.jntadr[0])])

@@ -66,18 +66,17 @@ class ContactSensors:
         if self._nets:
             nets = [sum(data[:, place.start + 1 : place.start + 4] for place in own) for own in self._nets]
             fields["contact_netforce"] = np.stack(nets, axis=1)
-        shown = [[sensor.read(data) for sensor in own] for own in self._points]
-        fields["contact_found"] = np.stack([sum(part.count for part in own) for own in shown], axis=1)
+        fields["contact_found"] = np.stack([sum(sensor.count(data) for sensor in own) for own in self._points], axis=1)
         if self._num_slots:
+            shown = [[sensor.read(data) for sensor in own] for own in self._points]
             slots = np.stack([_first_contacts(own, self._num_slots) for own in shown], axis=1)
             fields |= _in_world(slots)
         return {name: fields[name] for name in self._fields}
 
 
 class _Shown(NamedTuple):
-    """What one sensor shows: how many contacts there are, which of those shown are contacts, and numbers of each."""
+    """What one sensor shows: which of those shown are contacts, and numbers of each."""
 
-    count: Float[np.ndarray, " env"]
     is_contact: Bool[np.ndarray, "env shown"]
     values: Float[np.ndarray, "env shown value"]
 
@@ -104,16 +103,22 @@ class _PointSensor:
         self._columns = columns
         self._values = [column for quantity in _OF_SLOTS for column in columns[quantity]] if num_slots else []
 
+    def count(self, data: Float[np.ndarray, "env number"]) -> Float[np.ndarray, " env"]:
+        """Return how many contacts there are."""
+        count = data[:, self._place.start]
+        if self._margin is None:
+            return count
+        num = self.read(data).is_contact.sum(axis=1)
+        return np.where(num < self._num, num, count)  # if all that are shown are contacts, others may be
+
     def read(self, data: Float[np.ndarray, "env number"]) -> _Shown:
         """Return what it shows."""
         shown = data[:, self._place.start : self._place.stop].reshape(len(data), self._num, -1)
-        count, is_contact = shown[:, 0, 0], shown[:, :, 0] > 0
+        is_contact = shown[:, :, 0] > 0
         if self._margin is not None:
             distance, force = shown[:, :, self._columns["dist"][0]], shown[:, :, self._columns["force"]]
             is_contact = is_contact & ((distance < self._margin) | (force != 0).any(axis=-1))
-            num = is_contact.sum(axis=1)
-            count = np.where(num < self._num, num, count)  # if all that are shown are contacts, others may be
-        return _Shown(count, is_contact, shown[:, :, self._values])
+        return _Shown(is_contact, shown[:, :, self._values])
 
 
 def _first_contacts(parts: Sequence[_Shown], num_slots: int) -> Float[np.ndarray, "env slot value"]:

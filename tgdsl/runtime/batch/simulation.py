@@ -33,7 +33,7 @@ from tgdsl.runtime.simulators.state_values import INTEGRATED, Rows, StateTable
 from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
 from tgdsl.scene.options import Options
-from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask
+from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask, is_env_mask
 
 Array = np.ndarray
 _FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -181,7 +181,8 @@ class BatchSimulation(Simulation):
 
     def _ascending(self, env_ids: EnvIds | None) -> Int[Array, " n"]:
         """Return environments as MuJoCo takes them: in ascending order, each once."""
-        return np.unique(env_indices(env_ids, self.num_envs))
+        ids = env_indices(env_ids, self.num_envs)
+        return ids if env_ids is None or is_env_mask(env_ids, self.num_envs) else np.unique(ids)
 
     def _write(self, ids: Int[Array, " n"], rows: Rows) -> None:
         chosen = torch.from_numpy(ids)

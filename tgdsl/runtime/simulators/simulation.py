@@ -248,7 +248,7 @@ class Simulation(ABC):
                 finite, or MuJoCo reports an environment as failed.
         """
         self._refuse_if_closed()
-        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._faults.mask.device)
+        rows, mask = self._table.rows(values, env_ids), env_mask(env_ids, self.num_envs, self._faults.counts.device)
         if contacts == "evaluate":
             self._start_contacts.forget(mask)
         else:
@@ -277,7 +277,7 @@ class Simulation(ABC):
         """
         self._refuse_if_closed()
         rows = self._table.rows(values, env_ids)
-        self._start_contacts.forget(env_mask(env_ids, self.num_envs, self._faults.mask.device))
+        self._start_contacts.forget(env_mask(env_ids, self.num_envs, self._faults.counts.device))
         self._put(env_ids, rows)
 
     @abstractmethod
