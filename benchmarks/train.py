@@ -52,7 +52,7 @@ def _speeds(given: argparse.Namespace, cone: str) -> list[dict[str, Any]]:
     taxels = sum(len(table) for table in env.touch.taxels.values())
     rows = []
     for has_rnd in (False, True):
-        loaded = load_task(given.task, overrides if has_rnd else {**overrides, "train.rnd": "off"})
+        loaded = load_task(given.task, {**overrides, "train.rnd": "{}" if has_rnd else "off"})
         learner = Learner(env, loaded, seed=0)
         for _ in range(WARM):
             learner.iterate()
