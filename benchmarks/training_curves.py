@@ -36,7 +36,9 @@ PANELS: dict[str, dict[str, str]] = {
         "cube/u1": "u1: pyramidal",
         "cube/u4": "u4: pyramidal, more noise",
         "cube/t2": "t2: no floor of exploration",
-        "cube/touch": "touch: the actor feels, and sees nothing",
+    },
+    "in_palm_rotate, one cube, by touch alone or the other way: quarter turns in 10 s": {
+        "cube/touch": "touch, beside three other runs",
         "cube/clockwise": "clockwise, seed 3",
         "cube/clockwise_2": "clockwise, seed 2, beside three other runs",
     },
@@ -130,7 +132,7 @@ def main() -> None:
             print(keep(options.keep, options.name))
         except KeptError as error:
             parser.error(str(error))
-    figure = Figure(figsize=(10, 15), dpi=100)
+    figure = Figure(figsize=(10, 3 * len(PANELS)), dpi=100)
     for (title, runs), pair in zip(PANELS.items(), figure.subplots(len(PANELS), 2), strict=True):
         by_time, by_samples = pair
         panel(by_time, by_samples, title, runs)
