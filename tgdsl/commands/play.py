@@ -91,7 +91,10 @@ class Play:
 
         if self.policy is None:
             return actor_of(env, self.actions, self.seed)
-        return policy_for(env, self.policy, self.groups)
+        policy = policy_for(env, self.policy, self.groups)
+        for line in policy.changes:
+            print(f"changed since the policy was learned: {line}")
+        return policy
 
     def _steps(self, env: TouchEnv, actor: Actor, record: Record, steps: int) -> None:
         """Make all steps."""

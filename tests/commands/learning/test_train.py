@@ -75,6 +75,7 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
         base, "play", "task.yaml", "--policy", "out/task/policy.pt", "--envs", "1", "--seconds", "0.1", "--no-video"
     )
     assert code == 0, error
+    assert out.splitlines()[0] == "changed since the policy was learned: rewards.spin: 3.0, now 2.0"
     with np.load(base / "out" / "played.npz") as found:
         assert found["action"].shape == (4, 1, 2)
 

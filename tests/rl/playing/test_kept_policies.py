@@ -27,6 +27,7 @@ def test_it_does_better_than_rest(file):
     num = (8 if "teacher" in card else 16) if is_long else 4
     env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
     policy, obs = policy_for(env, file), env.reset(seed=1)
+    assert not policy.changes
     steps = env.max_steps - 1 if is_long else round(2.0 / env.control_step)
     returns = torch.zeros(num)
     for _ in range(steps):

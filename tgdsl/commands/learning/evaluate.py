@@ -60,6 +60,8 @@ class Evaluate:
             env = TouchEnv(self.task, envs, device=self.device, seed=seed, overrides=overrides, progress=progress)
         try:
             actor = ZeroActor(env) if self.policy is None else policy_for(env, self.policy, self.groups)
+            for line in actor.changes:
+                print(f"changed since the policy was learned: {line}")
             found = evaluate(env, actor, self.episodes, seed)
         finally:
             env.close()

@@ -6,14 +6,20 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 
 class Actor(ABC):
-    """Who acts in environments."""
+    """Who acts in environments.
+
+    Attributes:
+        changes: What of the task was otherwise when that was learned, a line each.
+    """
+
+    changes: Sequence[str] = ()
 
     @abstractmethod
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:

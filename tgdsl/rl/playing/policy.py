@@ -23,6 +23,7 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.rl.differences import spec_differences
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.sensed import GROUP
@@ -32,6 +33,8 @@ ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 """Groups that a policy sees unless others are named: of these, those that there are."""
 
 
+OF_LEARNING, OF_TOUCH = ("train", "distill"), ("touch", "placement", "resolution", "noise")
+"""What of a document matters to those alone who learn, and to those alone who feel."""
 CARD = "card.json"
 """Name of the card in the file."""
 
@@ -137,7 +140,13 @@ def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
         if GROUP in card["groups"] and felt != env.spec.touch:
             raise PolicyError(f"{file}: this policy feels {felt}, not {env.spec.touch}; try --set touch={felt}")
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
-    return Policy(file, groups, env.num_envs, env.num_actions, env.device)
+    policy = Policy(file, groups, env.num_envs, env.num_actions, env.device)
+    if card is not None:
+        unfelt = () if GROUP in card["groups"] else OF_TOUCH
+        policy.changes = spec_differences(
+            card["spec"], env.spec.model_dump(mode="json"), type(env.spec), (*OF_LEARNING, *unfelt)
+        )
+    return policy
 
 
 def card_of(file: Path) -> dict[str, Any] | None:

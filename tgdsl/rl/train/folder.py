@@ -20,21 +20,20 @@ import platform
 import re
 import shutil
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 
 from tgdsl.errors import FileError, TgdslError
-from tgdsl.fields.models import SpecModel
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, with_folder
 from tgdsl.module.module import TactileModule
+from tgdsl.rl.differences import differences, spec_differences
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 COPIES = 3
@@ -208,7 +207,7 @@ def made_from(loaded: LoadedTask, env: TouchEnv, seed: int, overrides: Mapping[s
     }
 
 
-def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[SpecModel]) -> list[str]:
+def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[TaskSpec]) -> list[str]:
     """Return what of two starts of a run differs, a line each: the task's numbers, its seed, its sensors.
 
     Args:
@@ -216,21 +215,10 @@ def changes(before: Mapping[str, Any], now: Mapping[str, Any], model: type[SpecM
         now: What this one is made from.
         model: Model of the task's document.
     """
-    spec = before["spec"]
-    with suppress(ValidationError):  # of a version with other names: what it had is told as it was
-        spec = model.model_validate(spec).model_dump(mode="json")
-    lines = differences(spec, now["spec"])
+    lines = spec_differences(before["spec"], now["spec"], model)
     lines += [line for name in ("seed", "envs") for line in differences(before[name], now[name], name)]
     told = {"module": "what is compiled of the sensors' document", "taxels": "the table of taxels"}
     return lines + [what for name, what in told.items() if before[name] != now[name]]
-
-
-def differences(before: Any, now: Any, path: str = "") -> list[str]:
-    """Return how two plain values differ, a line each: `rewards.spin: 2.0, now 3.0`."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        names = dict.fromkeys((*before, *now))
-        return [line for name in names for line in differences(before.get(name), now.get(name), f"{path}.{name}".lstrip("."))]
-    return [] if before == now else [f"{path}: {json.dumps(before)}, now {json.dumps(now)}"]
 
 
 def versions() -> dict[str, str]:
