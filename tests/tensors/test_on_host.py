@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from tgdsl.geometry import planes
 from tgdsl.quantities.pairs import relate
@@ -57,6 +59,10 @@ def test_what_is_no_number_warns_of_nothing():
         torch.testing.assert_close(own, other, rtol=0, atol=0, equal_nan=True)
 
 
+class Own(torch.Tensor):
+    """A class of tensors of somebody's own."""
+
+
 def test_numpy_works_where_values_may_be_looked_at_and_are_few(monkeypatch):
     seen = []
 
@@ -67,7 +73,41 @@ def test_numpy_works_where_values_may_be_looked_at_and_are_few(monkeypatch):
     few = torch.ones(8, requires_grad=True)
     both(lambda own: on_host(noted, own), few)
     assert seen == [np.ndarray, torch.Tensor]
+    with torch.no_grad():
+        on_host(noted, few.detach().as_subclass(Own))
+    assert seen.pop() is Own
     monkeypatch.setattr(on_host_file, "MOST", 7)
     with torch.no_grad():
         on_host(noted, few)
     assert seen[-1] is torch.Tensor
+
+
+EXPONENT = torch.tensor(1.5, dtype=torch.float64)
+
+
+def seen_through(quat):
+    """Return what is made of NumPy's rotation and of a look at depths."""
+    x, y, z = on_host(rotated, quat, torch.ones_like(quat)[..., :3])
+    return planes.power(x.clamp(min=0.0), EXPONENT) + y * z
+
+
+def forwards(quat, along):
+    with forward_ad.dual_level():
+        return forward_ad.unpack_dual(seen_through(forward_ad.make_dual(quat, along))).tangent
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("is_deep", [False, True])  # or no depth at all, where power leaves the rest out
+def test_who_follows_operations_without_gradients_sees_all_of_them(is_deep):
+    generator = torch.Generator().manual_seed(2)
+    quat, other, along = torch.randn((3, 5, 4), generator=generator, dtype=torch.float64)
+    if not is_deep:  # (1, 1, 1) has x = −1.24 there
+        quat = torch.tensor([0.6, 0.0, 0.0, -0.8], dtype=torch.float64).repeat(5, 1)
+    _, expected = torch.func.jvp(seen_through, (quat,), (along,))
+    with torch.no_grad():
+        plain = seen_through(other)
+        torch.testing.assert_close(forwards(quat, along), expected)
+        torch.testing.assert_close(torch.func.jvp(seen_through, (quat,), (along,))[1], expected)
+        torch.testing.assert_close(torch.func.vmap(seen_through)(torch.stack([other, quat]))[0], plain)
+        torch.testing.assert_close(torch.jit.trace(seen_through, (quat,), check_trace=False)(other), plain)
+        torch.testing.assert_close(make_fx(seen_through)(quat)(other), plain)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from tgdsl.errors import SimulationError, TgdslError, listed
+from tgdsl.tensors.torch_internals import is_followed
 
 EnvIds = Tensor | np.ndarray | Sequence[int]
 """Environments: indices, or a boolean mask over all of them."""
@@ -130,13 +131,17 @@ def put(target: Tensor, where: Bool[Tensor, "*mask"], new: Tensor | float) -> No
 
 
 def may_look(values: Tensor) -> bool:
-    """Return whether Python may branch on values: not on a GPU, in code that is compiled, or where derivatives are wanted."""
-    return not (values.is_cuda or torch.is_grad_enabled() or torch.compiler.is_compiling())
+    """Return whether Python may branch on values: not on a GPU, where derivatives are wanted, or operations are followed."""
+    return not (torch.is_grad_enabled() or _is_out_of_sight(values))
 
 
 def may_hold(mask: Bool[Tensor, "*n"]) -> bool:
-    """Return whether a mask holds anywhere, or its values are not to be looked at: on a GPU, and in code that is compiled.
+    """Return whether a mask holds anywhere, or its values are not to be looked at: on a GPU, and where operations are followed.
 
     What is done only where a mask holds can be left out if this is False; the result must be the same bytes.
     """
-    return mask.is_cuda or torch.compiler.is_compiling() or bool(mask.any())
+    return _is_out_of_sight(mask) or bool(mask.any())
+
+
+def _is_out_of_sight(values: Tensor) -> bool:
+    return values.is_cuda or torch.compiler.is_compiling() or is_followed()
