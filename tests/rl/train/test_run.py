@@ -14,7 +14,7 @@ import torch
 from small_runs import small_learner
 
 from tgdsl.errors import FileError, TgdslError
-from tgdsl.rl.differences import differences
+from tgdsl.rl.playing.differences import differences
 from tgdsl.rl.train import folder as folders
 from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder, made_from
@@ -191,7 +191,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from small_runs import small_learner
 from tgdsl.rl.train import checkpoint
-from tgdsl.rl.differences import differences
+from tgdsl.rl.playing.differences import differences
 from tgdsl.rl.train.folder import RunFolder, made_from
 from tgdsl.rl.train.run import Run
 

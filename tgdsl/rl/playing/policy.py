@@ -23,9 +23,9 @@ from pydantic import ValidationError
 from torch import Tensor
 
 from tgdsl.errors import TgdslError, did_you_mean
-from tgdsl.rl.differences import spec_differences
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.differences import spec_differences
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 

@@ -30,9 +30,9 @@ import torch
 from tgdsl.errors import FileError, TgdslError
 from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, with_folder
 from tgdsl.module.module import TactileModule
-from tgdsl.rl.differences import differences, spec_differences
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
+from tgdsl.rl.playing.differences import differences, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
