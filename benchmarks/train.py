@@ -48,11 +48,13 @@ def speed(given: argparse.Namespace) -> None:
 def _speeds(given: argparse.Namespace, cone: str) -> list[dict[str, Any]]:
     """Return a row each with RND off and on."""
     overrides = {"physics.cone": cone, **dict(pair.split("=", 1) for pair in given.set)}
-    env = TouchEnv(load_task(given.task, overrides), given.envs, device=given.device)
+    document = load_task(given.task, overrides)
+    env = TouchEnv(document, given.envs, device=given.device)
     taxels = sum(len(table) for table in env.touch.taxels.values())
     rows = []
     for has_rnd in (False, True):
-        loaded = load_task(given.task, {**overrides, "train.rnd": "{}" if has_rnd else "off"})
+        is_there = has_rnd == (document.spec.train.rnd is not None)  # with the document's own numbers
+        loaded = document if is_there else load_task(given.task, {**overrides, "train.rnd": "{}" if has_rnd else "off"})
         learner = Learner(env, loaded, seed=0)
         for _ in range(WARM):
             learner.iterate()

@@ -38,6 +38,16 @@ def test_on_a_simulation_and_behind_the_line(base, here):
     assert scores[0] == scores[1]
 
 
+def test_what_of_the_task_is_otherwise_is_told(base, here):
+    """All but what the user asks for, which is no change of the task."""
+    arguments = ("--policy", "student.pt", "--seconds", "0.1", "--goal", "1", "--set", "randomise.drive.delay=[0, 1]")
+    code, out, error = here(base, "deploy", "task.yaml", *arguments)
+    assert code == 0, error
+    first, second, *_ = out.splitlines()
+    assert first == "changed since the policy was learned: randomise.drive.delay: [0.0, 2.0], now [0.0, 1.0]"
+    assert second.startswith("score ")
+
+
 def test_on_a_log(base, here):
     write_log(base / "press.npz", random_readings(1.0 + 0.02 * np.arange(8)))
     arguments = ("--policy", "student.pt", "--source", "press.npz", "--lockstep", "--goal", "1", "--calibration", "hand.yaml")

@@ -85,6 +85,16 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
 
 
+def test_what_of_the_task_is_otherwise_than_for_the_teacher_is_told_once(base, here):
+    """What students feel is no change."""
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", "--iterations", "1", *SMALL)
+    other = ("--set", "rewards.spin=3", "--set", "placement=all", "--resolutions", "low,high")
+    code, out, error = here(base, "distill", "task.yaml", *few, *other)
+    assert code == 0, error
+    told = [line for line in out.splitlines() if "changed" in line]
+    assert told == ["changed since the teacher was learned: rewards.spin: 2.0, now 3.0"]
+
+
 def test_what_is_refused_leaves_a_run_as_it_was(base, here):
     """An override that does not fit is not kept; a folder that holds a run takes no other; one killed early begins anew."""
     few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "2", *SMALL)

@@ -62,6 +62,13 @@ def test_a_policy_brings_its_card(tmp_path):
     for action in (less, rounded):
         write_policy(learner, card | {"spec": learned | {"action": action}}, file)
         assert policy_for(env, file).groups == ("tactile_sensors", "proprio")
+    pushes = {"push": {**learned["randomise"]["push"], "interval": [2.0 * (1.0 + 1e-15), 4.0]}}
+    for before, expected in (
+        ({"episode": learned["episode"] * (1.0 + 1e-15), "randomise": learned["randomise"] | pushes}, []),
+        ({"episode": 2.0 * learned["episode"]}, [f"episode: {2.0 * learned['episode']}, now {learned['episode']}"]),
+    ):
+        write_policy(learner, card | {"spec": learned | before}, file)
+        assert policy_for(env, file).changes == expected
     for lacking, message in (
         ({**card, "spec": {}}, "has no spec.task"),
         ({**card, "spec": learned | {"physics": {"timestep": 0.005}}}, r"has no spec\.physics\.substeps"),

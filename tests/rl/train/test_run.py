@@ -191,7 +191,6 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from small_runs import small_learner
 from tgdsl.rl.train import checkpoint
-from tgdsl.rl.playing.differences import differences
 from tgdsl.rl.train.folder import RunFolder, made_from
 from tgdsl.rl.train.run import Run
 

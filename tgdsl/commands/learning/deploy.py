@@ -85,6 +85,8 @@ class Deploy:
                 lockstep=self.lockstep,
                 progress=progress,
             )
+        for line in found.prepared.changes:
+            print(f"changed since the policy was learned: {line}")
         self._act(found)
 
     def _act(self, found: Deployment) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -87,6 +88,8 @@ class Distill:
             _check_new(folder, asked["resolutions"])
         for part in prepared:
             part.check(is_resumed=self.resume is not None)
+        for line in prepared[0].changes:
+            print(f"changed since the teacher was learned: {line}")
         rows: list[Row] = []
         unit = ""
         for part in prepared:
@@ -162,6 +165,11 @@ class _Part:
         check_blocks(self._envs, len(self._keys), num_variants(self._loaded))
         self._felt = feels(self._keys, self._teacher.felt)
         check_felt(self._loaded, self._felt)
+
+    @property
+    def changes(self) -> Sequence[str]:
+        """What of the task was otherwise when the teacher was learned, a line each."""
+        return self._teacher.changes
 
     def check(self, is_resumed: bool) -> None:
         """See that the folder can be written, that there are such taxels, and that a teacher that feels does so with them.

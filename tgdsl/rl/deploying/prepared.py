@@ -19,7 +19,7 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.playing.policy import ACTOR_GROUPS, Policy, PolicyError, card_of, check_card, check_learned
+from tgdsl.rl.playing.policy import ACTOR_GROUPS, Policy, PolicyError, card_of, changes_since, check_card, check_learned
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
 from tgdsl.rl.start import moved_joints
 from tgdsl.scene.scene import SceneModels
@@ -53,6 +53,7 @@ class Prepared:
         joints: The actuated joints, in the order of the module's groups `joint_pos` and `joint_vel`.
         actuator_id: Actuator of each.
         moved: The joints that the policy moves.
+        changes: What of the task was otherwise when the policy was learned, a line each.
     """
 
     file: Path
@@ -65,6 +66,7 @@ class Prepared:
     joints: tuple[str, ...]
     actuator_id: Int[np.ndarray, " joint"]
     moved: Actuators
+    changes: Sequence[str]
 
     @property
     def control_step(self) -> float:
@@ -115,10 +117,12 @@ def prepare(
     """
     loaded = load_task(task, overrides)
     card = card_of(policy)
+    changes: Sequence[str] = ()
     if card is not None:
         check_learned(card, policy, loaded.spec)
         own = {name: card["spec"][name] for name in _OF_CARDS if name in card["spec"]}
         loaded = _with(loaded, own)
+        changes = changes_since(card, loaded.spec)
     names = tuple(groups) or tuple(card["groups"] if card else _default_groups(loaded))
     _refuse_unknowable(policy, loaded, names)
     loaded, asked = _asked(loaded, goal)
@@ -138,7 +142,8 @@ def prepare(
     except SimulationError as error:
         raise loaded.error(("joints",), str(error)) from error
     sizes = {name: _size(name, card, sensed, felt, len(moved), asked) for name in names}
-    found = Prepared(policy, loaded, sensed, felt, sizes, asked, model, joints, _actuators(model, joints), actuators)
+    actuator_id = _actuators(model, joints)
+    found = Prepared(policy, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
     found.policy()
     return found
 

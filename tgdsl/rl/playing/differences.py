@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
@@ -17,7 +18,18 @@ def differences(before: Any, now: Any, path: str = "") -> list[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         names = dict.fromkeys((*before, *now))
         return [line for name in names for line in differences(before.get(name), now.get(name), f"{path}.{name}".lstrip("."))]
-    return [] if before == now else [f"{path}: {json.dumps(before)}, now {json.dumps(now)}"]
+    return [] if is_close(before, now) else [f"{path}: {json.dumps(before)}, now {json.dumps(now)}"]
+
+
+def is_close(one: Any, other: Any) -> bool:
+    """Return whether plain values are equal, numbers but for rounding: 0.7 cm are not quite 7 mm."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(is_close(value, other[name]) for name, value in one.items())
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(is_close, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-9)
+    return one == other
 
 
 def spec_differences(

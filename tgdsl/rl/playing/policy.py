@@ -10,7 +10,6 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 import json
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +24,7 @@ from torch import Tensor
 from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
-from tgdsl.rl.playing.differences import spec_differences
+from tgdsl.rl.playing.differences import is_close, spec_differences
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 
@@ -142,11 +141,20 @@ def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
     policy = Policy(file, groups, env.num_envs, env.num_actions, env.device)
     if card is not None:
-        unfelt = () if GROUP in card["groups"] else OF_TOUCH
-        policy.changes = spec_differences(
-            card["spec"], env.spec.model_dump(mode="json"), type(env.spec), (*OF_LEARNING, *unfelt)
-        )
+        policy.changes = changes_since(card, env.spec)
     return policy
+
+
+def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str, ...] = ()) -> list[str]:
+    """Return what of a task's document is otherwise than where a policy was learned, a line each.
+
+    Args:
+        card: The policy's card.
+        spec: The task's document.
+        leave_out: Names at the top that do not count; those of learning, and of touch where the policy has none, never do.
+    """
+    unfelt = () if GROUP in card["groups"] else OF_TOUCH
+    return spec_differences(card["spec"], spec.model_dump(mode="json"), type(spec), (*OF_LEARNING, *unfelt, *leave_out))
 
 
 def card_of(file: Path) -> dict[str, Any] | None:
@@ -177,7 +185,7 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
     steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
     for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
-        if not _is_close(before, now):
+        if not is_close(before, now):
             texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
             raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
 
@@ -189,15 +197,6 @@ def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
         size == found and (name == other or (name == GROUP and other.startswith(f"{GROUP}/")))
         for (name, size), (other, found) in pairs
     )
-
-
-def _is_close(one: Any, other: Any) -> bool:
-    """Return whether plain values are equal, numbers but for rounding: 0.7 cm are not quite 7 mm."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_is_close(value, other[name]) for name, value in one.items())
-    if isinstance(one, float) and isinstance(other, float):
-        return math.isclose(one, other, rel_tol=1e-9)
-    return one == other
 
 
 def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxels: str) -> None:

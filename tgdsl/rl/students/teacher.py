@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.policy import Policy, PolicyError, card_of, check_card, check_learned
+from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, card_of, changes_since, check_card, check_learned
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 
 WARM_CALLS = 3
@@ -28,6 +28,7 @@ class Teacher:
         file: Its file.
         card: Its card.
         felt: What it feels; None: nothing.
+        changes: What else of the task was otherwise when it was learned, a line each.
     """
 
     def __init__(self, file: Path, loaded: LoadedTask):
@@ -50,6 +51,7 @@ class Teacher:
         if loaded.spec.distill.loss == "inverse_variance" and not card.get("std"):
             what = "its card has no deviations of actions, `std`, which distill.loss inverse_variance divides by"
             raise PolicyError(f"{file}: {what}; learn it anew, or take distill.loss=mse")
+        self.changes = changes_since(card, loaded.spec, OF_TOUCH)
         self._loaded = loaded
 
     def check_taxels(self) -> None:
