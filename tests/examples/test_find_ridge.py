@@ -12,6 +12,8 @@ from scipy.stats import binomtest
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
+from tgdsl.rl.playing.actions import ZeroActor
+from tgdsl.rl.playing.evaluation import evaluate
 from tgdsl.rl.task import HandNow
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -126,6 +128,12 @@ def test_a_script_that_feels_stops_on_the_ridge(make):
         made = env.step(env.task.script(obs))
         obs = made.obs
     assert made.info.score.mean() >= 0.95
+
+
+def test_episodes_that_end_for_good_when_their_time_is_over_are_whole(make):
+    env = make(3, touch="none")
+    found = evaluate(env, ZeroActor(env), 4)
+    assert found.held == 1.0 and found.seconds == 2.0
 
 
 def test_chance_is_the_best_fixed_place(make):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictInt
 
-from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Range, RangeOf, SpecModel
+from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Radius, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
 from tgdsl.rl.pushes import PushSpec
 from tgdsl.rl.students.spec import DistillSpec
@@ -32,6 +32,9 @@ SENSED: dict[str, tuple[str, str]] = {
 """The kind of sensor that each type reads, and the observation that is made of it."""
 Time = Annotated[float, Quantity("time", gt=0.0)]
 Whole = Annotated[StrictInt, Field(ge=1)]
+Impedance = Annotated[float, Quantity("number", ge=1e-4), Field(le=0.9999)]
+"""Between the bounds that MuJoCo has."""
+Power = Annotated[float, Quantity("number", ge=1.0)]
 Weight = Number
 """Weight of a term of the reward: of a gain more than 0, of a penalty less."""
 
@@ -62,6 +65,11 @@ class PhysicsSpec(SpecModel):
     """Where its line search stops."""
     impratio: Positive | None = None
     """Ratio of friction's impedance to that of the normal force."""
+    solref: tuple[Time, Positive] | None = None
+    """Of all contacts, as MuJoCo's geoms have it: time constant [s], at least two timesteps, and damping ratio. A contact's
+    stiffness is also by the masses that meet, and by `solimp`."""
+    solimp: tuple[Impedance, Impedance, Radius, Impedance, Power] | None = None
+    """Of all contacts, as MuJoCo's geoms have it: impedances at first and at the width, width [m], midpoint, power."""
     nconmax: Whole | None = None
     """On a GPU, capacity for contacts per environment."""
     njmax: Whole | None = None

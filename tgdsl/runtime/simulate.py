@@ -86,7 +86,8 @@ def simulate(
         threads: CPU threads; 0: one per CPU.
         keyframe: Name of the keyframe to start from.
         options: Fields of MuJoCo's `mjOption` that are to differ from the scene's, by name and in its units, such as
-            `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`; no XML is edited.
+            `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`, and `solref` and `solimp` of all contacts; no XML is
+            edited.
         per_env: What environments shall have of their own: "mass" and "friction" for `sim.properties`, on a GPU also fields of
             MuJoCo's model by name. On the CPU environments may always have these.
         watch: Names of bodies, sites, joints, actuators and pairs that `sim.watched()` returns, of the instant of readings.

@@ -1,4 +1,4 @@
-"""MuJoCo's `<option>` by name: settings of the physics that are changed without an edit of XML."""
+"""MuJoCo's `<option>` by name, and how stiff contacts are: settings of the physics that are changed without an edit of XML."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from tgdsl.errors import SimulationError, did_you_mean
 
-Options = Mapping[str, float | int | str | Sequence[float]]
-"""Values of fields of MuJoCo's `mjOption` by name; of those with keywords, the keyword that MJCF has."""
+Options = Mapping[str, float | int | str | Sequence[float | int]]
+"""Values of fields of MuJoCo's `mjOption` by name; of those with keywords, the keyword that MJCF has. Also `solref` and
+`solimp`, which all geoms and pairs then have."""
 KEYWORDS: Mapping[str, Any] = {
     "cone": mujoco.mjtCone,
     "integrator": mujoco.mjtIntegrator,
@@ -19,6 +20,8 @@ KEYWORDS: Mapping[str, Any] = {
     "solver": mujoco.mjtSolver,
 }
 """Fields whose values have names, and the enumeration of these."""
+CONTACTS: Mapping[str, int] = {"solref": mujoco.mjNREF, "solimp": mujoco.mjNIMP}
+"""What all geoms and pairs may be given, and how many numbers these are."""
 _POSITIVE = ("timestep", "impratio")
 _MOST = 2**31 - 1  # MuJoCo's integers have 32 bits
 
@@ -31,25 +34,54 @@ def option_names() -> tuple[str, ...]:
 _METHODS = {name for name in dir(mujoco.MjOption) if callable(getattr(mujoco.MjOption, name, None))}
 
 
-def set_options(option: Any, options: Options) -> None:
-    """Set options of a model or a spec, all or none.
+def set_options(spec: mujoco.MjSpec, options: Options) -> None:
+    """Set options of a scene, all or none.
 
     Args:
-        option: `MjModel.opt` or `MjSpec.option`.
-        options: Values by name, such as `{"timestep": 0.005, "cone": "pyramidal", "iterations": 10}`, in MuJoCo's units.
+        spec: The scene.
+        options: Values by name, such as `{"timestep": 0.005, "cone": "pyramidal", "solref": [0.01, 1]}`, in MuJoCo's units.
 
     Raises:
-        SimulationError: If there is no such option or keyword, or a value does not fit.
+        SimulationError: If there is no such option or keyword, or a value does not fit, as MuJoCo would silently take another.
     """
-    values = {name: _value(option, name, given) for name, given in options.items()}
+    option = spec.option
+    values = {name: _value(option, name, given) for name, given in options.items() if name not in CONTACTS}
+    steps = float(values.get("timestep", option.timestep)), int(values.get("disableflags", option.disableflags))
+    contacts = {name: _contact(name, given, *steps) for name, given in options.items() if name in CONTACTS}
     for name, value in values.items():
         setattr(option, name, value)
+    for name, value in contacts.items():
+        for element in (*spec.geoms, *spec.pairs):
+            setattr(element, name, value)
+
+
+def _contact(name: str, given: Any, timestep: float, disabled: int) -> list[float]:
+    """Return what all contacts are given, as MuJoCo has it."""
+    try:
+        value = [float(number) for number in given]
+    except (TypeError, ValueError):
+        value = []
+    is_fit, expected = len(value) == CONTACTS[name] and bool(np.isfinite(value).all()), f"{CONTACTS[name]} numbers"
+    if is_fit and name == "solref":
+        is_fit, expected = min(value) > 0 or max(value) <= 0, "a time constant [s] and a damping ratio, or −k and −b"
+        is_safe = not disabled & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+        if is_fit and is_safe and 0 < value[0] < 2 * timestep:
+            is_fit, expected = False, f"a time constant of at least {2 * timestep:g} s, twice the timestep"
+    elif is_fit:
+        low, high, width, middle, power = value
+        bounds = (mujoco.mjMINIMP, mujoco.mjMAXIMP)
+        is_fit = all(bounds[0] <= number <= bounds[1] for number in (low, high, middle)) and width >= 0 and power >= 1
+        expected = f"impedances and midpoint from {bounds[0]:g} to {bounds[1]:g}, a width of at least 0, a power of at least 1"
+    if not is_fit:
+        raise SimulationError(f"option {name} is {given!r}, expected {expected}")
+    return value
 
 
 def _value(option: Any, name: str, given: Any) -> Any:
     """Return the value of an option as MuJoCo has it."""
-    if name not in option_names():
-        raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, option_names(), "options")}')
+    known = (*option_names(), *CONTACTS)
+    if name not in known:
+        raise SimulationError(f'MuJoCo has no option "{name}"; {did_you_mean(name, known, "options")}')
     if name in KEYWORDS:
         return _keyword(name, given)
     now = getattr(option, name)

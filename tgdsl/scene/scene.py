@@ -183,7 +183,7 @@ class SceneModels:
 
         Args:
             scene: The scene.
-            options: MuJoCo's options that are to differ from the scene's.
+            options: MuJoCo's options that are to differ from the scene's: see `set_options`.
             prepare: Changes the scene before anything of it is compiled.
 
         Raises:
@@ -193,7 +193,7 @@ class SceneModels:
         self.objects = {target.name: target for target in scene.objects}
         with muted_mujoco():
             self._base = _spec(scene, {asset.key: _content(asset) for asset in scene.assets})
-            set_options(self._base.option, options or {})
+            set_options(self._base, options or {})
             if prepare is not None:
                 prepare(self._base)
         self._models: dict[tuple[Choice, ...], mujoco.MjModel] = {}

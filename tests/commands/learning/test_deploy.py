@@ -25,7 +25,7 @@ def test_on_a_simulation_and_behind_the_line(base, here):
         code, out, error = here(base, "deploy", "task.yaml", "--source", *source, *arguments)
         assert code == 0, error
         lines = out.splitlines()
-        assert lines[0].startswith("score ") and lines[0].endswith(" rad, 100.0% without a drop; 1 episode, 10 control steps")
+        assert lines[0].startswith("score ") and lines[0].endswith(" rad, 100.0% of full length; 1 episode, 10 control steps")
         assert lines[1].startswith("inference ") and lines[1].endswith("of 50.0 control steps per second, not in real time")
         assert lines[-1] == "record: a b/made.npz" and len(lines) == 2 + 2 + 6 + 1
         with np.load(base / "a b" / "made.npz") as found:

@@ -36,7 +36,7 @@ def test_first_episodes_of_each_environment_count(env):
     assert (found.episodes, found.envs, found.faults) == (10, 4, 3)
     assert found.held == pytest.approx(0.7) and found.held_interval == share_interval(0.7, 10)
     assert found.seconds == pytest.approx((3 * 3 + 7 * 8) / 10 * 0.025)
-    assert str(found).endswith("in 10 episodes; 70.0% (95 %: 39.7% to 89.2%) without a drop")
+    assert str(found).endswith("in 10 episodes; 70.0% (95 %: 39.7% to 89.2%) of full length")
     json.dumps(found.plain())
 
 

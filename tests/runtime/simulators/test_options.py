@@ -31,11 +31,53 @@ def test_options_act_as_those_of_the_scene(tmp_path, simulator, target):
     assert given.env_model(1).opt.iterations == 7
 
 
+@BOTH
+@pytest.mark.parametrize("target", [None, VARIANTS], ids=["one", "variants"])
+def test_contacts_are_as_stiff_as_those_of_a_scene_with_the_same_numbers(tmp_path, simulator, target):
+    """Of all geoms, those of variants too; a ball that rests is less deep in where contacts are stiffer."""
+    options = {"solref": [0.01, 0.8], "solimp": [0.95, 0.99, 0.002, 0.4, 3]}
+    text = SCENE.replace("<worldbody>", '<default><geom solref=".01 .8" solimp=".95 .99 .002 .4 3"/></default><worldbody>', 1)
+    assert text != SCENE
+    sims = [
+        simulator(module(tmp_path, scene, target=target), 3, options=given, keyframe="home", substeps=2)
+        for scene, given in ((SCENE, options), (text, None), (SCENE, None))
+    ]
+    for _ in range(20):
+        for sim in sims:
+            sim.step(np.array([0.1, -0.2]))
+    given, written, before = (sim.qpos.numpy() for sim in sims)
+    np.testing.assert_array_equal(given, written)
+    assert not np.array_equal(given, before)
+    for model in (sims[0].env_model(1), sims[0].env_model(2)):
+        assert (model.geom_solref == [0.01, 0.8]).all() and (model.geom_solimp == options["solimp"]).all()
+
+
+def test_pairs_are_as_stiff_too():
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><geom name="a" size="1"/><body><joint/><geom name="b" size="1"/></body></worldbody>'
+        '<contact><pair geom1="a" geom2="b"/></contact></mujoco>'
+    )
+    set_options(spec, {"solref": (-100, -1)})
+    model = spec.compile()
+    assert (model.pair_solref == [-100, -1]).all() and (model.geom_solref == [-100, -1]).all()
+
+
+def test_a_time_constant_that_mujoco_would_raise_is_refused_unless_the_scene_has_it_so():
+    """MuJoCo takes two timesteps in place of less, unless `refsafe` is off."""
+    spec = mujoco.MjSpec()
+    with pytest.raises(SimulationError, match=r"option solref is \[0.009, 1\], expected a time constant of at least 0.01 s"):
+        set_options(spec, {"timestep": 0.005, "solref": [0.009, 1]})
+    assert spec.option.timestep == 0.002
+    set_options(spec, {"timestep": 0.005, "solref": [0.01, 1]})
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_REFSAFE
+    set_options(spec, {"solref": [0.001, 1]})
+
+
 @pytest.mark.parametrize("given", ["elliptic", "Elliptic", int(mujoco.mjtCone.mjCONE_ELLIPTIC)])
 def test_a_keyword_may_be_its_number(given):
-    option = mujoco.MjModel.from_xml_string("<mujoco/>").opt
-    set_options(option, {"cone": given})
-    assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec = mujoco.MjSpec()
+    set_options(spec, {"cone": given})
+    assert spec.option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
 def test_an_artefact_keeps_its_own_options(tmp_path):
@@ -57,6 +99,14 @@ def test_an_artefact_keeps_its_own_options(tmp_path):
         ({"iterations": 1.5}, "option iterations is 1.5, expected a whole number at least 0"),
         ({"tolerance": -1}, "option tolerance is -1, expected a number at least 0"),
         ({"gravity": 9.81}, "option gravity is 9.81, expected 3 numbers"),
+        ({"solref": 0.01}, "option solref is 0.01, expected 2 numbers"),
+        ({"solref": [0.01, -1]}, "option solref is [0.01, -1], expected a time constant [s] and a damping ratio, or −k and −b"),
+        ({"solimp": [0.9, 0.95, 0.001]}, "option solimp is [0.9, 0.95, 0.001], expected 5 numbers"),
+        (
+            {"solimp": [0.9, 1, 0.001, 0.5, 2]},
+            "option solimp is [0.9, 1, 0.001, 0.5, 2], expected impedances and midpoint from 0.0001 to 0.9999, "
+            "a width of at least 0, a power of at least 1",
+        ),
     ],
 )
 def test_options_that_cannot_be_are_named(tmp_path, simulator, options, message):

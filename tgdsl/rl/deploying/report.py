@@ -35,7 +35,7 @@ class Scores(NamedTuple):
         each: Score of each episode, in their order.
         mean: Their mean.
         interval: Its interval.
-        held: Share of the episodes that did not end for good.
+        held: Share of the episodes that lasted as long as they might: without a drop, or whatever else ends them before.
         held_interval: Its interval, Wilson's.
     """
 
@@ -104,7 +104,7 @@ class Report:
             return f"no score: {self.source} has no scene that knows what happened; {count}"
         own = self.scores
         between = f" (95 %: {own.interval[0]:.4f} to {own.interval[1]:.4f})" if len(own.each) > 1 else ""
-        return f"score {own.mean:.4f} {self.unit}{between}, {own.held:.1%} without a drop; {count}"
+        return f"score {own.mean:.4f} {self.unit}{between}, {own.held:.1%} of full length; {count}"
 
     def _timed(self) -> str:
         rate = f"{self.rate:.1f} of {self.control_rate:.1f} control steps per second"

@@ -24,7 +24,7 @@ class Judged(NamedTuple):
         goal: What is asked for now.
         score: The score.
         is_over: Whether it has ended, for good or as time is over.
-        is_held: Whether it has not ended for good.
+        is_held: Whether nothing has ended it before its time was over.
     """
 
     goal: Float[Tensor, "env goal"]
@@ -66,8 +66,9 @@ class TaskScene(SteppedScene):
         if self.judged.is_over:
             return self.readings
         step = self._env.follow(self._setpoints)
-        goal, ended = self._env.task.asked().cpu().clone(), bool(step.info.ended)
-        self.judged = Judged(goal, float(step.info.score), ended, not bool(step.terminated))
+        goal, info = self._env.task.asked().cpu().clone(), step.info
+        ended, is_whole = bool(info.ended), bool((info.episode_steps >= self._env.max_steps) & ~info.faults)
+        self.judged = Judged(goal, float(info.score), ended, is_whole or not ended)
         return self.read()
 
     def begin(self) -> dict[str, Tensor]:

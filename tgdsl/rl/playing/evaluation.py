@@ -33,7 +33,7 @@ class Evaluation:
         seed: What was random in them follows from it.
         score: Mean of the score.
         score_interval: Its interval.
-        held: Share of the episodes that did not end for good: without a drop.
+        held: Share of the episodes that lasted as long as one may: without a drop, or whatever else ends them before.
         held_interval: Its interval, Wilson's.
         episode_return: Mean of the sum of rewards.
         seconds: Mean of the duration [s].
@@ -62,7 +62,7 @@ class Evaluation:
         least, most = self.held_interval
         return (
             f"score {self.score:.3f} {self.unit} (95 %: {low:.3f} to {high:.3f}) in {self.episodes:,} episodes; "
-            f"{self.held:.1%} (95 %: {least:.1%} to {most:.1%}) without a drop"
+            f"{self.held:.1%} (95 %: {least:.1%} to {most:.1%}) of full length"
         )
 
 
@@ -101,7 +101,8 @@ def evaluate_each(env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000
         info, obs, index = step.info, step.obs, index + 1
         counts = info.ended & (done < quota)
         score = info.score.double()
-        told = [score, score.square(), ~step.terminated, info.episode_return, info.episode_steps, info.faults]
+        held = (info.episode_steps >= env.max_steps) & ~info.faults
+        told = [score, score.square(), held, info.episode_return, info.episode_steps, info.faults]
         sums += torch.where(counts, torch.stack([value.double() for value in told]), 0.0)
         done += counts
         actor.begin(info.ended)

@@ -41,7 +41,7 @@ class Row(NamedTuple):
         score: Mean of the score.
         low: Lower bound of its 95 % interval.
         high: Upper bound.
-        held: Share of the episodes that did not end for good.
+        held: Share of the episodes that lasted as long as one may.
         episodes: How many there were.
         samples: Control steps of each student.
         minutes: How long they have learned, with all others of the simulation [min].
