@@ -85,6 +85,40 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert code == 2 and "--types none: this run began with depth,bool,none; begin another one" in error
 
 
+def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeypatch):
+    """The number of environments is kept, not made anew; what students feel cannot be changed; old scores do not stay."""
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--episodes", "2", "--iterations", "1", *SMALL, "-o", "run")
+    monkeypatch.setattr("tgdsl.commands.learning.distill.ENVS", 6)
+    assert here(base, "distill", "task.yaml", *few)[0] == 0
+    assert json.loads((base / "run" / "distill.json").read_text())["envs"] == 6
+    monkeypatch.setattr("tgdsl.commands.learning.distill.ENVS", 8)
+    on = ("--resume", "run", "--device", "cpu", "--iterations", "2", "--episodes", "0")
+    for key in ("resolution=high", "placement=all", "noise=noisy"):
+        code, out, error = here(base, "distill", "task.yaml", *on, "--set", key)
+        assert (code, out) == (2, "") and f"--set {key}: what they feel stays as it is in a run that goes on" in error
+    teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
+    code, out, error = here(base, "distill", "task.yaml", *on, "--set", "rewards.spin=3")
+    assert code == 0, error
+    told = [line for line in out.splitlines() if line.startswith("changed since the run began")]
+    assert told == [
+        "changed since the run began: rewards.spin: 2.0, now 3.0",
+        "changed since the run began: the teacher's file",
+    ]
+    assert [start["envs"] for start in json.loads((base / "run" / "default" / "run.json").read_text())["starts"]] == [6, 6]
+    assert not (base / "run" / "table.csv").exists() and not (base / "run" / "default" / "evaluation.json").exists()
+    for text in ("[]", '{"types": ["none"]}'):
+        (base / "run" / "distill.json").write_text(text)
+        code, _, error = here(base, "distill", "task.yaml", *on)
+        assert code == 2 and "distill.json: it has no teacher: this is not what tgdsl distill writes" in error
+
+
+def test_a_teacher_that_does_not_say_what_it_feels_is_refused(base, fails):
+    loaded = load_task(base / "task.yaml", {"touch": "depth"})
+    spec = {name: value for name, value in loaded.spec.model_dump(mode="json").items() if name != "resolution"}
+    teacher(base / "teacher.pt", loaded, ["proprio", "tactile_sensors"], spec=spec)
+    assert "teacher.pt: its card has no spec.resolution: this is not what tgdsl train writes" in fails(*TEACHER, *FIVE)
+
+
 def test_what_of_the_task_is_otherwise_than_for_the_teacher_is_told_once(base, here):
     """What students feel is no change."""
     few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", "--iterations", "1", *SMALL)
@@ -118,7 +152,6 @@ def test_what_is_refused_leaves_a_run_as_it_was(base, here):
     assert code == 0, error
     assert [row["iteration"] for row in rows_of(base / "run" / "default" / "curve.csv")] == ["1", "2"]
     (base / "run" / "distill.json").unlink()
-    (base / "run" / "table.csv").unlink()
     code, _, error = here(base, "distill", "task.yaml", *few, "-o", "run")
     assert code == 2 and "run: this folder holds default/run.json of a run; give another --out" in error
 
@@ -150,6 +183,12 @@ def test_mistakes_are_named_before_anything_runs(base, fails):
     alike = fails(*TEACHER, "--types", "depth", "--placements", "fing*,fing_", "--seeds", "1")
     assert "two students would have the name depth-fing_-clean-s0" in alike
     assert "--teacher FILE is missing" in fails("--device", "cpu")
+    assert "groups names a group twice" in fails(*TEACHER, "--set", "distill.groups=[proprio, proprio]")
+    felt = ("--types", "none,depth", "--placements", "all", "--set", "distill.groups=[tactile_sensors/depth/all/clean]")
+    assert 'there is no group of observations "tactile_sensors/depth/all/clean" beside what' in fails(*TEACHER, *felt)
+    both = (*TEACHER, "--resolutions", "low", "--set", "resolution=high")
+    assert "--set resolution=high: --resolutions says it of students" in fails(*both)
+    assert "--set touch=depth: --types says it of students" in fails(*TEACHER, "--set", "touch=depth")
     assert "--seeds 0: expected at least 1" in fails(*TEACHER, "--seeds", "0")
     assert "there is no run of tgdsl distill to go on with" in fails("--resume", "nothing")
     assert 'no link matches "palm"' in fails(*TEACHER, "--types", "bool", "--placements", "palm", "--resolutions", "low,high")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shlex
 import sys
@@ -18,14 +19,15 @@ from tgdsl.errors import TgdslError
 
 if TYPE_CHECKING:
     from tgdsl.rl.load import LoadedTask
+    from tgdsl.rl.spec import TaskSpec
     from tgdsl.rl.students.results import Row
 
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 Folder = tyro.conf.arg(metavar="FOLDER")
 Names = tyro.conf.arg(metavar="A,B,…")
 ENVS = 13824
-KEPT = ("teacher", "types", "placements", "noise", "seeds", "resolutions")
-"""What a run that goes on takes from its first start, with the number of environments and the seed."""
+OPTIONS = {"touch": "types", "placement": "placements", "noise": "noise", "resolution": "resolutions"}
+"""Keys of a task's document of which an option of the command says what students have."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,13 @@ class Distill:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
         before = _read(folder / "distill.json") if self.resume else {}
-        overrides = joined_overrides(before.get("overrides", {}), parsed_overrides(self.set))
+        given = parsed_overrides(self.set)
+        overrides = joined_overrides(before.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
-        self._check()
+        self._check(given)
         asked = self._asked(loaded, before)
         prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
+        asked["envs"] = prepared[0].envs
         if self.resume is None:
             _check_new(folder, asked["resolutions"])
         for part in prepared:
@@ -92,14 +96,21 @@ class Distill:
             print(f"changed since the teacher was learned: {line}")
         rows: list[Row] = []
         unit = ""
+        table = folder / "table.csv"
         for part in prepared:
             own, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
             rows += own
         if rows:
-            write_table(rows, folder / "table.csv")
-            print(f"{shown(rows, unit, loaded.task.is_less_better)}\ntable: {folder / 'table.csv'}")
+            write_table(rows, table)
+            print(f"{shown(rows, unit, loaded.task.is_less_better)}\ntable: {table}")
+        else:
+            table.unlink(missing_ok=True)  # of what the students were before
 
-    def _check(self) -> None:
+    def _check(self, overrides: dict[str, str]) -> None:
+        for key, option in OPTIONS.items():
+            if key in overrides and (key == "touch" or self.resume is not None or getattr(self, option) is not None):
+                what = "what they feel stays as it is in a run that goes on"
+                raise TgdslError(f"--set {key}={overrides[key]}: {what if self.resume else f'--{option} says it of students'}")
         for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0), ("seeds", 1)):
             value = getattr(self, name)
             if value is not None and not value >= least:
@@ -161,8 +172,8 @@ class _Part:
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
         self._teacher = Teacher(Path(asked["teacher"]), self._loaded)
         unit = len(self._keys) * num_variants(self._loaded)
-        self._envs = asked["envs"] or max(1, ENVS // unit) * unit
-        check_blocks(self._envs, len(self._keys), num_variants(self._loaded))
+        self.envs = asked["envs"] or max(1, ENVS // unit) * unit
+        check_blocks(self.envs, len(self._keys), num_variants(self._loaded))
         self._felt = feels(self._keys, self._teacher.felt)
         check_felt(self._loaded, self._felt)
 
@@ -202,20 +213,23 @@ class _Part:
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
         state = read_checkpoint(folder.checkpoint) if self._goes_on else None
         with StatusLine() as progress:
-            env = TouchEnv(loaded, self._envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
+            env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
             distiller = Distiller(env, loaded, self._teacher.bound(env), self._keys, seed)
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
+            origin["teacher_sha256"] = hashlib.sha256(Path(self._asked["teacher"]).read_bytes()).hexdigest()
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
+            for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
+                print(f"changed since the run began: {line}")
             if file is not None:
                 _write(file, self._asked | {"overrides": self._given})
             folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             total = command.iterations or loaded.spec.distill.iterations
             limit = float("inf") if command.minutes is None else 60.0 * command.minutes
-            print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self._envs} environments: {folder.path}")
+            print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
             bar = ProgressBar(total, distiller.iteration, env.task.score_unit)
             try:
                 run.learn(total, limit, bar.show)
@@ -224,6 +238,14 @@ class _Part:
             return self._finish(distiller, origin, run.seconds), env.task.score_unit
         finally:
             env.close()
+
+    def _changes(self, origin: dict[str, Any], model: type[TaskSpec]) -> list[str]:
+        """Return what is otherwise than when the run was started last, a line each."""
+        from tgdsl.rl.train.folder import changes
+
+        before = self._folder.last_start()
+        other = before.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]
+        return [*changes(before, origin, model), *(["the teacher's file"] if other else [])]
 
     def _finish(self, distiller: Any, origin: dict[str, Any], seconds: float) -> list[Row]:
         """Evaluate the students, write them, and return the table's rows."""
@@ -237,6 +259,7 @@ class _Part:
             students = self._folder.path / "students"
             write_students(distiller, self._loaded, origin, seconds, text, found, students, progress)
         if not found:
+            self._folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []
         plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
         _write(self._folder.evaluation, plain)
@@ -282,6 +305,10 @@ def _write(file: Path, plain: dict[str, Any]) -> None:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise TgdslError(f"{file}: there is no run of tgdsl distill to go on with: {error}") from error
+    names = ("teacher", "types", "placements", "noise", "seeds", "resolutions", "envs", "seed", "overrides")
+    if missing := [name for name in names if not isinstance(found, dict) or name not in found]:
+        raise TgdslError(f"{file}: it has no {missing[0]}: this is not what tgdsl distill writes")
+    return found

@@ -164,3 +164,5 @@ class Train:
             write_policy(learner, card | {"score": found.plain()}, folder.policy)
             atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(found)
+        else:
+            folder.evaluation.unlink(missing_ok=True)  # of what the policy was before

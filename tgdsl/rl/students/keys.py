@@ -117,10 +117,11 @@ def groups_of(loaded: LoadedTask, groups: Mapping[str, int]) -> list[str]:
         SpecError: If a group that is named is not there.
     """
     named = loaded.spec.distill.groups
+    others = [name for name in groups if not name.startswith(f"{GROUP}/")]
     for i, name in enumerate(named or ()):
-        if name not in groups:
-            what = f'there is no group of observations "{name}"'
-            raise loaded.error(("distill", "groups", i), what, did_you_mean(name, groups, "groups"))
+        if name not in others:
+            what = f'there is no group of observations "{name}" beside what each student feels'
+            raise loaded.error(("distill", "groups", i), what, did_you_mean(name, others, "groups"))
     if named:
         return [*named, GROUP]
     return [name for name in ACTOR_GROUPS if name in groups or name == GROUP]

@@ -109,4 +109,6 @@ class DistillSpec(SpecModel):
     def _check(self) -> DistillSpec:
         if self.steps % self.gradient_length:
             raise ValueError(f"steps is {self.steps}, expected a multiple of gradient_length, {self.gradient_length}")
+        if len(set(self.groups or ())) < len(self.groups or ()):
+            raise ValueError("groups names a group twice")
         return self
