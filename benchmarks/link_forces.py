@@ -2,7 +2,8 @@
 
     python benchmarks/link_forces.py examples/tasks/screwdriver.yaml policies/screwdriver.pt --envs 24
 
-Prints how many forces there were, their median, 99th percentile and largest [N], over one episode of each environment.
+Prints how many forces there were, their median, 99th percentile and largest [N], over one episode of each environment; and
+likewise how deep in the object the deepest probe of the task's `surface_distance` was [mm], where one was: contacts are soft.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.policy import policy_for
 
 
-def link_forces(options: argparse.Namespace) -> torch.Tensor:
-    """Return the forces [N], of all links, instants and environments in one row: those of episodes that have not ended."""
+def link_forces(options: argparse.Namespace) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return forces [N] and depths [m], of all links, instants and environments in one row: of episodes that have not ended."""
     env = TouchEnv(options.task, options.envs, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
-    policy, obs, found = policy_for(env, options.policy), env.reset(), []
+    policy, obs, found, depths = policy_for(env, options.policy), env.reset(), [], []
     going_on = torch.ones(options.envs, dtype=torch.bool)
     for _ in range(env.max_steps):
         made = env.step(policy(obs))
@@ -28,9 +29,12 @@ def link_forces(options: argparse.Namespace) -> torch.Tensor:
         going_on &= ~made.info.ended
         force = torch.linalg.vector_norm(env.now.link_force[going_on], dim=2).flatten()
         found.append(force[force > 0])
+        depth = (-env.now.distance[going_on]).flatten(1)
+        depth = depth.amax(dim=1) if depth.shape[1] else depth.flatten()  # of a task without such probes
+        depths.append(depth[depth > 0])
         policy.begin(made.info.ended)
     env.close()
-    return torch.cat(found).double()
+    return torch.cat(found).double(), torch.cat(depths).double()
 
 
 def main() -> None:
@@ -42,10 +46,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="of the task's document")
     options = parser.parse_args()
-    force = link_forces(options)
-    middle, high = (float(torch.quantile(force, share)) for share in (0.5, 0.99))
-    shown = f"median {middle:.1f} N, 99 % below {high:.0f} N, largest {float(force.max()):.0f} N"
-    print(f"{options.policy.stem}: {len(force):,} forces, {shown}")
+    for name, values, unit in zip(("forces", "depths"), link_forces(options), ("N", "mm"), strict=True):
+        if not len(values):
+            continue
+        own = values * (1e3 if unit == "mm" else 1.0)
+        middle, high, largest = (float(torch.quantile(own, share)) for share in (0.5, 0.99, 1.0))
+        told = f"median {middle:.1f} {unit}, 99 % below {high:.1f}, largest {largest:.1f}"
+        print(f"{options.policy.stem}: {len(own):,} {name}, {told}")
 
 
 if __name__ == "__main__":
