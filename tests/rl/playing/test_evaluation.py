@@ -32,7 +32,9 @@ class Ends(ZeroActor):
 @pytest.mark.filterwarnings("ignore:environments had faults")
 def test_first_episodes_of_each_environment_count(env):
     """Of 10 episodes of 4 environments: 3, 3, 2 and 2, however short those of environment 1 are."""
-    found = evaluate(env, Ends(env), 10)
+    told: list[str] = []
+    found = evaluate(env, Ends(env), 10, progress=told.append)
+    assert told[0] == "evaluating: 0 of 10 episodes"
     assert (found.episodes, found.envs, found.faults) == (10, 4, 3)
     assert found.held == pytest.approx(0.7) and found.held_interval == share_interval(0.7, 10)
     assert found.seconds == pytest.approx((3 * 3 + 7 * 8) / 10 * 0.025)

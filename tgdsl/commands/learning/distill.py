@@ -253,9 +253,11 @@ class _Part:
         from tgdsl.rl.students.results import rows_of, write_students
 
         command, keys = self._command, distiller.keys
-        found = evaluate_each(distiller.env, distiller.acting(), len(keys), command.episodes) if command.episodes else []
-        text = shlex.join(["tgdsl", *sys.argv[1:]])
+        found, text = [], shlex.join(["tgdsl", *sys.argv[1:]])
         with StatusLine() as progress:
+            if command.episodes:
+                acting = distiller.acting()
+                found = evaluate_each(distiller.env, acting, len(keys), command.episodes, progress=progress)
             students = self._folder.path / "students"
             write_students(distiller, self._loaded, origin, seconds, text, found, students, progress)
         if not found:

@@ -62,7 +62,8 @@ class Evaluate:
             actor = ZeroActor(env) if self.policy is None else policy_for(env, self.policy, self.groups)
             for line in actor.changes:
                 print(f"changed since the policy was learned: {line}")
-            found = evaluate(env, actor, self.episodes, seed)
+            with StatusLine() as progress:
+                found = evaluate(env, actor, self.episodes, seed, progress)
         finally:
             env.close()
         print(found)

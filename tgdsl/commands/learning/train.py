@@ -160,7 +160,8 @@ class Train:
             f"policy: {folder.policy}, after {learner.iteration} iterations, {learner.samples:,} steps, {seconds / 60:.1f} min"
         )
         if self.episodes:
-            found = evaluate(learner.env, policy_for(learner.env, folder.policy), self.episodes)
+            with StatusLine() as progress:
+                found = evaluate(learner.env, policy_for(learner.env, folder.policy), self.episodes, progress=progress)
             write_policy(learner, card | {"score": found.plain()}, folder.policy)
             atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(found)

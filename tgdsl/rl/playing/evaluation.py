@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from tgdsl.console.progress import Progress, silent
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 
@@ -72,12 +73,14 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def evaluate(env: TouchEnv, actor: Actor, episodes: int = 1000, seed: int = SEED) -> Evaluation:
+def evaluate(env: TouchEnv, actor: Actor, episodes: int = 1000, seed: int = SEED, progress: Progress = silent) -> Evaluation:
     """Let an actor act, and return how good that was: see `evaluate_each`."""
-    return evaluate_each(env, actor, 1, episodes, seed)[0]
+    return evaluate_each(env, actor, 1, episodes, seed, progress)[0]
 
 
-def evaluate_each(env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000, seed: int = SEED) -> list[Evaluation]:
+def evaluate_each(
+    env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000, seed: int = SEED, progress: Progress = silent
+) -> list[Evaluation]:
     """Let an actor act, and return how good that was in each block of environments.
 
     Each environment's first episodes count, as many of each, so that short ones do not count more often than long ones.
@@ -88,6 +91,7 @@ def evaluate_each(env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000
         blocks: How many blocks they are: as many environments each, one block after the other.
         episodes: How many episodes count of each block.
         seed: What all that is random in the environments follows from.
+        progress: Is told how many episodes have ended.
     """
     size = env.num_envs // blocks
     quota = torch.full((blocks, size), episodes // size, dtype=torch.int64, device=env.device)
@@ -96,7 +100,9 @@ def evaluate_each(env: TouchEnv, actor: Actor, blocks: int, episodes: int = 1000
     done, sums = torch.zeros_like(quota), torch.zeros((6, env.num_envs), dtype=torch.float64, device=env.device)
     obs, index = env.reset(seed), 0
     actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
-    while index % CHECKED_EVERY or bool((done < quota).any()):
+    while index % CHECKED_EVERY or (left := int((quota - done).sum())):
+        if index % CHECKED_EVERY == 0:
+            progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
         step = env.step(actor(obs))
         info, obs, index = step.info, step.obs, index + 1
         counts = info.ended & (done < quota)
