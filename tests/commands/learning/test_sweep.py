@@ -58,6 +58,17 @@ def test_every_combination_is_a_trial(base):
     assert trials[4].settings == {"action.scale": "10 deg", "--seed": 2}
 
 
+def test_students_are_trials_too(base):
+    """A teacher's path is relative to the sweep's document."""
+    (base / "teachers").mkdir()
+    (base / "teachers" / "t.pt").write_bytes(b"")
+    fixed = {"--teacher": "teachers/t.pt", "--types": "bool,none", "--seeds": 1, "--resolutions": "low,high"}
+    document = write(base, {"--iterations": [1, 2]}, fixed, command="distill")
+    _, trials = load_sweep(document)
+    who = ("--teacher", str(base / "teachers" / "t.pt"), "--types", "bool,none", "--seeds", "1", "--resolutions", "low,high")
+    assert trials[1].words == ("distill", str(base / "task.yaml"), *who, "--iterations", "2")
+
+
 def test_the_example():
     spec, trials = load_sweep(EXAMPLE)
     assert len(trials) == 9 and (spec.cpus, spec.gpus) == (4, 1)
@@ -95,6 +106,25 @@ def test_the_example():
         ),
         ({"matrix": {"--minutes": [0]}, "fixed": {"--envs": True}}, "1:", "(?s)--envs is true.*--minutes is 0"),
         ({"matrix": {"--seed": [1]}, "command": "trian"}, "1:", "command"),
+        ({"matrix": {"--seed": [1.5, "x"]}}, "1:", r'(?s)--seed\[0\]: --seed is 1.5, expected a whole number\n.*--seed is "x"'),
+        ({"matrix": {"--seed": [1]}, "fixed": {"--device": 7}}, "fixed.--device", "--device is 7, expected a text, as on the"),
+        ({"matrix": {"--device": ["cpu", "CPU"]}}, "matrix.--device[1]", '--device is "CPU", expected cuda or cpu'),
+        ({"matrix": {"--types": ["bool"]}}, "1:", "`tgdsl train` has no option --types that a sweep may set"),
+        ({"matrix": {"--seed": [1]}, "command": "distill", "fixed": {}}, "command", "`tgdsl distill` needs a --teacher, under"),
+        (
+            {"matrix": {"--teacher": ["t.pt"]}, "command": "distill", "fixed": {}},
+            "matrix.--teacher[0]",
+            '--teacher is "t.pt", expected a policy: there is no file /.*/t.pt',
+        ),
+        (
+            {
+                "matrix": {"--minutes": [1]},
+                "command": "distill",
+                "fixed": {"--teacher": "task.yaml", "--seeds": 0, "--resolutions": "low,high"},
+            },
+            "fixed.--resolutions",
+            '(?s)--seeds is 0.*--resolutions is "low,high", expected one, as --minutes count for each: list them under matrix',
+        ),
     ],
 )
 def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
