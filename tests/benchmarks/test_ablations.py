@@ -131,9 +131,17 @@ def test_of_an_error_less_is_better(kept):
     text = tables(kept(task="grip_force"))
     rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
     assert list(rows) == ["proximity", "bool", "depth", "force", "none"]
-    assert rows["proximity"].endswith("| no | open |") and rows["bool"].endswith("| yes | `none` |")
-    assert rows["none"].endswith("| yes | – |") and rows["force"].endswith("| `bool`, `none` |")
+    assert rows["proximity"].endswith("| no | open |") and rows["bool"].endswith("| yes | `none`; open: `proximity` |")
+    assert rows["none"].endswith("| yes | open: `proximity` |") and rows["force"].endswith(
+        "| `bool`, `none`; open: `proximity` |"
+    )
     assert "of the paper's" not in text and "The paper does not have this task." in text
+
+
+def test_where_all_curves_are_flat_nothing_is_open(kept):
+    text = tables(kept(scores={name: BLIND[name] for name in ("force", "bool", "none")}))
+    rows = {line.split("`")[1]: line for line in text.splitlines() if line.startswith("| `")}
+    assert rows["force"].endswith("| yes | – |") and rows["bool"].endswith("| yes | `force` |")
 
 
 def test_without_a_yardstick_no_curve_is_flat(kept, tmp_path):
