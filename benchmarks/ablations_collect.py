@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -160,13 +161,18 @@ def evaluations(file: Path, taught: Sequence[Taught]) -> str:
     """Return the evaluation of each student, a line each.
 
     Raises:
-        KeptError: If one's is missing.
+        KeptError: If one's is missing, or they are not those that the table was made from.
     """
     found = read_json(file, "evaluations")
     names = [name for each in taught for name in each.names]
     missing = [name for name in names if name not in found]
     if missing:
         raise KeptError(f"{file}: there is no evaluation of {missing[0]}")
+    for each in taught:
+        own = [found[name] for name in each.names]
+        told = f"{fmean(one['score'] for one in own):.6g} in {sum(one['episodes'] for one in own)} episodes"
+        if told != (expected := f"{each.row.score:.6g} in {each.row.episodes} episodes"):
+            raise KeptError(f"{file}: {', '.join(each.names)} score {told}, {expected} by table.csv: of another evaluation")
     lines = [f"{json.dumps(name)}: {json.dumps(_rounded({key: found[name][key] for key in EVALUATED}))}" for name in names]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 

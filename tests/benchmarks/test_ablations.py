@@ -265,6 +265,14 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
     assert "there is no evaluation of force-hand-clean-s0" in refused(
         lambda run: (run / "med" / "evaluation.json").write_text("{}")
     )
+    for changed, told in ({"score": -5.0}, "-5 in 200"), ({"episodes": 2}, "10.005 in 4"):
+
+        def other(run, changed=changed):
+            file = run / "med" / "evaluation.json"
+            file.write_text(json.dumps({name: own | changed for name, own in json.loads(file.read_text()).items()}))
+
+        what = f"force-hand-clean-s0, force-hand-clean-s1 score {told} episodes, 10.005 in 200 episodes by table.csv"
+        assert f"evaluation.json: {what}: of another evaluation" in refused(other)
     assert "this is no JSON" in refused(lambda run: (run / "med" / "run.json").write_text("{"))
     other = evaluation(tmp_path / "other.json", 1.0, "screwdriver")
     assert 'an evaluation in "screwdriver", expected one in "in_palm_rotate"' in refused(teacher=other)
