@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -76,9 +77,11 @@ def collect(
         if not own:
             raise KeptError(f'{run / "table.csv"}: there is no row of the resolution "{resolution}"')
         curve = read_rows(folder / "curve.csv")
-        made[resolution] = made_from(folder / "run.json")
-        parts = begun_midway(curve, made[resolution], folder / "curve.csv")
-        files[f"{resolution}/curve.csv"] = thinned(curve, own, rows, folder / "curve.csv", parts)
+        iteration = column(curve, "iteration", folder / "curve.csv")
+        starts = starts_in(folder / "run.json")
+        legs = legs_in(starts, int(iteration[-1]))
+        made[resolution] = made_from(starts[-1], legs)
+        files[f"{resolution}/curve.csv"] = thinned(curve, own, rows, folder / "curve.csv", begun_midway(iteration, legs))
         files[f"{resolution}/evaluation.json"] = evaluations(folder / "evaluation.json", own)
     document = next(iter(made.values()))["document"]
     task = next((load_task(file).task for file in (Path(document), ROOT / document) if file.is_file()), None)
@@ -104,22 +107,27 @@ def collect(
     return size
 
 
-def begun_midway(curve: Sequence[Mapping[str, str]], made: Mapping[str, Any], file: Path) -> Bool[Array, " point"]:
+def begun_midway(iteration: Float[Array, " point"], legs: Mapping[int, Mapping[str, Any]]) -> Bool[Array, " point"]:
     """Return in which iterations the episodes that ended may have been parts alone: the first of each leg.
 
     When a run begins or goes on, its first episodes count as having lasted a while, so that not all end at once; what they
     score is that of a part, which would look as if students had forgotten something.
     """
-    iteration, physics = column(curve, "iteration", file), made["physics"]
-    steps = round(made["episode"] / (physics["timestep"] * physics["substeps"]))
-    length = math.ceil(steps / made["distill"]["steps"])
-    return np.any([(iteration > first) & (iteration <= first + length) for first in made["begun"]], axis=0)
+    found = np.zeros(len(iteration), dtype=bool)
+    for first, start in legs.items():
+        spec, physics = start["spec"], start["spec"]["physics"]
+        steps = round(spec["episode"] / (physics["timestep"] * physics["substeps"]))
+        found |= (iteration > first) & (iteration <= first + math.ceil(steps / spec["distill"]["steps"]))
+    return found
 
 
 def thinned(
     curve: Sequence[Mapping[str, str]], taught: Sequence[Taught], rows: int, file: Path, left_out: Bool[Array, " point"]
 ) -> str:
-    """Return a curve of few rows as CSV: means over spans of as many control steps each, of scores weighted by episodes.
+    """Return a curve of few rows as CSV: means over spans of as many control steps each, at the end of which `samples` stands.
+
+    A score's mean is that of the iterations in which it is known, however many episodes ended in each: the curve tells the
+    number of all students' episodes together alone, by which a student would count more where others drop the object.
 
     Args:
         curve: A row per iteration.
@@ -141,18 +149,16 @@ def thinned(
         steps = f"{round(samples[-1]):,} control steps of each student, the table {taught[0].row.samples:,}"
         raise KeptError(f"{file}: the curve has {steps}: the last leg was not evaluated")
     span = np.ceil(samples / samples[-1] * rows - 1e-9).astype(int)
-    episodes = np.where(left_out, 0.0, np.nan_to_num(column(curve, "episodes", file)))
-    values = {"samples": samples, "seconds": column(curve, "seconds", file)}
-    values |= {name: column(curve, name, file) for name in columns}
+    seconds, values = column(curve, "seconds", file), {name: column(curve, name, file) for name in columns}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(values)
+    writer.writerow(["samples", "seconds", *values])
     for own in np.unique(span):
         chosen = span == own
-        means = (
-            _mean(value[chosen], episodes[chosen] if name.startswith("Score/") else None) for name, value in values.items()
-        )
-        writer.writerow([f"{mean:.{DIGITS}g}" if math.isfinite(mean) else "" for mean in means])
+        known = {name: chosen & np.isfinite(value) for name, value in values.items()}
+        known |= {name: kept & ~left_out for name, kept in known.items() if name.startswith("Score/")}
+        means = [f"{value[known[name]].mean():.{DIGITS}g}" if known[name].any() else "" for name, value in values.items()]
+        writer.writerow([round(samples[chosen][-1]), f"{seconds[chosen][-1]:.{DIGITS}g}", *means])
     return text.getvalue()
 
 
@@ -160,51 +166,67 @@ def evaluations(file: Path, taught: Sequence[Taught]) -> str:
     """Return the evaluation of each student, a line each.
 
     Raises:
-        KeptError: If one's is missing.
+        KeptError: If one's is missing, or they are not those that the table was made from.
     """
     found = read_json(file, "evaluations")
     names = [name for each in taught for name in each.names]
     missing = [name for name in names if name not in found]
     if missing:
         raise KeptError(f"{file}: there is no evaluation of {missing[0]}")
+    for each in taught:
+        own = [found[name] for name in each.names]
+        told = f"{fmean(one['score'] for one in own):.6g} in {sum(one['episodes'] for one in own)} episodes"
+        if told != (expected := f"{each.row.score:.6g} in {each.row.episodes} episodes"):
+            raise KeptError(f"{file}: {', '.join(each.names)} score {told}, {expected} by table.csv: of another evaluation")
     lines = [f"{json.dumps(name)}: {json.dumps(_rounded({key: found[name][key] for key in EVALUATED}))}" for name in names]
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def made_from(file: Path) -> dict[str, Any]:
-    """Return what the simulation of a resolution was made from: of all legs the devices, else of the last one.
+def starts_in(file: Path) -> list[dict[str, Any]]:
+    """Return what a run was made from at each start.
 
     Raises:
-        KeptError: If that cannot be read, or does not say when its legs began.
+        KeptError: If that cannot be read, or does not say after how many iterations these were.
     """
     starts = read_json(file, "what the run was made from").get("starts") or []
     if not starts:
         raise KeptError(f"{file}: it has no starts")
-    last = starts[-1]
     begun = [start.get("iteration") for start in starts[1:]]
     if None in begun:
         raise KeptError(
             f"{file}: it does not say at which iteration leg {begun.index(None) + 2} began: it is of an older tgdsl"
         )
+    return [starts[0] | {"iteration": 0}, *starts[1:]]
+
+
+def legs_in(starts: Sequence[dict[str, Any]], iterations: int) -> dict[int, dict[str, Any]]:
+    """Return the starts of which iterations are left, by the iteration after which each was.
+
+    One that was killed while it evaluated, or whose iterations were made again, is no leg.
+
+    Args:
+        starts: All starts, in their order.
+        iterations: Iterations of the run.
+    """
+    legs: dict[int, dict[str, Any]] = {}
+    for start in starts:
+        legs = {first: leg for first, leg in legs.items() if first < start["iteration"]} | {start["iteration"]: start}
+    return {first: leg for first, leg in legs.items() if first < iterations}
+
+
+def made_from(last: Mapping[str, Any], legs: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what the simulation of a resolution was made from: of all legs the devices, else of the last start."""
     return {
         "document": last["task"],
         "task": last["spec"]["task"],
-        "begun": [0, *begun],
-        "devices": list(dict.fromkeys(start["device"] for start in starts)),
+        "begun": list(legs),
+        "devices": list(dict.fromkeys(start["device"] for start in legs.values())),
         "envs": last["envs"],
         "episode": last["spec"]["episode"],
         "physics": last["spec"]["physics"],
         "distill": last["spec"]["distill"],
         "versions": last["versions"],
     }
-
-
-def _mean(values: Float[Array, " point"], weights: Float[Array, " point"] | None) -> float:
-    """Return the mean of what is known; nan if nothing is."""
-    kept = np.isfinite(values) if weights is None else np.isfinite(values) & (weights > 0)
-    if not kept.any():
-        return math.nan
-    return float(np.average(values[kept], weights=None if weights is None else weights[kept]))
 
 
 def _of_task(file: Path, made: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 - `distill.json`: who was taught, by whom, and what the run was made from; no local paths
 - `table.csv`: as `tgdsl distill` wrote it
-- `<resolution>/curve.csv`: at most 60 rows, each the mean of as many control steps: `samples`, control steps of each student;
-  `seconds`; `Score/…` and `Loss/…` of each student, 4 digits; scores without the first episodes of each leg
+- `<resolution>/curve.csv`: at most 60 rows, each of as many control steps: `samples`, control steps of each student by its
+  end; `seconds` by then; means of `Score/…` and `Loss/…` of each student, 4 digits; scores without the first episodes of each
+  leg, iterations in which some episode of the student ended counting alike
 - `<resolution>/evaluation.json`: the evaluation of each student
 - `teacher.json`, `rest.json`: evaluations of the teacher and of joints at rest, where given
 
@@ -65,7 +66,7 @@ class Curves:
     """Curves of the students of one simulation.
 
     Attributes:
-        samples: Control steps of each student.
+        samples: Control steps of each student by the end of each point.
         score: Score by student, nan where no episode has ended.
     """
 

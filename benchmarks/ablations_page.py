@@ -167,15 +167,17 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
 
 
 def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
-    worse = worse_than(own, _beside(own, found), ablation.made["is_less_better"])
     row, change, paper = own.taught.row, own.trend, paper_samples(_task(ablation))
     place = ", ".join(part for part in own.taught.where if part)
     steps = _millions(row.samples) + (f" ({_percent(row.samples / paper, 2)} of the paper's)" if paper else "")
     moved = "–" if change is None else "{} ({} to {})".format(*map(_signed, change))
     flat = {True: "yes", False: "no", None: "–"}[own.is_flat]
-    names = _named(worse, _beside(own, found)) or ("–" if own.is_told else "open")
+    beside = _beside(own, found)
+    worse = _named(worse_than(own, beside, ablation.made["is_less_better"]), beside)
+    untold = _named([other for other in beside if not other.is_told], beside)
+    said = "; ".join(part for part in (worse, f"open: {untold}" if untold else "") if part) or "–"
     score = [f"{row.score:.3f}", _bounds(row.low, row.high), _percent(row.held)]
-    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, names]
+    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, said if own.is_told else "open"]
 
 
 def _conditions(ablation: Ablation) -> str:

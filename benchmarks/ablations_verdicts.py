@@ -9,7 +9,7 @@ of Student's distribution with two degrees of freedom fewer than points,
 so that a curve which is too noisy to tell is not flat, and one that gets worse is not either; nor is one whose scores are not
 known at either end of that third, as when its last leg was shorter than an episode. Where joints at rest were not
 measured, students that feel nothing stand in for them. Points are taken as independent, which those closer than an episode are
-not.
+not. A point is the mean score of the control steps since the one before it.
 
 One student is worse than another if both curves have flattened and the 95 % intervals of their scores, over seeds and episodes,
 do not overlap: a curve that still rises says nothing of what can be learned from a type, and neither does one seed, whose
@@ -59,7 +59,7 @@ def trend(samples: Float[Array, " point"], score: Float[Array, " point"]) -> Tre
     """Return how a curve changes over its last third; None if there are too few points.
 
     Args:
-        samples: Control steps, rising.
+        samples: Control steps by the end of each point, rising.
         score: The score there; nan where no episode has ended.
     """
     if not len(samples):

@@ -1,19 +1,23 @@
 """`tgdsl sweep`: what is run, what a mistake is called, and what becomes of a run whose worker is killed."""
 
-import csv
 import json
 import runpy
 import sys
 from pathlib import Path
 
 import pytest
+import torch
+from felt_tasks import felt_task
 from small_runs import SMALL
 from small_tasks import small_task
+from written_teachers import teacher
 
 from tgdsl.commands.learning.sweep_document import Trial, load_sweep
 from tgdsl.commands.learning.sweep_trial import left, run_trial
 from tgdsl.errors import SpecError
-from tgdsl.rl.train.checkpoint import read_checkpoint
+from tgdsl.rl.load import load_task
+from tgdsl.rl.train.checkpoint import FORMAT, read_checkpoint
+from tgdsl.rl.train.folder import RunFolder
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "tasks" / "sweep.yaml"
 FIXED = {"--device": "cpu", "--envs": 4, "--iterations": 3, "--episodes": 4, **SMALL}
@@ -26,7 +30,7 @@ from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 class Killed(InPalmRotate):
     def advance(self, now):
         mark = Path(__file__).parent / "kill"
-        if list(mark.parent.glob("runs/*/checkpoint.pt")):
+        if list(mark.parent.glob("runs/**/checkpoint.pt")):
             with suppress(FileNotFoundError):  # of two workers that come at once one has it
                 mark.unlink()
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -56,6 +60,17 @@ def test_every_combination_is_a_trial(base):
     common = ("train", str(base / "task.yaml"), "--minutes", "0.5", "--set", "randomise={}", "--set", "train.rnd=off")
     assert trials[4].words == (*common, "--set", "action.scale=10 deg", "--seed", "2")
     assert trials[4].settings == {"action.scale": "10 deg", "--seed": 2}
+
+
+def test_students_are_trials_too(base):
+    """A teacher's path is relative to the sweep's document."""
+    (base / "teachers").mkdir()
+    (base / "teachers" / "t.pt").write_bytes(b"")
+    fixed = {"--teacher": "teachers/t.pt", "--types": "bool,none", "--seeds": 1, "--resolutions": "low,high"}
+    document = write(base, {"--iterations": [1, 2]}, fixed, command="distill")
+    _, trials = load_sweep(document)
+    who = ("--teacher", str(base / "teachers" / "t.pt"), "--types", "bool,none", "--seeds", "1", "--resolutions", "low,high")
+    assert trials[1].words == ("distill", str(base / "task.yaml"), *who, "--iterations", "2")
 
 
 def test_the_example():
@@ -95,6 +110,25 @@ def test_the_example():
         ),
         ({"matrix": {"--minutes": [0]}, "fixed": {"--envs": True}}, "1:", "(?s)--envs is true.*--minutes is 0"),
         ({"matrix": {"--seed": [1]}, "command": "trian"}, "1:", "command"),
+        ({"matrix": {"--seed": [1.5, "x"]}}, "1:", r'(?s)--seed\[0\]: --seed is 1.5, expected a whole number\n.*--seed is "x"'),
+        ({"matrix": {"--seed": [1]}, "fixed": {"--device": 7}}, "fixed.--device", "--device is 7, expected a text, as on the"),
+        ({"matrix": {"--device": ["cpu", "CPU"]}}, "matrix.--device[1]", '--device is "CPU", expected cuda or cpu'),
+        ({"matrix": {"--types": ["bool"]}}, "1:", "`tgdsl train` has no option --types that a sweep may set"),
+        ({"matrix": {"--seed": [1]}, "command": "distill", "fixed": {}}, "command", "`tgdsl distill` needs a --teacher, under"),
+        (
+            {"matrix": {"--teacher": ["t.pt"]}, "command": "distill", "fixed": {}},
+            "matrix.--teacher[0]",
+            '--teacher is "t.pt", expected a policy: there is no file /.*/t.pt',
+        ),
+        (
+            {
+                "matrix": {"--minutes": [1]},
+                "command": "distill",
+                "fixed": {"--teacher": "task.yaml", "--seeds": 0, "--resolutions": "low,high"},
+            },
+            "fixed.--resolutions",
+            '(?s)--seeds is 0.*--resolutions is "low,high", expected one, as --minutes count for each: list them under matrix',
+        ),
     ],
 )
 def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
@@ -103,14 +137,19 @@ def test_mistakes_are_named_before_anything_runs(base, changes, place, what):
     assert place in str(found.value)
 
 
-def test_a_run_that_goes_on_learns_the_minutes_that_are_left(base):
-    """9 of 30 seconds were learned: 0.35 minutes are left; and none where more was."""
+@pytest.mark.parametrize("place", [".", "low"])
+def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
+    """9 of 30 seconds were learned when its checkpoint was written: 0.35 minutes are left; and none where more was.
+
+    Iterations that it made later, of which it was writing the last one, are made again.
+    """
     words = ["train", "task.yaml", "--minutes", "0.5", "--seed", "1"]
-    assert left(words, base) == words
-    for seconds, expected in (("9.0", 0.35), ("42", 0.0)):
-        with (base / "curve.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([["iteration", "seconds"], ["1", "3.0"], ["2", seconds]])
-        found = left(words, base)
+    assert left(words, tmp_path) == words
+    (tmp_path / place).mkdir(exist_ok=True)
+    (tmp_path / place / "curve.csv").write_text("iteration,samples,seconds\n1,8,9.0\n2,16,12.0\n3,2")
+    for seconds, expected in ((9.0, 0.35), (42.0, 0.0)):
+        torch.save({"format": FORMAT, "seconds": seconds}, tmp_path / place / "checkpoint.pt")
+        found = left(words, tmp_path)
         assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(expected)
 
 
@@ -131,6 +170,10 @@ def test_a_trial_that_is_wrong_says_so_and_one_that_was_made_is_left_alone(base,
 def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
     for name in ("argv", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, getattr(sys, name))
+    (base / "z").mkdir()
+    (base / "z" / "checkpoint.pt").write_text("")
+    wrong = run_trial(Trial("z", {}, ("train", "task.yaml", "--minutes", "1")), str(base / "z"))
+    assert wrong.startswith("failed: CheckpointError: ") and "cannot read this checkpoint" in wrong
     (base / "broken.py").write_text("raise ZeroDivisionError('of this test')")
     monkeypatch.setattr("runpy.run_module", lambda *_, **__: runpy.run_path(str(base / "broken.py")))
     assert run_trial(Trial("y", {}, ("train", "task.yaml")), str(base / "y")) == "failed: ZeroDivisionError: of this test"
@@ -138,13 +181,18 @@ def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
     assert not (base / "y" / "ended.json").exists()
 
 
+def killed_once(folder):
+    """Have the task kill the worker that comes to it first once there is a checkpoint."""
+    (folder / "killed.py").write_text(KILLED)
+    (folder / "kill").write_text("")
+    task = (folder / "task.yaml").read_text().replace("task: in_palm_rotate", "task: killed.py:Killed")
+    (folder / "task.yaml").write_text(task)
+
+
 @pytest.mark.slow
 def test_two_workers_one_of_them_killed(base, here):
     """Both runs end whole: the one that was killed went on from its checkpoint, and its curve has each iteration once."""
-    (base / "killed.py").write_text(KILLED)
-    (base / "kill").write_text("")
-    task = (base / "task.yaml").read_text().replace("task: in_palm_rotate", "task: killed.py:Killed")
-    (base / "task.yaml").write_text(task)
+    killed_once(base)
     document = write(base, {"--seed": [1, 2]}, {**FIXED, "train.checkpoint": 1e-9})
     code, out, error = here(base, "sweep", document.name, "--out", "runs")
     assert code == 0, error
@@ -156,8 +204,7 @@ def test_two_workers_one_of_them_killed(base, here):
     for seed in (1, 2):
         folder = base / "runs" / f"seed={seed}"
         assert read_checkpoint(folder / "checkpoint.pt")["iteration"] == 3
-        with (folder / "curve.csv").open() as file:
-            assert [row["iteration"] for row in csv.DictReader(file)] == ["1", "2", "3"]
+        assert [row["iteration"] for row in RunFolder(folder).rows()] == ["1", "2", "3"]
         assert json.loads((folder / "ended.json").read_text()) == {"--seed": seed}
         starts.append(len(json.loads((folder / "run.json").read_text())["starts"]))
     assert sorted(starts) == [1, 2]
@@ -165,3 +212,28 @@ def test_two_workers_one_of_them_killed(base, here):
     assert code == 0 and out.count("was made before") == 2, error
     code, out, error = here(base, "sweep", write(base, {"--seed": [1]}, cpus=1e6).name)
     assert code == 2 and "a run takes 1e+06 processors and 0 GPUs, no machine has more than" in error
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+def test_two_workers_that_teach_one_of_them_killed(tmp_path, here):
+    """Students of the one that was killed went on from its checkpoint; each trial has its own folder with a table."""
+    felt_task(tmp_path)
+    killed_once(tmp_path)
+    teacher(tmp_path / "teacher.pt", load_task(tmp_path / "task.yaml"), ["priv_proprio", "priv_obj_state"])
+    small = {"distill.steps": 4, "distill.networks.encoder.hidden": [8], "distill.networks.hidden": [8]}
+    small |= {"--teacher": "teacher.pt", "--seeds": 1, "--envs": 2, "--iterations": 3, "--minutes": 60, "--episodes": 2}
+    fixed = {"--device": "cpu", "distill.checkpoint": 1e-9, **small}
+    (tmp_path / "elsewhere").mkdir()
+    write(tmp_path, {"--types": ["none", "depth"]}, fixed, command="distill")
+    code, out, error = here(tmp_path / "elsewhere", "sweep", "../sweep.yaml", "--out", "../runs")
+    assert code == 0, error
+    assert not (tmp_path / "kill").exists() and out.count(": done") == 2
+    starts = []
+    for type_ in ("none", "depth"):
+        folder = tmp_path / "runs" / f"types={type_}"
+        assert (folder / "table.csv").read_text().splitlines()[1].startswith(f"{type_},")
+        assert [row["iteration"] for row in RunFolder(folder / "default").rows()] == ["1", "2", "3"]
+        assert json.loads((folder / "ended.json").read_text()) == {"--types": type_}
+        starts.append(len(json.loads((folder / "default" / "run.json").read_text())["starts"]))
+    assert sorted(starts) == [1, 2]

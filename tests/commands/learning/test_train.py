@@ -143,9 +143,16 @@ def test_rates_that_are_set_when_a_run_goes_on_count(base, here):
 
 
 def test_time_is_a_limit_too(base, here):
-    code, out, error = here(base, "train", "task.yaml", *ON, "--minutes", "0.0", "--episodes", "0", *ARGUMENTS)
-    assert code == 0, error
-    assert "after 1 iterations" in out
+    """Without any no iteration is made, whether a run begins or goes on; else one at least."""
+    start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS]
+    for minutes, more, iterations in (
+        ("0.0", (), 0),
+        ("1e-6", ("--resume", "out/task"), 1),
+        ("0", ("--resume", "out/task"), 1),
+    ):
+        code, out, error = here(base, *start, "--minutes", minutes, *more)
+        assert code == 0, error
+        assert f"after {iterations} iterations" in out
 
 
 def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, StrictInt
 
+from tgdsl.commands.learning.distill import Distill
 from tgdsl.commands.learning.train import Train
 from tgdsl.errors import SpecError, did_you_mean
 from tgdsl.fields.models import NonNegative, Positive, SpecModel
@@ -19,10 +20,12 @@ from tgdsl.schema.load import read_source
 from tgdsl.schema.validation import validate
 from tgdsl.schema.yaml import Source
 
+COMMANDS = {"train": Train, "distill": Distill}
+"""What a sweep may run."""
 OWN = ("task", "out", "resume", "set")
 """Options that a sweep gives itself."""
-WHOLE = {"--iterations": 1, "--envs": 1, "--episodes": 0}
-"""Options that are whole numbers, and the least value of each."""
+WHOLE = {"--iterations": 1, "--envs": 1, "--episodes": 0, "--seeds": 1, "--seed": None}
+"""Options that are whole numbers, and the least value of each; None: any."""
 
 
 class SweepSpec(SpecModel):
@@ -30,12 +33,13 @@ class SweepSpec(SpecModel):
 
     tgdsl: Literal[1]
     """Version of the grammar."""
-    command: Literal["train"] = "train"
-    """What is run."""
+    command: Literal["train", "distill"] = "train"
+    """What is run: `tgdsl train` or `tgdsl distill`."""
     task: str
     """The task's document, relative to this one."""
     fixed: dict[str, Any] = {}
-    """Settings of all runs: values of the task by dotted path, and options of the command by name: `--seed: 1`."""
+    """Settings of all runs: values of the task by dotted path, and options of the command by name: `--seed: 1`.
+    The path of a `--teacher` is relative to this document."""
     matrix: Annotated[dict[str, Annotated[tuple[Any, ...], Field(min_length=1)]], Field(min_length=1)]
     """Settings that differ: each has a list, and every combination is run."""
     cpus: Positive = 1.0
@@ -67,7 +71,7 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
     if problems or not isinstance(spec, SweepSpec):
         raise SpecError(problems)
     _check_options(source, spec)
-    _check_values(source, spec)
+    _check_values(source, spec, file.parent)
     trials = []
     for values in itertools.product(*spec.matrix.values()):
         settings = dict(zip(spec.matrix, values, strict=True))
@@ -76,6 +80,7 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
         words = [spec.command, str((file.parent / spec.task).resolve())]
         for name, value in every.items():
             text = value if isinstance(value, str) else json.dumps(value)
+            text = str((file.parent / text).resolve()) if name == "--teacher" else text
             words += [name, text] if name.startswith("--") else ["--set", f"{name}={text}"]
         name = ",".join(f"{name.lstrip('-')}={value}" for name, value in settings.items())
         trials.append(Trial(re.sub(r"[^\w.=,+-]", "_", name), settings, tuple(words)))
@@ -85,30 +90,47 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
 
 
 def _check_options(source: Source, spec: SweepSpec) -> None:
-    known = {"--" + own.name: own.name for own in fields(Train) if own.name not in OWN}
+    known = {"--" + own.name for own in fields(COMMANDS[spec.command]) if own.name not in OWN}
     for place in ("fixed", "matrix"):
         for name in getattr(spec, place):
             if name.startswith("--") and name not in known:
                 what = f"`tgdsl {spec.command}` has no option {name} that a sweep may set"
                 raise SpecError([source.problem((place, name), what, did_you_mean(name, known, "options"), on_key=True)])
+    if "--teacher" in known - spec.fixed.keys() - spec.matrix.keys():
+        raise SpecError([source.problem(("command",), f"`tgdsl {spec.command}` needs a --teacher, under fixed or matrix")])
 
 
-def _check_values(source: Source, spec: SweepSpec) -> None:
-    """See that options which are numbers have such values.
+def _check_values(source: Source, spec: SweepSpec, folder: Path) -> None:
+    """See that the command takes the options' values.
 
     Raises:
-        SpecError: All values that are none.
+        SpecError: All values that it does not take.
     """
     fixed = [(("fixed", name), name, value) for name, value in spec.fixed.items()]
     listed = [(("matrix", name, i), name, value) for name, values in spec.matrix.items() for i, value in enumerate(values)]
+    is_timed = "--minutes" in spec.fixed or "--minutes" in spec.matrix
     problems = []
     for path, name, value in (*fixed, *listed):
-        expected = ""
-        if name in WHOLE and not (type(value) is int and value >= WHOLE[name]):
-            expected = f"a whole number of at least {WHOLE[name]}"
-        if name == "--minutes" and not (type(value) in (int, float) and 0.0 < value < float("inf")):
-            expected = "a positive number"
-        if expected:
+        if name.startswith("--") and (expected := _expected(name, value, folder, is_timed)):
             problems.append(source.problem(path, f"{name} is {json.dumps(value, default=str)}, expected {expected}"))
     if problems:
         raise SpecError(problems)
+
+
+def _expected(name: str, value: Any, folder: Path, is_timed: bool) -> str:
+    """Return what an option expects, where a value is something else; else nothing."""
+    if name in WHOLE:
+        least = WHOLE[name]
+        is_right = type(value) is int and (least is None or value >= least)
+        return "" if is_right else "a whole number" if least is None else f"a whole number of at least {least}"
+    if name == "--minutes":
+        return "" if type(value) in (int, float) and 0.0 < value < float("inf") else "a positive number"
+    if not isinstance(value, str):
+        return "a text, as on the command line"
+    if name == "--device" and not re.fullmatch(r"cpu|cuda(:\d+)?", value):
+        return "cuda or cpu"
+    if name == "--teacher" and not (folder / value).is_file():
+        return f"a policy: there is no file {folder / value}"
+    if name == "--resolutions" and "," in value and is_timed:
+        return "one, as --minutes count for each: list them under matrix"
+    return ""

@@ -27,13 +27,14 @@ def run_trial(trial: Trial, folder: str) -> str:
         return f"failed: its folder holds a run of other settings, `tgdsl {shlex.join(before)}`; give another --out"
     if end.is_file():
         return "was made before"
-    if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
-        words = [*left([*trial.words], place), "--resume", folder]
     place.mkdir(parents=True, exist_ok=True)
     atomic_write(asked, json.dumps(trial.words).encode())
     with (place / "log.txt").open("a") as log:
-        sys.argv, sys.stdout, sys.stderr = ["tgdsl", *words], log, log
+        sys.stdout, sys.stderr = log, log
         try:
+            if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
+                words = [*left([*trial.words], place), "--resume", folder]
+            sys.argv = ["tgdsl", *words]
             runpy.run_module("tgdsl", run_name="__main__")  # the command line itself; commands.cli imports this package
         except SystemExit as ended:
             if ended.code:
@@ -51,16 +52,15 @@ def run_trial(trial: Trial, folder: str) -> str:
 
 
 def left(words: list[str], folder: Path) -> list[str]:
-    """Return a command's words with those minutes alone that a run has not learned yet.
+    """Return a command's words with those minutes alone that a run had not learned at its last checkpoint.
 
-    Students of several resolutions learn so many minutes each, and go on for all of them.
+    That of students is in the folder of their resolution; beside `--minutes` there is one alone.
     """
-    from tgdsl.rl.train.folder import RunFolder
+    from tgdsl.rl.train.checkpoint import read_checkpoint
 
-    inner = [file.parent for file in folder.glob("*/curve.csv")]
-    rows = RunFolder(inner[0] if len(inner) == 1 else folder).rows()
-    if "--minutes" not in words or not rows:
+    found = [*folder.glob("checkpoint.pt"), *folder.glob("*/checkpoint.pt")]
+    if "--minutes" not in words or not found:
         return words
     at = words.index("--minutes") + 1
-    left = max(0.0, float(words[at]) - float(rows[-1]["seconds"]) / 60.0)
+    left = max(0.0, float(words[at]) - read_checkpoint(found[0])["seconds"] / 60.0)
     return [*words[:at], str(left), *words[at + 1 :]]

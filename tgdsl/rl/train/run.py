@@ -66,7 +66,7 @@ class Run:
 
         Args:
             iterations: Iterations of the whole run, those made before included.
-            seconds: Time from now on [s]; may be infinite.
+            seconds: Time from now on [s]; may be infinite. Of 0 no iteration is made.
             shown: Is shown each iteration.
 
         Raises:
@@ -75,7 +75,7 @@ class Run:
         """
         learner, before = self._learner, self.seconds
         begun = saved = time.monotonic()
-        is_over = learner.iteration >= iterations
+        is_over = learner.iteration >= iterations or seconds <= 0.0
         try:
             while not is_over:
                 start = time.monotonic()
