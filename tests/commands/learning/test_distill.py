@@ -87,7 +87,22 @@ def test_from_a_teacher_to_students_that_play(base, here):
 
 def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeypatch):
     """The number of environments is kept, not made anew; what students feel cannot be changed; old scores do not stay."""
-    few = (*TEACHER, "--types", "none", "--seeds", "1", "--episodes", "2", "--iterations", "1", *SMALL, "-o", "run")
+    few = (
+        *TEACHER,
+        "--types",
+        "none",
+        "--seeds",
+        "1",
+        "--episodes",
+        "2",
+        "--iterations",
+        "1",
+        *SMALL,
+        "-o",
+        "run",
+        "--set",
+        "placement=ends",
+    )
     monkeypatch.setattr("tgdsl.commands.learning.distill.ENVS", 6)
     assert here(base, "distill", "task.yaml", *few)[0] == 0
     assert json.loads((base / "run" / "distill.json").read_text())["envs"] == 6
@@ -95,9 +110,9 @@ def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeyp
     on = ("--resume", "run", "--device", "cpu", "--iterations", "2", "--episodes", "0")
     for key in ("resolution=high", "placement=all", "noise=noisy"):
         code, out, error = here(base, "distill", "task.yaml", *on, "--set", key)
-        assert (code, out) == (2, "") and f"--set {key}: what they feel stays as it is in a run that goes on" in error
+        assert (code, out) == (2, "") and f"--set {key}: what students feel stays as it is in a run that goes on" in error
     teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
-    code, out, error = here(base, "distill", "task.yaml", *on, "--set", "rewards.spin=3")
+    code, out, error = here(base, "distill", "task.yaml", *on, "--set", "rewards.spin=3", "--set", "placement=ends")
     assert code == 0, error
     told = [line for line in out.splitlines() if line.startswith("changed since the run began")]
     assert told == [

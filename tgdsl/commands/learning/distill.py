@@ -84,7 +84,7 @@ class Distill:
         given = parsed_overrides(self.set)
         overrides = joined_overrides(before.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
-        self._check(given)
+        self._check(given, before.get("overrides", {}))
         asked = self._asked(loaded, before)
         prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
         asked["envs"] = prepared[0].envs
@@ -106,11 +106,12 @@ class Distill:
         else:
             table.unlink(missing_ok=True)  # of what the students were before
 
-    def _check(self, overrides: dict[str, str]) -> None:
+    def _check(self, overrides: dict[str, str], before: dict[str, Any]) -> None:
         for key, option in OPTIONS.items():
-            if key in overrides and (key == "touch" or self.resume is not None or getattr(self, option) is not None):
-                what = "what they feel stays as it is in a run that goes on"
-                raise TgdslError(f"--set {key}={overrides[key]}: {what if self.resume else f'--{option} says it of students'}")
+            if key in overrides and (key == "touch" or getattr(self, option) is not None):
+                raise TgdslError(f"--set {key}={overrides[key]}: --{option} says it of students")
+            if key in overrides and self.resume is not None and overrides[key] != before.get(key):
+                raise TgdslError(f"--set {key}={overrides[key]}: what students feel stays as it is in a run that goes on")
         for name, least in (("envs", 1), ("iterations", 1), ("minutes", 0.0), ("episodes", 0), ("seeds", 1)):
             value = getattr(self, name)
             if value is not None and not value >= least:
