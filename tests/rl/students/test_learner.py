@@ -248,8 +248,16 @@ def test_a_checkpoint_of_others_is_refused(make, tmp_path):
     write_checkpoint(state_of(one, 1.0), file)
     with pytest.raises(CheckpointError, match=r"learned from the groups .*bool-all.*, not"):
         restore(make(types=("depth",)), read_checkpoint(file), file)
-    with pytest.raises(CheckpointError, match=r"its networks are of other sizes: .* is \(4, 8.*not \(4, 9|its networks"):
-        restore(make(networks__hidden="[9]"), read_checkpoint(file), file)
+    found = r"its networks are encoders\.0\.layers\.0\.weight, .*, trunk\.2\.bias, .*, decoders\.1\.4\.bias$"
+    refused = [
+        ({"networks__hidden": "[9]"}, r"trunk\.0\.weight is \(2, 8, 72\), not \(2, 9, 72\)$"),
+        ({"networks__encoder__hidden": "[7]"}, r"encoders\.0\.layers\.0\.weight is \(2, 8, 6\), not \(2, 7, 6\)$"),
+        ({"networks__touch_kind": "lstm"}, found),
+        ({"decoders": "{object_size: {hidden: [4]}}"}, found),
+    ]
+    for chosen, expected in refused:
+        with pytest.raises(CheckpointError, match=f"its networks are of other sizes: {expected}"):
+            restore(make(**chosen), read_checkpoint(file), file)
 
 
 @pytest.mark.parametrize("loss", ["mse", "inverse_variance"])

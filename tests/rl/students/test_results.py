@@ -1,8 +1,19 @@
-"""The table of students."""
+"""The table of students: means and intervals over seeds and episodes, and their order."""
+
+import math
 
 import pytest
+from scipy.stats import ttest_1samp
 
-from tgdsl.rl.students.results import Row, shown
+from tgdsl.rl.playing.evaluation import Evaluation
+from tgdsl.rl.students.keys import student_keys
+from tgdsl.rl.students.results import Row, interval, rows_of, shown
+
+
+def evaluation(score: float, half: float, held: float = 1.0, episodes: int = 10) -> Evaluation:
+    """Return what one seed's episodes were."""
+    bounds = (score - half, score + half)
+    return Evaluation("small", "RMS", episodes, 2, 1, score, bounds, held, (0.0, 1.0), 3.0, 2.0, 0)
 
 
 @pytest.mark.parametrize(("is_less_better", "expected"), [(False, ["a", "b"]), (True, ["b", "a"])])
@@ -11,3 +22,34 @@ def test_the_best_comes_first(is_less_better, expected):
     rows = [Row(name, "tips", "med", "clean", 1, score, 0.0, 1.0, 1.0, 2, 3, 4.0) for name, score in (("a", 0.9), ("b", 0.1))]
     lines = shown(rows, "RMS", is_less_better).splitlines()[2:]
     assert [line.split()[0] for line in lines] == expected
+
+
+@pytest.mark.parametrize("scores", [(0.1, 0.5, 0.9), (0.2, 0.3)])
+def test_an_interval_of_seeds_that_differ_is_students(scores):
+    """Their episodes alone would say ±0.01 at most."""
+    expected = ttest_1samp(scores, 0.0).confidence_interval(0.95)
+    assert interval([evaluation(score, 0.01) for score in scores]) == pytest.approx(tuple(expected))
+    assert expected.high - expected.low > 0.5
+
+
+def test_an_interval_of_seeds_that_hardly_differ_is_that_of_all_episodes():
+    """The halves of two seeds' intervals, 0.3 and 0.4, are 0.25 of their mean's; the means alone would say ±0.06."""
+    low, high = ttest_1samp((0.5, 0.51), 0.0).confidence_interval(0.95)
+    assert high - low < 0.2
+    assert interval([evaluation(0.5, 0.3), evaluation(0.51, 0.4)]) == pytest.approx((0.255, 0.755))
+
+
+def test_an_interval_of_one_seed_is_that_of_its_episodes():
+    """And of one episode nothing is known."""
+    assert interval([evaluation(0.5, 0.2)]) == pytest.approx((0.3, 0.7))
+    assert interval([evaluation(0.5, math.inf)]) == (-math.inf, math.inf)
+
+
+def test_rows_are_means_over_seeds():
+    keys = student_keys(["depth", "none"], ["tips"], ["clean"], 2)
+    found = [evaluation(0.5, 0.3, 0.25), evaluation(0.51, 0.4, 0.5), evaluation(0.1, 0.03, 1.0), evaluation(0.1, 0.04, 0.4, 20)]
+    depth, none = rows_of(keys, found, "med", 1000, 2.5)
+    assert depth[:5] == ("depth", "tips", "med", "clean", 2) and none[:5] == ("none", "", "med", "", 2)
+    assert depth[5:9] == pytest.approx((0.505, 0.255, 0.755, 0.375))
+    assert none[5:9] == pytest.approx((0.1, 0.075, 0.125, 0.7))
+    assert depth[9:] == (20, 1000, 2.5) and none[9:] == (30, 1000, 2.5)

@@ -23,6 +23,7 @@ ENCODERS = {
 }
 FORWARD = 1e-5  # float32: sums in another order
 UPDATES = 1e-9  # float64, 20 steps of Adam
+MOMENTS = 1e-6  # float32: what networks take is rounded
 CLIP = 20.0  # of gradients whose norms are 10 to 50
 
 
@@ -104,6 +105,38 @@ def test_means_and_variances_are_those_of_all_rows_of_a_student():
     seen = torch.cat(parts, dim=1)
     torch.testing.assert_close(stack.buffers["mean"], seen.mean(dim=1), rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(stack.buffers["var"], seen.var(dim=1, correction=0), rtol=1e-12, atol=1e-12)
+
+
+def test_means_and_variances_follow_what_changes_late():
+    """Offsets of up to 300 spreads, and all moves by a spread after 100,000 looks: float32 cannot hold what one look changes."""
+    before, looks = 100_000, 2_000
+    stack, generator = Stack(architecture("mlp"), SEEDS, 1e-3, 1.0), torch.Generator().manual_seed(0)
+    found = dict(stack.buffers)  # in place: a graph that was captured reads these
+    x = torch.randn((3, 64, 17), generator=generator) + torch.linspace(0.0, 300.0, 17)
+    stack.look(x)
+    stack.seen.mul_(before)  # the same rows again and again change nothing else
+    for _ in range(looks):
+        stack.look(x + 1.0)
+    rows = x.double(), (x + 1.0).double()
+    (mean, var), (late_mean, late_var) = ((own.mean(dim=1), own.var(dim=1, correction=0)) for own in rows)
+    share = looks / (before + looks)
+    var = torch.lerp(var, late_var, share) + share * (1.0 - share) * (late_mean - mean).square()
+    mean = torch.lerp(mean, late_mean, share)
+    torch.testing.assert_close(found["mean"], mean.float(), rtol=MOMENTS, atol=MOMENTS)
+    torch.testing.assert_close(found["var"], var.float(), rtol=MOMENTS, atol=MOMENTS)
+
+
+def test_moments_of_older_checkpoints_are_float32():
+    one, other = (Stack(architecture("mlp"), SEEDS, 1e-3, 1.0) for _ in range(2))
+    one.look(3.0 * inputs(one, 40, torch.float32)[0] + 1.0)
+    state = copy.deepcopy(one.state_dict())
+    state["seen"] |= {name: one.buffers[name].clone() for name in ("mean", "var")}
+    assert state["seen"]["mean"].dtype == torch.float32
+    found = dict(other.buffers)
+    other.load_state_dict(state)
+    for name in ("mean", "var"):
+        assert torch.equal(found[name], one.buffers[name]) and other.moments[name].dtype == torch.float64
+        assert torch.equal(other.moments[name], one.buffers[name].double())
 
 
 def test_adams_options_are_the_devices_own(monkeypatch):
@@ -189,6 +222,8 @@ def test_what_is_saved_goes_on_to_the_bit(kind):
         teach(stack, range(3, 6))
     for name, value in one.parameters.items():
         assert torch.equal(value, other.parameters[name])
+    assert all(torch.equal(one.moments[name], other.moments[name]) for name in ("mean", "var"))
+    assert all(torch.equal(one.buffers[name], other.buffers[name]) for name in ("mean", "var"))
     with pytest.raises(RuntimeError, match="its networks are"):
         other.load_state_dict(Stack(architecture("mlp", ()), SEEDS, 1e-2, 0.1).state_dict())
 

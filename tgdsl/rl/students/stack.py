@@ -31,7 +31,10 @@ class Stack:
         size: How many there are.
         memory: How many numbers each remembers of an episode.
         parameters: Their weights by name, (student, …).
-        buffers: Means and variances of what they have seen, likewise.
+        buffers: Means and variances by which they normalise what they see, likewise: copies of `moments`.
+        moments: Means and variances of what they have seen, (student, feature), in float64: after many rows a change is lost in
+            float32.
+        seen: How many rows each has seen.
         optimiser: Adam.
     """
 
@@ -59,6 +62,7 @@ class Stack:
         students = [made(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
+        self.moments = {name: self.buffers[name].to(torch.float64, copy=True) for name in ("mean", "var")}
         self.seen = torch.zeros((), dtype=torch.float64, device=device)
         self._shape = copy.deepcopy(students[0]).to("meta")
         self.optimiser = torch.optim.Adam(list(self.parameters.values()), **self._options())
@@ -85,13 +89,14 @@ class Stack:
     def look(self, x: Float[Tensor, "student row feature"]) -> None:
         """Take rows into account in each student's mean and variance, in place."""
         num = x.shape[1]
-        rate = (num / (self.seen + num)).to(x.dtype)
-        var, mean = torch.var_mean(x, dim=1, correction=0)
-        own_mean, own_var = self.buffers["mean"], self.buffers["var"]
+        rate = num / (self.seen + num)
+        var, mean = torch.var_mean(x.double(), dim=1, correction=0)
+        own_mean, own_var = self.moments["mean"], self.moments["var"]
         delta = mean - own_mean
         own_mean += rate * delta
         own_var += rate * (var - own_var + delta * (mean - own_mean))
         self.seen += num
+        self._normalise()
 
     def student(self, index: int) -> Student:
         """Return a copy of one student, on the CPU."""
@@ -103,8 +108,7 @@ class Stack:
     def state_dict(self) -> dict[str, Any]:
         """Return all that teaching goes on from: live tensors."""
         networks = {name: value.detach() for name, value in self.parameters.items()}
-        kept = {name: self.buffers[name] for name in ("mean", "var")}
-        return {"networks": networks, "seen": kept | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
+        return {"networks": networks, "seen": self.moments | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from what was saved, with the learning rate that the stack was made with.
@@ -124,9 +128,15 @@ class Stack:
             for part in ("networks", "seen"):
                 for name, value in own[part].items():
                     value.copy_(state[part][name])
+            self._normalise()
         optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`
         groups = [group | self._options() for group in optimiser["param_groups"]]
         self.optimiser.load_state_dict({"state": optimiser["state"], "param_groups": groups})
+
+    def _normalise(self) -> None:
+        """Have the networks normalise by the moments, in place."""
+        for name, value in self.moments.items():
+            self.buffers[name].copy_(value)
 
     def _options(self) -> dict[str, Any]:
         """Return what of Adam's groups depends on the device and the document."""

@@ -1,0 +1,212 @@
+"""An update is that of separate students, each taught alone in plain torch as the docstrings say: all of it in float64."""
+
+import random
+from functools import partial
+from statistics import fmean
+from typing import NamedTuple
+
+import pytest
+import torch
+from felt_tasks import felt_task
+from torch import Tensor
+from written_teachers import teacher
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.students import rollout
+from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.learner import Distiller
+from tgdsl.rl.students.stack import Stack
+from tgdsl.rl.students.student import Student
+from tgdsl.rl.students.teacher import Teacher
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+UPDATES = 1e-9  # float64, 18 steps of Adam
+STEPS, LENGTH, ROWS, EPOCHS, NUM_UPDATES, RATE = 6, 3, 4, 3, 3, 1e-2
+STD = (0.5, 0.25)  # of the teacher's actions
+SCALES, WEIGHTS = (20.0, 1.0), (0.5, 2.0)  # of the decoders
+KINDS = {
+    "mlp": {"kind": "mlp", "touch_kind": "mlp"},
+    "lstm": {"kind": "lstm", "touch_kind": "lstm"},
+    "convrnn": {"kind": "mlp", "touch_kind": "convrnn"},
+}
+
+
+class Chosen(NamedTuple):
+    """What of `distill:` differs between the cases."""
+
+    loss: str = "mse"
+    clip: float | None = None
+    max_grad_norm: float | None = None
+    num_decoders: int = 0
+    aggregate: int = 1
+
+
+CHOSEN = {
+    "plain": Chosen(),
+    "bounded": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0),
+    "decoders": Chosen(num_decoders=2),
+    "aggregate": Chosen(clip=0.02, aggregate=2),
+    "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2),
+}
+
+
+class Lesson(NamedTuple):
+    """A rollout of one student: (step, row, …), but for `begun`, (row, memory)."""
+
+    x: Tensor
+    before: Tensor
+    label: Tensor
+    target: Tensor
+    ended: Tensor
+    begun: Tensor
+
+
+class Alone:
+    """A student that is taught alone."""
+
+    def __init__(self, student: Student, chosen: Chosen):
+        self.student, self.chosen = student, chosen
+        self.optimiser = torch.optim.Adam(student.parameters(), lr=RATE)
+        self.seen: list[Tensor] = []
+        self.norms: list[float] = []
+
+    def acted(self, lesson: Lesson) -> Tensor:
+        """What it would ask for now, (step, row, joint)."""
+        actions, memory = [], lesson.begun
+        with torch.no_grad():
+            for x, ended in zip(lesson.x, lesson.ended, strict=True):
+                made = self.student(x, memory)
+                actions.append(made.action)
+                memory = made.memory * ~ended[:, None]
+        return torch.stack(actions)
+
+    def passed(self, lesson: Lesson, is_latest: bool) -> float:
+        """Go through a rollout once; return the mean error of the actions."""
+        before = lesson.before if is_latest else self.acted(lesson)
+        memory, errors = lesson.begun, []
+        for first in range(0, STEPS, LENGTH):
+            behaviour, decoded = [], []
+            for t in range(first, first + LENGTH):
+                action, told, memory = self.student(lesson.x[t], memory)
+                memory = memory * ~lesson.ended[t][:, None]
+                behaviour.append(self.behaviour(action, lesson.label[t], before[t]).mean())
+                for k in range(self.chosen.num_decoders):
+                    off = told[:, k] - SCALES[k] * lesson.target[t][:, k]
+                    decoded.append(WEIGHTS[k] * off.square().mean())
+            error = torch.stack(behaviour).mean()
+            self.optimiser.zero_grad()
+            (error + sum(decoded) / LENGTH).backward()
+            norm = torch.nn.utils.clip_grad_norm_(self.student.parameters(), self.chosen.max_grad_norm or torch.inf)
+            self.norms.append(float(norm))
+            self.optimiser.step()
+            memory = memory.detach()
+            errors.append(float(error.detach()))
+        return fmean(errors)
+
+    def behaviour(self, action: Tensor, label: Tensor, before: Tensor) -> Tensor:
+        """The error of each action."""
+        error, bound = (action - label) ** 2, self.chosen.clip
+        if bound is not None:
+            bounded = torch.minimum(torch.maximum(action, before - bound), before + bound)
+            error = torch.maximum(error, (bounded - label) ** 2)
+        return error / torch.tensor(STD) ** 2 if self.chosen.loss == "inverse_variance" else error
+
+    def look(self, lesson: Lesson) -> None:
+        """Normalise from now on by all rows that were seen."""
+        self.seen.append(lesson.x.flatten(0, 1))
+        rows = torch.cat(self.seen)
+        self.student.mean.copy_(rows.mean(dim=0))
+        self.student.var.copy_(rows.var(dim=0, correction=0))
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Return the task's document and a teacher."""
+    folder = tmp_path_factory.mktemp("task")
+    task = felt_task(folder)
+    return task, teacher(folder / "teacher.pt", load_task(task), ["priv_proprio"], std=list(STD))
+
+
+@pytest.fixture
+def make(files, monkeypatch):
+    """Return a function that makes a distiller, of five students in three stacks, whose networks and rollouts are float64."""
+    made, (task, file) = [], files
+
+    def distiller(kind: str, chosen: Chosen) -> Distiller:
+        decoders = [f"{{scale: {scale}, weight: {weight}, hidden: [4]}}" for scale, weight in zip(SCALES, WEIGHTS, strict=True)]
+        named = [f"{name}: {own}" for name, own in zip(("object_size", "goal_distance"), decoders, strict=True)]
+        spec = {"steps": STEPS, "gradient_length": LENGTH, "epochs": EPOCHS, "learning_rate": RATE}
+        spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate}
+        spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm")}
+        spec["decoders"] = "{" + ", ".join(named[: chosen.num_decoders]) + "}"
+        widths = {"encoder.hidden": "[5]", "encoder.size": 4, "hidden": "[8]", "touch_encoder.hidden": "[6]"}
+        widths |= {"touch_encoder.size": 6, "convolution.channels": "[2]"} | KINDS[kind]
+        spec |= {f"networks.{name}": value for name, value in widths.items()}
+        loaded = load_task(task, {f"distill.{name}": value for name, value in spec.items()})
+        keys = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 1)
+        own = Teacher(file, loaded)
+        made.append(TouchEnv(loaded, ROWS * len(keys), seed=1, threads=1, feels=feels(keys, own.felt)))
+        bound = own.bound(made[-1])
+        monkeypatch.setattr(rollout, "Stack", partial(Stack, dtype=torch.float64))
+        torch.set_default_dtype(torch.float64)
+        return Distiller(made[-1], loaded, bound, keys, 0)
+
+    yield distiller
+    torch.set_default_dtype(torch.float32)
+    for env in made:
+        env.close()
+
+
+def filled(found: Distiller, generator: torch.Generator) -> list[Lesson]:
+    """Put made-up rollouts where `roll` puts them; return each student's: episodes end at random, features have offsets."""
+    lessons = []
+    for own in found.rollouts:
+        for i in range(len(own.keys)):
+            block = slice(own.first + i * own.rows, own.first + (i + 1) * own.rows)
+            x, before, label, target = (
+                torch.randn((STEPS, ROWS, size), generator=generator)
+                for size in (own.x.shape[-1], 2, 2, found._privileged.shape[-1])
+            )
+            ended = torch.rand((STEPS, ROWS), generator=generator) < 0.3
+            begun = torch.randn((ROWS, own.stack.memory), generator=generator)
+            lesson = Lesson(1.0 + 3.0 * x, 0.5 * before, label, 0.1 * target, ended, begun)
+            lessons.append(lesson)
+            for room, values in (
+                (own.x[:, i], lesson.x),
+                (own.before[:, i], lesson.before),
+                (own.begun[i], lesson.begun),
+                (found._labels[:, block], lesson.label),
+                (found._privileged[:, block], lesson.target),
+                (found._ended[:, block], lesson.ended),
+            ):
+                room.copy_(values)
+    return lessons
+
+
+@pytest.mark.parametrize("chosen", CHOSEN)
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_update_is_that_of_separate_students(make, kind, chosen):
+    """Weights, normalisation and the errors that are told, after several updates."""
+    own = CHOSEN[chosen]
+    found, generator, chance = make(kind, own), torch.Generator().manual_seed(0), random.Random(5)
+    found._chance.seed(5)
+    alone = [Alone(found.student(i), own) for i in range(len(found.keys))]
+    kept: list[list[Lesson]] = []
+    for _ in range(NUM_UPDATES):
+        kept = [*kept, filled(found, generator)][-own.aggregate :]
+        latest = len(kept) - 1
+        passes = [latest] + [chance.randrange(len(kept)) if own.aggregate > 1 else latest for _ in range(EPOCHS - 1)]
+        errors = [[each.passed(kept[i][n], i == latest) for i in passes] for n, each in enumerate(alone)]
+        for each, lesson in zip(alone, kept[-1], strict=True):
+            each.look(lesson)
+        found.learn()
+        told = found._losses * LENGTH / (EPOCHS * STEPS)
+        expected = torch.tensor(errors).mean(dim=1)
+        torch.testing.assert_close(told, expected, rtol=UPDATES, atol=UPDATES)
+    for i, each in enumerate(alone):
+        state = found.student(i).state_dict()
+        for name, value in each.student.state_dict().items():
+            torch.testing.assert_close(state[name], value, rtol=UPDATES, atol=UPDATES)
+    norms = [norm for each in alone for norm in each.norms]
+    assert own.max_grad_norm is None or min(norms) < own.max_grad_norm < max(norms)
