@@ -43,6 +43,14 @@ def test_the_paper_s_numbers():
         assert (algorithm["rnd_cfg"]["learning_rate"], algorithm["rnd_cfg"]["num_outputs"]) == (1e-3, 8)
 
 
+@pytest.mark.parametrize("learner", ["train", "distill"])
+def test_widths_given_alone_leave_the_embeddings_size(tmp_path, learner):
+    """That of touch has 32 numbers, not the 64 of other groups."""
+    own = getattr(load_task(small_task(tmp_path), {f"{learner}.networks.touch_encoder.hidden": "[8]"}).spec, learner)
+    assert (own.networks.touch_encoder.hidden, own.networks.touch_encoder.size) == ((8,), 32)
+    assert own.networks.encoder.size == 64
+
+
 def test_who_sees_what(tmp_path):
     teacher = ["priv_proprio", "goal", "priv_obj_state"]
     found = observed(loaded(tmp_path), GROUPS)

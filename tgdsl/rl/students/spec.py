@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Positive, Quantity, SpecModel
-from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, Widths
+from tgdsl.rl.train.spec import WIDTHS, EncoderSpec, Groups, TouchEncoderSpec, Widths
 
 Whole = Annotated[StrictInt, Field(ge=1)]
 Loss = Literal["mse", "inverse_variance"]
@@ -55,7 +55,7 @@ class StudentNetworksSpec(SpecModel):
     """Its widths; an `lstm` has the last one."""
     touch_kind: Literal["mlp", "lstm", "cnn", "convrnn"] = "mlp"
     """Kind of the network that embeds touch; of types that have no images, `mlp` in place of `cnn`, `lstm` of `convrnn`."""
-    touch_encoder: EncoderSpec = EncoderSpec(hidden=(64, 64), size=32)
+    touch_encoder: TouchEncoderSpec = TouchEncoderSpec()
     """Its widths, likewise."""
     convolution: ConvolutionSpec = ConvolutionSpec()
     """The networks of images."""

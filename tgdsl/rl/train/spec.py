@@ -31,12 +31,21 @@ class EncoderSpec(SpecModel):
     """Size of the embedding."""
 
 
+class TouchEncoderSpec(EncoderSpec):
+    """The network that embeds what is felt."""
+
+    hidden: Widths = (64, 64)
+    """Widths of its hidden layers."""
+    size: Whole = 32
+    """Size of the embedding."""
+
+
 class NetworksSpec(SpecModel):
     """Networks of actor and critic: groups are normalised, each is embedded, and the embeddings are mapped together."""
 
     encoder: EncoderSpec = EncoderSpec()
     """Of each group but touch."""
-    touch_encoder: EncoderSpec = EncoderSpec(hidden=(64, 64), size=32)
+    touch_encoder: TouchEncoderSpec = TouchEncoderSpec()
     """Of `tactile_sensors`."""
     hidden: Widths = WIDTHS
     """Widths of the hidden layers that follow the embeddings."""
