@@ -259,6 +259,28 @@ def test_stop_and_go_on_is_bit_for_bit(make, joint_vel):
     assert torch.equal(fresh.step(actions(env, 1, 1)[0]).reward, expected[0].reward)
 
 
+def test_a_state_from_before_the_first_step_is_gone_on_from_after_some(make):
+    env = make(more=NOISY + RANDOM, seed=1)
+    saved = env.state_dict()
+    expected = [env.step(action) for action in actions(env, 3)]
+    env.load_state_dict(saved)
+    for action, before in zip(actions(env, 3), expected, strict=True):
+        made = env.step(action)
+        assert same(made.obs, before.obs) and torch.equal(made.info.episode_return, before.info.episode_return)
+        assert all(torch.equal(total, before.info.episode_terms[name]) for name, total in made.info.episode_terms.items())
+
+
+def test_what_is_read_is_there_again_after_a_loaded_states_next_step(make):
+    env = make(more="touch: depth\n", seed=1)
+    saved = env.state_dict()
+    env.load_state_dict(saved)
+    for told in (lambda: env.now, env.images):
+        with pytest.raises(SimulationError, match="a state was loaded: what was read then is there again after the next step"):
+            told()
+    env.step(torch.zeros(4, 2))
+    assert env.now.object.pos.shape == (4, 3)
+
+
 @pytest.mark.parametrize("is_begun", [False, True])
 def test_a_state_of_other_environments_changes_nothing(make, is_begun):
     env, other = make(more=NOISY + RANDOM, seed=1), make(more=NOISY + RANDOM, seed=9)
@@ -352,12 +374,18 @@ def test_an_action_that_is_no_number_ends_one_episode(make, more):
 
 
 @pytest.mark.parametrize("simulator", ["mujoco", pytest.param("warp", marks=pytest.mark.slow)])
-def test_an_environment_that_diverges_begins_anew(make, simulator):
+def test_an_environment_that_diverges_begins_anew(make, simulator, monkeypatch):
+    """Its score is that of the step before, as the instant at which it diverged is none."""
     env = make(3, simulator=simulator)
     env.reset(1)
+    count, advance = env.task.keep("count"), env.task.advance
+    monkeypatch.setattr(env.task, "advance", lambda now: (advance(now), count.add_(1.0)))
+    monkeypatch.setattr(env.task, "score", lambda: count)
+    env.step(torch.zeros(3, 2))
     env.sim.qvel[1, 5] = 1e12
     with pytest.warns(UserWarning, match="environments had faults: 1 diverged"):
         made = env.step(torch.zeros(3, 2))
+    assert made.info.score.tolist() == [2.0, 1.0, 2.0]
     assert made.info.faults.tolist() == [False, True, False] == made.terminated.tolist()
     assert made.reward[1] == 0.0 and all(value.isfinite().all() for value in made.obs.values())
     for _ in range(3):

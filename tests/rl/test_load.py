@@ -1,10 +1,12 @@
 """Documents of tasks: what is wrong is told at its place, with what would be right."""
 
 import json
+import sys
 from pathlib import Path
 
 import jsonschema
 import pytest
+import torch
 from ruamel.yaml import YAML
 from tiny_tasks import tiny_env, write_task
 
@@ -129,9 +131,47 @@ def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
     )
     env = TouchEnv(task, 2, threads=1)
     assert isinstance(env.task, InPalmRotate) and env.spec.extra == 4
+    (tmp_path / "near_it.py").write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n")
+    (tmp_path / "other.py").write_text("import near_it\nclass Other(near_it.InPalmRotate):\n    pass\n")
+    paths = list(sys.path)
+    beside = write_task(tmp_path, task="other.py:Other")
+    assert load_task(beside).task.__name__ == "Other" and sys.path == paths
+    del sys.modules["near_it"]
+    task = write_task(tmp_path, task="own.py:Own", more="extra: 4\n")
     task.write_text(task.read_text().replace("extra: 4", "extra: x"))
     (found,) = problems(lambda: load_task(task))
     assert found.path == "extra" and found.line == 8
+
+
+@pytest.mark.parametrize(
+    ("method", "says"),
+    [
+        ("def reward(self, now, is_over):\n        return {}", "Own: `reward` has no terms, expected one at least"),
+        (
+            "def reward(self, now, is_over):\n        return {'a': is_over[:, None] * 1.0}",
+            r'Own: the term "a" of `reward` is of shape \(2, 1\), expected a tensor \(2,\)',
+        ),
+        (
+            "def reward(self, now, is_over):\n        return {'a': 1.0}",
+            r'the term "a" of `reward` is a float, expected a tensor',
+        ),
+        (
+            "def observe(self, now):\n        return {'goal': now.friction}",
+            r'Own: the group "goal" of `observe` is of shape \(2,\), expected a tensor \(2, …\)',
+        ),
+        (
+            "def observe(self, now):\n        return {'proprio': now.joint_pos}",
+            'Own: `observe` has a group "proprio", as all tasks do; call it otherwise',
+        ),
+    ],
+)
+def test_what_a_task_of_ones_own_returns_wrongly_is_named(tmp_path, method, says):
+    (tmp_path / "own.py").write_text(
+        f"from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    {method}\n"
+    )
+    task = write_task(tmp_path, task="own.py:Own")
+    with pytest.raises(SimulationError, match=says):
+        TouchEnv(task, 2, threads=1).step(torch.zeros(2, 2))
 
 
 def test_a_mapping_is_a_document_too(tmp_path, monkeypatch):

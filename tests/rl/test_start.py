@@ -27,6 +27,19 @@ def test_half_heights_are_those_of_each_environments_own_variant(tmp_path):
     env.close()
 
 
+def test_an_object_stands_where_it_would_among_the_environments_of_all_processes(tmp_path):
+    """Whichever variant the first environment of a process has: a box of 50 mm, a cylinder, and after them the sphere again."""
+    task = varied_task(tmp_path)
+    made = [
+        TouchEnv(task, num, threads=1, overrides={"touch": "none"}, first_env=first) for num, first in ((6, 0), (1, 1), (3, 2))
+    ]
+    every, *others = (env.sim.qpos.clone() for env in made)
+    torch.testing.assert_close(torch.cat(others), every[1:5], rtol=0, atol=0)
+    assert len(set(every[:3, 5].tolist())) == 3
+    for env in made:
+        env.close()
+
+
 @pytest.mark.parametrize(("chosen", "heights"), [([2, 0], [0.015, 0.03, 0.015]), ([1], [0.05] * 3)])
 def test_a_task_takes_some_variants_in_its_own_order(tmp_path, chosen, heights):
     """Of one alone nothing is varied: it is the body's own geom."""

@@ -81,6 +81,10 @@ class ActionSpec(SpecModel):
         return self
 
 
+MOST_DELAY = 1000
+"""Longest delay of a target [control steps]: of each environment so many targets are kept."""
+
+
 class DriveSpec(SpecModel):
     """What drives do that ideal ones do not. All may be ranges, drawn for each joint and environment at reset."""
 
@@ -109,6 +113,8 @@ class DriveSpec(SpecModel):
     def _check(self) -> DriveSpec:
         if any(end != int(end) for end in self.delay):
             raise ValueError(f"delay is {self.delay[0]:g} to {self.delay[1]:g} control steps, expected whole numbers")
+        if self.delay[1] > MOST_DELAY:
+            raise ValueError(f"delay is up to {self.delay[1]:g} control steps, expected at most {MOST_DELAY}")
         return self
 
     @property

@@ -136,7 +136,6 @@ class TouchEnv:
         is_small = is_plain and num_envs * self.touch.plan.layout.num_taxels <= MOST_OF_ONE_THREAD
         self._dispatch = below_autograd if is_plain else nullcontext
         self._step_by, self._logic_by = (one_thread if own else nullcontext for own in (is_small, is_plain and not is_small))
-        self._readings: dict[str, Tensor] = {}
         self._prepare(progress or silent, is_compiled)
         self._obs = self.reset(seed)
         self.groups = {name: value.shape[1] for name, value in self._obs.items()}
@@ -178,7 +177,13 @@ class TouchEnv:
 
     @property
     def now(self) -> Now:
-        """The instant that the last observations are of; its tensors hold until the next step."""
+        """The instant that the last observations are of; its tensors hold until the next step.
+
+        Raises:
+            SimulationError: If a state was loaded, which has no instant: it is there again after the next step.
+        """
+        if self._is_loaded:
+            raise SimulationError("a state was loaded: what was read then is there again after the next step")
         return self._instant
 
     def reset(self, seed: int | None = None) -> Observations:
@@ -197,7 +202,7 @@ class TouchEnv:
                 self.touch.seed(seed, self._first_env)
             now = self._now(self.sim.read())
             self._measure(now, everyone)
-            self._obs = self._observe(now)
+            self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
     def step(self, action: Float[Tensor, "env joint"]) -> Step:
@@ -216,7 +221,7 @@ class TouchEnv:
             self._action.copy_(action)
             made = self._call()
             made = saving.copied(made) if self.device.type == "cuda" else made
-        self._obs = made.obs
+        self._obs, self._is_loaded = made.obs, False
         return made._replace(obs=dict(made.obs))
 
     def follow(self, control: Float[Tensor, "env nu"]) -> Step:
@@ -233,20 +238,20 @@ class TouchEnv:
             self.sim.step(self.sim.ctrl)
             now = self._now(self.sim.read())
             self._measure(now)
-            self.task.advance(now)
+            self.task.keep_up(now, self.sim.faults)
             made = self._judged(now, self.sim.faults)
-        self._obs = made.obs
+        self._obs, self._is_loaded = made.obs, False
         return made
 
     def images(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what the policy feels as one image per link, and where its pixels are taxels: see `TactileModule.images`.
 
         Raises:
-            SimulationError: If it feels nothing, or there are several.
+            SimulationError: If it feels nothing, or there are several; or a state was loaded, and no step made since.
         """
         if self._sensed.felt is None:
             raise SimulationError("the policy feels nothing: touch is none; or there are several policies")
-        return self.touch.images(self._sensed.felt, self._readings)
+        return self.touch.images(self._sensed.felt, self.now.readings)
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
         """Return copies of all that the future follows from, but for the policy.
@@ -263,18 +268,18 @@ class TouchEnv:
         Raises:
             SimulationError: If they were others; nothing has changed.
         """
-        sums = [name for name in state.get("episodes", {}) if name.startswith("sums/")]
         own = self._memory() | {"touch": self.touch.state_dict(), "obs": self._obs, "seed": {"seed": torch.tensor(0)}}
-        if not self._episodes.terms:  # no step was made, so that any may be
-            own["episodes"] |= dict.fromkeys(sums, self._episodes.total)
+        own["episodes"], saved = self._episodes.alike(state.get("episodes", {}))
+        state = {**state, "episodes": saved} if "episodes" in state else state
         saving.refuse_other_parts(own, {part: kept for part, kept in state.items() if part != "sim"})
         self.sim.load_state_dict(state.get("sim", {}))  # refuses another one's before it changes
-        self._episodes.expect(tuple(name.removeprefix("sums/") for name in sums))
+        self._episodes.expect(tuple(name.removeprefix("sums/") for name in saved if name.startswith("sums/")))
         for part, memory in self._memory().items():
             saving.restore(memory, state[part])
         self.touch.load_state_dict(dict(state["touch"]))
         self._draws.reseed(int(state["seed"]["seed"]))
         self._obs = {name: value.to(self.device) for name, value in saving.saved(state["obs"]).items()}
+        self._is_loaded = True
         return dict(self._obs)
 
     def close(self) -> None:
@@ -319,7 +324,7 @@ class TouchEnv:
         """Return what a control step has brought, by its readings, and begin episodes where some have ended."""
         sim, now = self.sim, self._now(readings)
         self._measure(now)
-        self.task.advance(now)
+        self.task.keep_up(now, sim.faults)
         made = self._judged(now, sim.faults)
         if may_hold(made.info.ended):
             self._begin(made.info.ended)
@@ -347,7 +352,7 @@ class TouchEnv:
     def _judge(self, now: Now, faults: Bool[Tensor, " env"]) -> Step:
         """Return what a control step has brought, and add it up, as if no episode were to begin."""
         terminated = self.task.is_over(now) | faults
-        rates = self.task.reward(now, terminated)
+        rates = self.task.rates(now, terminated)
         earned = torch.where(faults, 0.0, torch.stack(list(rates.values())) * self._control_step).float()
         reward, terms = earned.sum(dim=0), dict(zip(rates, earned, strict=True))
         self._episodes.add(tuple(rates), earned, reward)
@@ -364,15 +369,9 @@ class TouchEnv:
 
     def _now(self, readings: dict[str, Tensor]) -> Now:
         """Return the instant that readings are of."""
-        self._readings, sim, num = readings, self.sim, self.num_actions
-        watched, none = sim.watched(), self._used[:, :0]
-        contact, distance = self._sensed.contact, self._sensed.distance
-        force, normal_force = none[:, :, None].expand(-1, -1, 3), none
-        if contact:
-            of_links, channels = readings[contact].to(none), self._sensed.channels
-            first = channels.index("force_x")
-            force = of_links[:, :, first : first + 3].contiguous()
-            normal_force = of_links[:, :, channels.index("normal_force")] if "normal_force" in channels else none
+        watched, none, num = self.sim.watched(), self._used[:, :0], self.num_actions
+        distance = self._sensed.distance
+        force, normal_force = self._sensed.forces(readings, self._used)
         self._instant = Now(
             watched=watched,
             object=watched.body(self._sensed.object),
@@ -396,5 +395,5 @@ class TouchEnv:
         felt = self._sensed.observe(now.readings)
         exact = groups.proprio(now)
         proprio = groups.proprio(now, self._speeds.value) if self._speeds else exact
-        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)} | self.task.observe(now)
-        return {name: value.to(self.device, torch.float32) for name, value in own.items()}
+        own = {"proprio": proprio} | felt | {"priv_proprio": groups.priv_proprio(now, exact)}
+        return {name: value.to(self.device, torch.float32) for name, value in (own | self.task.told(now, own)).items()}

@@ -5,6 +5,7 @@ Shapes: `env` environments, `feature` numbers of a group.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -48,6 +49,10 @@ class StepInfo(NamedTuple):
     episode_steps: Int[Tensor, " env"]
     episode_terms: dict[str, Float[Tensor, " env"]]
     faults: Bool[Tensor, " env"]
+
+    def is_whole(self, max_steps: int) -> Bool[Tensor, " env"]:
+        """Return which episodes have lasted as long as one may, in control steps, and were not ended by a fault."""
+        return (self.episode_steps >= max_steps) & ~self.faults
 
 
 class Step(NamedTuple):
@@ -145,6 +150,14 @@ class Episodes:
         """Begin to add up terms of the reward, if that was not begun."""
         if not self.terms:
             self.terms, self.sums = terms, torch.zeros((len(terms), len(self.total)), device=self.total.device)
+
+    def alike(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return what is kept here, and what was saved, both with the sums that either has: before the first step none are."""
+        own, before = self.memory(), dict(saved)
+        for one, other in ((own, saved), (before, self.memory())):
+            if not any(name.startswith("sums/") for name in one):
+                one |= {name: torch.zeros_like(self.total) for name in other if name.startswith("sums/")}
+        return own, before
 
     def memory(self) -> dict[str, Tensor]:
         """Return what is kept, by name: live tensors."""

@@ -111,9 +111,12 @@ def _own_module(name: str, folder: Path) -> Any:
         raise FileNotFoundError(f"there is no file {file}")
     module = importlib.util.module_from_spec(made)
     sys.modules[known] = module
+    sys.path.insert(0, str(file.parent))  # modules beside it, as where Python runs the file
     try:
         made.loader.exec_module(module)
     except BaseException:
         del sys.modules[known]
         raise
+    finally:
+        sys.path.remove(str(file.parent))
     return module

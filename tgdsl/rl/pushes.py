@@ -40,7 +40,7 @@ class PushSpec(SpecModel):
     z: Force = ZERO
     """Force along the world's z [N]."""
     interval: Annotated[Range, RangeOf("time", gt=0.0)] = (2.0, 4.0)
-    """Time from one push to the next, drawn for each [s]."""
+    """Time from the end of one push to the begin of the next, drawn for each [s]."""
     duration: Annotated[float, Quantity("time", gt=0.0)] = 0.025
     """How long a push lasts, rounded up to control steps [s]."""
 

@@ -96,6 +96,22 @@ class Sensed:
         chosen = {name: (made[own.observation], own.columns) for name, own in self.groups.items()}
         return {name: value if own is None else value.index_select(1, own) for name, (value, own) in chosen.items()}
 
+    def forces(
+        self, readings: Mapping[str, Tensor], like: Float[Tensor, "env joint"]
+    ) -> tuple[Float[Tensor, "env link 3"], Float[Tensor, "env loaded"]]:
+        """Return the object's force on each link, and the sum of its normal forces on each, as `Now` has them [N].
+
+        Args:
+            readings: Of the module.
+            like: A tensor of physics' dtype.
+        """
+        none = like[:, :0]
+        if self.contact is None:
+            return none[:, :, None].expand(-1, -1, 3), none
+        of_links, first = readings[self.contact].to(like), self.channels.index("force_x")
+        force = of_links[:, :, first : first + 3].contiguous()
+        return force, of_links[:, :, self.channels.index("normal_force")] if "normal_force" in self.channels else none
+
 
 def compile_sensed(
     loaded: LoadedTask,

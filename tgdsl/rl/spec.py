@@ -129,7 +129,7 @@ class TaskSpec(SpecModel):
     """The scene's keyframe that episodes start from; default: the model's own initial state."""
     physics: PhysicsSpec = PhysicsSpec()
     """How physics is stepped."""
-    episode: Time = 10.0
+    episode: Annotated[float, Quantity("time", gt=0.0), Field(le=1e6)] = 10.0
     """Duration of an episode [s]."""
     touch: TouchType = "force_torque"
     """What a policy feels."""

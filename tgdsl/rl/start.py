@@ -141,6 +141,7 @@ def make_setup(
         links=tuple(rows),
         qpos=sim.qpos[0].clone(),
         half_height=_half_heights(sim, sensed, loaded.spec.object),
+        first_half_height=_first_half_height(sim, sensed),
         variant=((torch.arange(sim.num_envs) + first_env) % num_variants).to(sim.qpos.device),
         num_variants=num_variants,
         friction=sim.properties.friction(sensed.object).to(sim.qpos).clone(),
@@ -163,6 +164,12 @@ def _half_heights(sim: EnvSimulation, sensed: Sensed, name: str) -> Float[Tensor
     each = [half_height(sim.env_model(env), sensed.object, qpos) for env in range(min(num, sim.num_envs))]
     variants = torch.arange(sim.num_envs) % num
     return torch.tensor(each, dtype=sim.qpos.dtype)[variants].to(sim.qpos.device)
+
+
+def _first_half_height(sim: EnvSimulation, sensed: Sensed) -> float:
+    """Return how far the object's first variant reaches below its body's origin [m], whatever the environments here have."""
+    first = SceneModels(sensed.touch.plan.scene).model({})
+    return half_height(first, sensed.object, sim.qpos[0].double().cpu().numpy())
 
 
 def half_height(model: mujoco.MjModel, body: str, qpos: Float[np.ndarray, " nq"]) -> float:

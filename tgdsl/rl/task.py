@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.console.tables import TaxelTable
+from tgdsl.errors import SimulationError
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.grasps.table import GraspTable
@@ -33,7 +34,7 @@ from tgdsl.runtime.simulators.joints import Joints
 from tgdsl.runtime.simulators.start_contacts import Contacts
 from tgdsl.runtime.simulators.state_values import StateValues
 from tgdsl.runtime.simulators.watch import BodyMotion, Watch, Watched
-from tgdsl.tensors.env_ids import put_rows
+from tgdsl.tensors.env_ids import may_hold, put_rows
 
 S = TypeVar("S", bound=TaskSpec)
 
@@ -54,6 +55,7 @@ class Setup:
         links: Bodies of the rows of `Now.link_force`.
         qpos: Where episodes start, before anything is random: the keyframe.
         half_height: How far each environment's object reaches below its body's origin when it stands upright [m].
+        first_half_height: That of its first variant, which stands where the keyframe has it [m].
         variant: Which of its variants each environment's object is, from 0.
         num_variants: How many there are; 1 if the object has none.
         friction: Coefficient of sliding friction of each object: a live tensor, drawn anew before `reset`.
@@ -74,6 +76,7 @@ class Setup:
     links: tuple[str, ...]
     qpos: Float[Tensor, " nq"]
     half_height: Float[Tensor, " env"]
+    first_half_height: float
     variant: Int[Tensor, " env"]
     num_variants: int
     friction: Float[Tensor, " env"]
@@ -220,6 +223,13 @@ class Task(ABC, Generic[S]):
     def advance(self, now: Now) -> None:
         """Bring what is remembered up to date: once per control step, after its physics."""
 
+    def keep_up(self, now: Now, faults: Bool[Tensor, " env"]) -> None:
+        """Bring what is remembered up to date, but for environments with a fault, whose instant is none."""
+        kept = {name: value.clone() for name, value in self.memory.items()} if may_hold(faults) else {}
+        self.advance(now)
+        for name, value in kept.items():
+            put_rows(self.memory[name], faults, value)
+
     @abstractmethod
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return which episodes end for good: not those that merely have lasted long enough."""
@@ -236,6 +246,41 @@ class Task(ABC, Generic[S]):
     @abstractmethod
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return groups of observations beside `proprio`, `tactile_sensors` and `priv_proprio`, which all tasks have."""
+
+    def rates(self, now: Now, is_over: Bool[Tensor, " env"]) -> dict[str, Float[Tensor, " env"]]:
+        """Return what `reward` returns, seen to be that.
+
+        Raises:
+            SimulationError: If it is not: terms (env,), one at least.
+        """
+        found = self.reward(now, is_over)
+        for name, value in found.items():
+            if not isinstance(value, Tensor) or value.shape != is_over.shape:
+                raise self._wrong(f'the term "{name}" of `reward`', value, f"({len(is_over)},)")
+        if not found:
+            raise SimulationError(f"{type(self).__name__}: `reward` has no terms, expected one at least")
+        return found
+
+    def told(self, now: Now, taken: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:
+        """Return what `observe` returns, seen to be that.
+
+        Raises:
+            SimulationError: If it is not: groups (env, feature), of other names than those that are taken.
+        """
+        found, num = self.observe(now), self.setup.num_envs
+        for name, value in found.items():
+            if not isinstance(value, Tensor) or value.ndim != 2 or len(value) != num:
+                raise self._wrong(f'the group "{name}" of `observe`', value, f"({num}, …)")
+            if name in taken:
+                raise SimulationError(
+                    f'{type(self).__name__}: `observe` has a group "{name}", as all tasks do; call it otherwise'
+                )
+        return found
+
+    def _wrong(self, what: str, value: object, expected: str) -> SimulationError:
+        is_tensor = isinstance(value, Tensor)
+        found = f"of shape {tuple(value.shape)}" if is_tensor else f"a {type(value).__name__}"
+        return SimulationError(f"{type(self).__name__}: {what} is {found}, expected a tensor {expected}")
 
     def decoded(self, now: Now) -> dict[str, Float[Tensor, " env"]]:
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""

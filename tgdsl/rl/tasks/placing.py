@@ -41,7 +41,7 @@ def placed(
 ) -> tuple[Float[Tensor, "env nq"], Float[Tensor, "env 3"], Float[Tensor, "env 4"]]:
     """Return `qpos` with the object at its start, and its position [m] and quaternion there, in the world.
 
-    Objects of other heights than the first environment's stand where that one stands.
+    Objects of other heights than the first variant, which the keyframe has, stand where that one stands.
 
     Args:
         setup: What the task is made for.
@@ -54,7 +54,7 @@ def placed(
     found = draws.shares({"placement": 2, "yaw": 1}, episode, chosen)
     xy, yaw = (within(found[name], *own).to(dtype) for name, own in (("placement", spec.xy), ("yaw", spec.yaw)))
     up = torch.eye(3, dtype=dtype, device=setup.device)[2].expand(setup.num_envs, 3)
-    rise = setup.half_height - setup.half_height[:1]
+    rise = setup.half_height - setup.first_half_height
     pos = qpos[:, own.start : own.start + 3] + torch.cat([xy, rise[:, None]], dim=1)
     quat = rotations.product(rotations.about(up, yaw[:, 0]), qpos[:, own.start + 3 : own.stop])
     qpos[:, own] = torch.cat([pos, quat], dim=1)
