@@ -97,6 +97,8 @@ def test_groups_that_are_not_there_are_located(tmp_path):
     [
         ("action.smoothing", 1.0, "action: smoothing is 1, expected less than 1"),
         ("randomise.drive.delay", [0.9, 2.2], "drive: delay is 0.9 to 2.2 control steps, expected whole numbers"),
+        ("randomise.drive.delay", 1e9, r"drive: delay is up to 1e\+09 control steps, expected at most 1000"),
+        ("episode", 1e300, "episode: .*1000000"),
     ],
 )
 def test_what_no_drive_can_do_is_refused(tmp_path, name, value, message):

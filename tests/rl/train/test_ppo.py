@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import io
+import sys
 
 import pytest
 import torch
@@ -134,6 +135,13 @@ def test_what_cannot_be_captured_is_refused_by_name():
         algorithm_of(True, Drifting(NUM_ENVS), use_mixed_precision=True)
     with pytest.raises(TgdslError, match="does without optimizer sgd"):
         algorithm_of(True, Drifting(NUM_ENVS), optimizer="sgd")
+
+
+@pytest.mark.parametrize(("num_envs", "parts", "least"), [(1, 32, 32), (1, 1, 2)])
+def test_a_rollout_of_fewer_rows_than_parts_is_refused(monkeypatch, num_envs, parts, least):
+    monkeypatch.setattr(sys.modules[__name__], "STEPS", 1)
+    with pytest.raises(TgdslError, match=f"are 1 rows of a rollout, expected at least {least}: train.mini_batches is {parts}"):
+        algorithm_of(True, Drifting(num_envs), num_mini_batches=parts)
 
 
 def test_it_goes_on_where_it_was_saved(tmp_path):

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import small_tasks
 import torch
 from small_runs import small_learner
 
@@ -59,6 +60,22 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
     assert other.algorithm.rnd.update_counter == learner.algorithm.rnd.update_counter == 12
     other.iterate()
     assert other.iteration == 4
+
+
+def test_noise_of_a_run_that_goes_on_was_not_drawn_before(tmp_path, monkeypatch):
+    """The module's counts go on, from which its random numbers follow; an earlier checkpoint has none of them."""
+    loose = small_tasks.SENSORS.replace("threshold: 0.1 mm, release_threshold: 0.05 mm", "threshold: 1 mm")
+    monkeypatch.setattr(small_tasks, "SENSORS", loose)
+    run, learner = begun(tmp_path, noise="noisy")
+    run.learn(3, float("inf"))
+    state = read_checkpoint(run._folder.checkpoint)
+    before = learner.env.touch.memory.clock
+    other, _ = small_learner(tmp_path, seed=5, noise="noisy")
+    restore(other, state, run._folder.checkpoint)
+    clock = other.env.touch.memory.clock
+    assert torch.equal(clock.episode, before.episode + 1) and torch.equal(clock.step, before.step + 1)
+    del state["processes"][0]["touch"]
+    restore(other, state, run._folder.checkpoint)
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 """A run's state in one file, from which it goes on; the file is replaced whole, or not at all.
 
 It holds networks, normalisers, optimisers, learning rate, iteration, random generators, and of each environment how often it
-was reset and how long its episode has lasted. Of the physics it holds nothing: a run that goes on begins new episodes, with
-random numbers that were not drawn before, and whose remaining times are as they were; so the file is small, and is written in
-no time. What is lost are the episodes of that moment.
+was reset, how often it was read and how long its episode has lasted. Of the physics it holds nothing: a run that goes on begins
+new episodes, with random numbers that were not drawn before, and whose remaining times are as they were; so the file is small,
+and is written in no time. What is lost are the episodes of that moment.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import torch
 
 from tgdsl.errors import TgdslError
 from tgdsl.files.write import atomic_open
+from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.iteration import Learning
 
 FORMAT = 1
@@ -38,6 +39,7 @@ def state_of(learner: Learning, seconds: float) -> dict[str, Any]:
     own = {
         "resets": env.resets.cpu().clone(),
         "steps": env.steps.cpu().clone(),
+        "touch": {name: getattr(env.touch.memory.clock, name).cpu().clone() for name in _counted(env)},
         "cpu": torch.get_rng_state(),
         "cuda": torch.cuda.get_rng_state(env.device) if env.device.type == "cuda" else None,
     }
@@ -116,10 +118,18 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     if own is None or own["resets"].shape != learner.env.resets.shape:
         return  # of other environments: these begin as in a new run
     learner.env.resets.copy_(own["resets"])
+    for name in _counted(learner.env):
+        if name in own.get("touch", {}):  # an earlier checkpoint has none
+            getattr(learner.env.touch.memory.clock, name).copy_(own["touch"][name])
     learner.go_on(own["steps"].to(learner.env.device))
     torch.set_rng_state(own["cpu"])
     if own["cuda"] is not None and learner.env.device.type == "cuda":
         torch.cuda.set_rng_state(own["cuda"], learner.env.device)
+
+
+def _counted(env: TouchEnv) -> tuple[str, ...]:
+    """Return by which counts of the module's clock its random numbers differ; none if no sensor draws any."""
+    return ("step", "episode") if env.touch.memory.clock.num_envs else ()
 
 
 def _slim(state: Mapping[str, Any]) -> dict[str, Any]:

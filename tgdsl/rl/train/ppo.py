@@ -67,6 +67,10 @@ class CapturedPPO(PPO):
             TgdslError: If something is asked for that cannot be captured.
         """
         _refuse(actor, critic, options)
+        rows, parts = storage.num_envs * storage.num_transitions_per_env, options.get("num_mini_batches", 1)
+        if rows < max(2, parts):
+            what = f"{storage.num_transitions_per_env} steps in {storage.num_envs} environments are {rows} rows of a rollout"
+            raise TgdslError(f"{what}, expected at least {max(2, parts)}: train.mini_batches is {parts}")
         kind = next(actor.parameters()).dtype
         self.rate = torch.zeros((), dtype=torch.float32 if torch.device(device).type == "cuda" else kind, device=device)
         super().__init__(actor, critic, storage, learning_rate=learning_rate, device=device, rnd_cfg=None, **options)
@@ -75,7 +79,6 @@ class CapturedPPO(PPO):
         self._collect_gradients()
         self.losses = torch.zeros(len(LOSSES), dtype=kind, device=device)
         self._kl = self._flat[-1:]
-        rows = storage.num_envs * storage.num_transitions_per_env
         self._rows = rows // self.num_mini_batches
         self._order = torch.zeros(rows // self.num_mini_batches * self.num_mini_batches, dtype=torch.int64, device=device)
         self._obs = storage.observations[0].clone()
