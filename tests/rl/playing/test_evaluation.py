@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from small_tasks import small_task
 
 from tgdsl.rl.env import TouchEnv
@@ -52,7 +53,8 @@ def test_scores_are_those_of_the_task_and_the_same_each_time(env):
 
     found = evaluate(env, Reaches(env), 3)
     assert (found.score, found.envs) == (1.0, 3)
-    assert found.score_interval == pytest.approx((1 - 1.96 * math.sqrt(1 / 3), 1 + 1.96 * math.sqrt(1 / 3)), abs=1e-4)
+    half = 4.302653 * math.sqrt(1 / 3)  # Student's, of two degrees of freedom
+    assert found.score_interval == pytest.approx((1 - half, 1 + half), abs=1e-5)
     again = [evaluate(env, ZeroActor(env), 4) for _ in range(2)]
     assert again[0] == again[1]
 
@@ -60,15 +62,16 @@ def test_scores_are_those_of_the_task_and_the_same_each_time(env):
 def test_what_is_not_known_of_one_episode_is_null(env):
     found = evaluate(env, ZeroActor(env), 1)
     assert found.score_interval == (-math.inf, math.inf)
+    assert str(found).startswith(f"score {found.score:.3f} quarter turns in one episode; ")
     assert json.loads(json.dumps(found.plain(), allow_nan=False))["score_interval"] == [None, None]
 
 
 def test_intervals():
-    """Against NumPy's standard error; and Wilson's interval of 8 of 10, as tables have it."""
-    values = np.random.default_rng(0).normal(3.0, 2.0, 500)
-    low, high = mean_interval(values.mean(), (values**2).sum(), 500)
-    half = 1.959963984540054 * values.std(ddof=1) / math.sqrt(500)
-    assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half))
+    """Against SciPy's, of few episodes and of many; and Wilson's interval of 8 of 10, as tables have it."""
+    for num in (2, 4, 500):
+        values = np.random.default_rng(0).normal(3.0, 2.0, num)
+        expected = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+        assert mean_interval(values.mean(), (values**2).sum(), num) == pytest.approx((expected.low, expected.high))
     assert mean_interval(1.0, 1.0, 1) == (-math.inf, math.inf)
     assert share_interval(0.8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
     assert share_interval(1.0, 1000)[1] == 1.0 and share_interval(0.0, 1000)[0] == pytest.approx(0.0, abs=1e-15)

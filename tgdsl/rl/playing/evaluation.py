@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from scipy.stats import t as student_t
 
 from tgdsl.console.progress import Progress, silent
 from tgdsl.rl.env import TouchEnv
@@ -61,10 +62,8 @@ class Evaluation:
     def __str__(self) -> str:
         low, high = self.score_interval
         least, most = self.held_interval
-        return (
-            f"score {self.score:.3f} {self.unit} (95 %: {low:.3f} to {high:.3f}) in {self.episodes:,} episodes; "
-            f"{self.held:.1%} (95 %: {least:.1%} to {most:.1%}) of full length"
-        )
+        between = f" (95 %: {low:.3f} to {high:.3f}) in {self.episodes:,} episodes" if self.episodes > 1 else " in one episode"
+        return f"score {self.score:.3f} {self.unit}{between}; {self.held:.1%} (95 %: {least:.1%} to {most:.1%}) of full length"
 
 
 def _finite(value: Any) -> Any:
@@ -107,8 +106,7 @@ def evaluate_each(
         info, obs, index = step.info, step.obs, index + 1
         counts = info.ended & (done < quota)
         score = info.score.double()
-        held = (info.episode_steps >= env.max_steps) & ~info.faults
-        told = [score, score.square(), held, info.episode_return, info.episode_steps, info.faults]
+        told = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
         sums += torch.where(counts, torch.stack([value.double() for value in told]), 0.0)
         done += counts
         actor.begin(info.ended)
@@ -138,7 +136,7 @@ def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed
 
 
 def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:
-    """Return the 95 % interval of a mean.
+    """Return the 95 % interval of a mean, Student's.
 
     Args:
         mean: The mean.
@@ -147,7 +145,7 @@ def mean_interval(mean: float, squares: float, num: int) -> tuple[float, float]:
     """
     if num < 2:
         return -math.inf, math.inf
-    half = Z95 * math.sqrt(max(0.0, squares - num * mean**2) / (num - 1) / num)
+    half = float(student_t.ppf(0.975, num - 1)) * math.sqrt(max(0.0, squares - num * mean**2) / (num - 1) / num)
     return mean - half, mean + half
 
 
