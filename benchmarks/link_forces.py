@@ -19,7 +19,7 @@ from tgdsl.rl.playing.policy import policy_for
 
 
 def link_forces(options: argparse.Namespace) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return forces [N] and depths [m], of all links, instants and environments in one row: of episodes that have not ended."""
+    """Return forces [N] and depths [mm], of all links, instants and environments in one row, until episodes end."""
     env = TouchEnv(options.task, options.envs, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
     policy, obs, found, depths = policy_for(env, options.policy), env.reset(), [], []
     going_on = torch.ones(options.envs, dtype=torch.bool)
@@ -29,7 +29,7 @@ def link_forces(options: argparse.Namespace) -> tuple[torch.Tensor, torch.Tensor
         going_on &= ~made.info.ended
         force = torch.linalg.vector_norm(env.now.link_force[going_on], dim=2).flatten()
         found.append(force[force > 0])
-        depth = (-env.now.distance[going_on]).flatten(1)
+        depth = -1e3 * env.now.distance[going_on].flatten(1)
         depth = depth.amax(dim=1) if depth.shape[1] else depth.flatten()  # of a task without such probes
         depths.append(depth[depth > 0])
         policy.begin(made.info.ended)
@@ -49,10 +49,9 @@ def main() -> None:
     for name, values, unit in zip(("forces", "depths"), link_forces(options), ("N", "mm"), strict=True):
         if not len(values):
             continue
-        own = values * (1e3 if unit == "mm" else 1.0)
-        middle, high, largest = (float(torch.quantile(own, share)) for share in (0.5, 0.99, 1.0))
+        middle, high, largest = (float(torch.quantile(values, share)) for share in (0.5, 0.99, 1.0))
         told = f"median {middle:.1f} {unit}, 99 % below {high:.1f}, largest {largest:.1f}"
-        print(f"{options.policy.stem}: {len(own):,} {name}, {told}")
+        print(f"{options.policy.stem}: {len(values):,} {name}, {told}")
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ def _speeds(given: argparse.Namespace, cone: str) -> list[dict[str, Any]]:
     taxels = sum(len(table) for table in env.touch.taxels.values())
     rows = []
     for has_rnd in (False, True):
-        is_there = has_rnd == (document.spec.train.rnd is not None)  # with the document's own numbers
+        is_there = has_rnd == (document.spec.train.rnd != "off")  # with the document's own numbers
         loaded = document if is_there else load_task(given.task, {**overrides, "train.rnd": "{}" if has_rnd else "off"})
         learner = Learner(env, loaded, seed=0)
         for _ in range(WARM):

@@ -120,7 +120,7 @@ class Play:
 
         try:
             with StatusLine() as progress:
-                video(env.sim.env_model(0), record.qpos[:, 0], env.control_step, file, self.camera, progress)
+                video(env.sim.env_model(0), record.poses(0), env.control_step, file, self.camera, progress)
         except VideoError as error:
             print(f"no video: {error}")
         else:

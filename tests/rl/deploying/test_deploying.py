@@ -168,6 +168,19 @@ def test_a_log_is_acted_on_and_moves_nothing(task, policy, tmp_path):
     assert report.scores is None and not report.moves and report.age.median > 0
     assert str(report).startswith(f"no score: {log} has no scene that knows what happened; 1 episode, {len(moments)} control")
     assert str(report).endswith(f"{log} was not moved: actions were computed, and went nowhere")
+    again = list(found.steps(episodes=3))
+    assert [moment.episode for moment in again] == [0] * len(moments)  # no more of it is left
+    parts = list(found.steps(episodes=9, seconds=0.1))
+    assert len(parts) >= len(moments) - 5 and max(moment.episode for moment in parts) >= 2
+
+
+def test_an_episode_that_was_cut_has_no_score_though_there_is_a_scene(task, blind):
+    found = Deployment(task, blind, goal=(1.0,))
+    steps = found.steps()
+    for _ in range(3):
+        next(steps)
+    steps.close()
+    assert str(found.report()).startswith("no score: no episode has ended; 0 episodes, 3 control steps")
 
 
 def test_in_real_time_samples_have_an_age(task, blind):

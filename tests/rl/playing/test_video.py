@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import imageio_ffmpeg
 import mujoco
@@ -10,7 +11,11 @@ import numpy as np
 import pytest
 
 from tgdsl.errors import FileError
+from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing import video as module
+from tgdsl.rl.playing.actions import ZeroActor
+from tgdsl.rl.playing.play import play
+from tgdsl.rl.playing.record import Record
 from tgdsl.rl.playing.video import HEIGHT, WIDTH, VideoError, video
 
 SCENE = """
@@ -21,6 +26,7 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+TASK = Path(__file__).parents[3] / "examples" / "tasks" / "find_ridge.yaml"
 
 
 class Renderer(mujoco.Renderer):
@@ -66,7 +72,7 @@ def frames_of(path):
 def test_each_pose_is_a_frame(opengl, tmp_path):
     heights = np.linspace(0.1, 0.9, 20)
     told, model = [], model_of()
-    assert video(model, heights[:, None], 0.025, tmp_path / "v.mp4", progress=told.append) == tmp_path / "v.mp4"
+    assert video(model, {"qpos": heights[:, None]}, 0.025, tmp_path / "v.mp4", progress=told.append) == tmp_path / "v.mp4"
     size, rate, means = frames_of(tmp_path / "v.mp4")
     assert (size, rate) == ((WIDTH, HEIGHT), 40.0)
     np.testing.assert_allclose(means, heights, atol=0.02)  # of the colours' coding
@@ -78,7 +84,7 @@ def test_each_pose_is_a_frame(opengl, tmp_path):
 def test_short_control_steps_are_thinned_out(opengl, tmp_path):
     """At 5 ms every fourth pose is shown, 50 per second."""
     heights = np.linspace(0.1, 0.9, 21)
-    video(model_of(), heights[:, None], 0.005, tmp_path / "v.mp4")
+    video(model_of(), {"qpos": heights[:, None]}, 0.005, tmp_path / "v.mp4")
     _, rate, means = frames_of(tmp_path / "v.mp4")
     assert rate == 50.0
     np.testing.assert_allclose(means, heights[::4], atol=0.02)
@@ -88,10 +94,10 @@ def test_cameras(opengl, tmp_path):
     """The one that is named, the scene's first, or MuJoCo's free one."""
     without = re.sub("<camera.*?/>", "", SCENE)
     for scene, camera, used in ((SCENE, "left side", "left side"), (SCENE, None, 0), (without, None, -1)):
-        video(model_of(scene), np.zeros((1, 1)), 0.025, tmp_path / "v.mp4", camera=camera)
+        video(model_of(scene), {"qpos": np.zeros((1, 1))}, 0.025, tmp_path / "v.mp4", camera=camera)
         assert Renderer.asked[-1].camera == used
     with pytest.raises(VideoError, match='the scene has no camera "frond"; did you mean "front"'):
-        video(model_of(), np.zeros((1, 1)), 0.025, tmp_path / "v.mp4", camera="frond")
+        video(model_of(), {"qpos": np.zeros((1, 1))}, 0.025, tmp_path / "v.mp4", camera="frond")
 
 
 def test_without_opengl(monkeypatch, tmp_path):
@@ -100,7 +106,7 @@ def test_without_opengl(monkeypatch, tmp_path):
 
     monkeypatch.setattr(mujoco, "Renderer", renderer)
     with pytest.raises(VideoError) as raised:
-        video(model_of(), np.zeros((1, 1)), 0.025, tmp_path / "v.mp4")
+        video(model_of(), {"qpos": np.zeros((1, 1))}, 0.025, tmp_path / "v.mp4")
     assert str(raised.value) == (
         "OpenGL cannot be started (FatalError: gladLoadGL error); without a display set the environment variable MUJOCO_GL to egl "
         "or osmesa"
@@ -108,10 +114,29 @@ def test_without_opengl(monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_bodies_that_are_put_by_mocap_are_where_they_were(opengl, monkeypatch, tmp_path):
+    """The example to copy moves its object so."""
+    env = TouchEnv(TASK, 2, threads=1, overrides={"touch": "none"})
+    record, places = Record(env, 2), []
+    for played in play(env, ZeroActor(env), 2):
+        record.add(played)
+
+    def noted(self, data, camera):
+        self.lifted = 0.0
+        places.append(data.body("ridge").xpos.copy())
+
+    monkeypatch.setattr(Renderer, "update_scene", noted)
+    video(env.sim.env_model(1), record.poses(1), env.control_step, tmp_path / "v.mp4")
+    expected = env.sim.arrays["mocap_pos"][1, 0].numpy()
+    np.testing.assert_allclose(places, [expected] * len(places))
+    assert places and abs(expected[1]) > 1e-4 and "mocap_pos" in record.poses(0)
+    env.close()
+
+
 def test_without_ffmpeg(opengl, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(VideoError, match=r'a video needs imageio-ffmpeg: pip install "tgdsl\[rl\]"'):
-        video(model_of(), np.zeros((1, 1)), 0.025, tmp_path / "v.mp4")
+        video(model_of(), {"qpos": np.zeros((1, 1))}, 0.025, tmp_path / "v.mp4")
 
 
 def test_what_cannot_be_written_is_named_and_not_left(opengl, monkeypatch, tmp_path):
@@ -120,7 +145,7 @@ def test_what_cannot_be_written_is_named_and_not_left(opengl, monkeypatch, tmp_p
     (tmp_path / "encoder").write_text("#!/bin/sh\nhead -c 100 > /dev/null\necho 'No space left on device' >&2\nexit 1\n")
     (tmp_path / "encoder").chmod(0o755)
     with pytest.raises(FileError) as raised:
-        video(model_of(), np.zeros((3, 1)), 0.025, tmp_path / "v.mp4")
+        video(model_of(), {"qpos": np.zeros((3, 1))}, 0.025, tmp_path / "v.mp4")
     assert str(raised.value) == f"{tmp_path}/v.mp4: No space left on device"
     assert (tmp_path / "v.mp4").read_bytes() == b"before" and len(list(tmp_path.iterdir())) == 2
 
@@ -139,5 +164,5 @@ def test_an_interruption_ends_the_encoder(opengl, monkeypatch, tmp_path):
     monkeypatch.setattr(subprocess, "Popen", noted)
     monkeypatch.setattr(Renderer, "render", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        video(model_of(), np.zeros((3, 1)), 0.025, tmp_path / "v.mp4")
+        video(model_of(), {"qpos": np.zeros((3, 1))}, 0.025, tmp_path / "v.mp4")
     assert started[0].returncode is not None and not list(tmp_path.iterdir())

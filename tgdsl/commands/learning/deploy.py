@@ -96,6 +96,7 @@ class Deploy:
         from tgdsl.rl.deploying.record import DeployRecord
 
         record = DeployRecord(found.prepared)
+        failed: TgdslError | None = None
         with tqdm(desc="acting", unit="step", disable=None, leave=False) as bar:
             try:
                 for moment in found.steps(self.episodes, self.seconds):
@@ -103,11 +104,16 @@ class Deploy:
                     bar.update()
             except KeyboardInterrupt:
                 bar.write("interrupted")
-        print(found.report())
-        print("\n".join(record.lines()))
-        if self.out is not None:
-            record.write(self.out)
-            print(f"record: {self.out}")
+            except TgdslError as error:  # a hand that no longer answers: what was done is told nevertheless
+                failed = error
+        if failed is None or record.num_steps:
+            print(found.report())
+            print("\n".join(record.lines()))
+            if self.out is not None:
+                record.write(self.out)
+                print(f"record: {self.out}")
+        if failed is not None:
+            raise failed
 
     def _motion(self) -> Callable[[MjModel], MotionLimits] | None:
         """Return what gives leave to move, if all three limits are given; joint ranges are those of the task's scene.

@@ -6,7 +6,6 @@ import hashlib
 import json
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -92,7 +91,7 @@ class Distill:
             _check_new(folder, asked["resolutions"])
         for part in prepared:
             part.check(is_resumed=self.resume is not None)
-        for line in prepared[0].changes:
+        for line in prepared[0].teacher.changes:
             print(f"changed since the teacher was learned: {line}")
         rows: list[Row] = []
         unit = ""
@@ -171,17 +170,12 @@ class _Part:
         self._loaded = load_task(command.task, self._overrides)
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
-        self._teacher = Teacher(Path(asked["teacher"]), self._loaded)
+        self.teacher = Teacher(Path(asked["teacher"]), self._loaded)
         unit = len(self._keys) * num_variants(self._loaded)
         self.envs = asked["envs"] or max(1, ENVS // unit) * unit
         check_blocks(self.envs, len(self._keys), num_variants(self._loaded))
-        self._felt = feels(self._keys, self._teacher.felt)
+        self._felt = feels(self._keys, self.teacher.felt)
         check_felt(self._loaded, self._felt)
-
-    @property
-    def changes(self) -> Sequence[str]:
-        """What of the task was otherwise when the teacher was learned, a line each."""
-        return self._teacher.changes
 
     def check(self, is_resumed: bool) -> None:
         """See that the folder can be written, that there are such taxels, and that a teacher that feels does so with them.
@@ -194,7 +188,7 @@ class _Part:
 
         self._goes_on = is_resumed and self._folder.checkpoint.is_file()
         check_writable(self._folder.checkpoint)
-        self._teacher.check_taxels()
+        self.teacher.check_taxels()
         if len(self._asked["resolutions"]) > 1:  # else it is compiled next
             compile_sensed(self._loaded, "cpu", feels=self._felt)
 
@@ -216,7 +210,7 @@ class _Part:
         with StatusLine() as progress:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
-            distiller = Distiller(env, loaded, self._teacher.bound(env), self._keys, seed)
+            distiller = Distiller(env, loaded, self.teacher.bound(env), self._keys, seed)
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}

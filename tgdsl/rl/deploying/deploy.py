@@ -202,6 +202,8 @@ class Deployment:
             return
         with self._connected(None) as connection:
             for episode in range(episodes):
+                if connection.is_over:
+                    break
                 if episode:
                     connection.reset()
                 self._approach(connection, actor)
@@ -226,6 +228,7 @@ class Deployment:
             episodes=len(sums.scores) if self.has_scene else max(1, len(sums.are_held)),
             steps=len(sums.inferences),
             scores=Scores.of(sums.scores, sums.are_held) if sums.scores else None,
+            has_scene=self.has_scene,
             age=Quantiles.of(ages) if ages else None,
             inference=Quantiles.of(sums.inferences),
             latency=Quantiles.of(pairs) if ages else None,

@@ -29,6 +29,11 @@ class DeployRecord:
         self._joints = prepared.moved.names
         self._rows: list[dict[str, np.ndarray]] = []
 
+    @property
+    def num_steps(self) -> int:
+        """How many steps it holds."""
+        return len(self._rows)
+
     def add(self, moment: Moment) -> None:
         """Keep one step."""
         row = {name: np.array(getattr(moment, name)) for name in ("episode", "index")}

@@ -65,7 +65,8 @@ class Report:
         unit: Unit of the score.
         episodes: How many there were.
         steps: Control steps of all of them.
-        scores: Their scores; None where no scene says what happened, as on a real hand and of a log.
+        scores: Their scores; None where no scene says what happened, as on a real hand and of a log, or no episode was whole.
+        has_scene: Whether a scene says what happened.
         age: How old the sample was that an action was chosen from; None where nothing runs in real time.
         inference: From a sample to set-points: what it took to observe and to choose.
         latency: Age and inference, of each step together; None where there is no age.
@@ -82,6 +83,7 @@ class Report:
     episodes: int
     steps: int
     scores: Scores | None
+    has_scene: bool
     age: Quantiles | None
     inference: Quantiles
     latency: Quantiles | None
@@ -99,9 +101,10 @@ class Report:
         return "\n".join([self._scored(), self._timed(), *self._moved()])
 
     def _scored(self) -> str:
-        count = f"{self.episodes:,} episode{'s' if self.episodes > 1 else ''}, {self.steps:,} control steps"
+        count = f"{self.episodes:,} episode{'' if self.episodes == 1 else 's'}, {self.steps:,} control steps"
         if self.scores is None:
-            return f"no score: {self.source} has no scene that knows what happened; {count}"
+            why = "no episode has ended" if self.has_scene else f"{self.source} has no scene that knows what happened"
+            return f"no score: {why}; {count}"
         own = self.scores
         between = f" (95 %: {own.interval[0]:.4f} to {own.interval[1]:.4f})" if len(own.each) > 1 else ""
         return f"score {own.mean:.4f} {self.unit}{between}, {own.held:.1%} of full length; {count}"

@@ -67,8 +67,8 @@ class TaskScene(SteppedScene):
             return self.readings
         step = self._env.follow(self._setpoints)
         goal, info = self._env.task.asked().cpu().clone(), step.info
-        ended, is_whole = bool(info.ended), bool((info.episode_steps >= self._env.max_steps) & ~info.faults)
-        self.judged = Judged(goal, float(info.score), ended, is_whole or not ended)
+        ended = bool(info.ended)
+        self.judged = Judged(goal, float(info.score), ended, not ended or bool(info.is_whole(self._env.max_steps)))
         return self.read()
 
     def begin(self) -> dict[str, Tensor]:

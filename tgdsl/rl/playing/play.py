@@ -23,15 +23,15 @@ class Played:
     Attributes:
         index: Its number, from 0.
         obs: Observations that the action was chosen from, by group.
-        qpos: MuJoCo's `qpos` at the start of this step; observations are of one physics step before, but for the first of an
-            episode.
+        poses: MuJoCo's `qpos`, and `mocap_pos` and `mocap_quat` where there are such bodies, (env, …), at the start of this
+            step; observations are of one physics step before, but for the first of an episode.
         action: The action.
         step: What came of it.
     """
 
     index: int
     obs: dict[str, Float[Tensor, "env feature"]]
-    qpos: Float[Tensor, "env nq"]
+    poses: dict[str, Float[Tensor, "env ..."]]
     action: Float[Tensor, "env joint"]
     step: Step
 
@@ -49,6 +49,12 @@ def steps_of(env: TouchEnv, seconds: float | None) -> int:
     return max(1, round(seconds / env.control_step))
 
 
+def poses_of(env: TouchEnv) -> dict[str, Float[Tensor, "env ..."]]:
+    """Return where everything is now, by MuJoCo's names, as `Played.poses`: live tensors."""
+    moved = ("qpos", "mocap_pos", "mocap_quat") if env.sim.model.nmocap else ("qpos",)
+    return {name: env.sim.arrays[name] for name in moved}
+
+
 def play(env: TouchEnv, actor: Actor, num_steps: int, seed: int = 0) -> Iterator[Played]:
     """Begin a new episode in all environments, and yield each control step.
 
@@ -60,8 +66,9 @@ def play(env: TouchEnv, actor: Actor, num_steps: int, seed: int = 0) -> Iterator
     """
     obs = env.reset(seed)
     for index in range(num_steps):
-        qpos, action = env.sim.qpos.clone(), actor(obs)
+        poses = {name: value.clone() for name, value in poses_of(env).items()}
+        action = actor(obs)
         step = env.step(action)
-        yield Played(index, obs, qpos, action, step)
+        yield Played(index, obs, poses, action, step)
         actor.begin(step.info.ended)
         obs = step.obs

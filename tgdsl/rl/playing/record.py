@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tgdsl.files.write import atomic_open
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.play import Played
+from tgdsl.rl.playing.play import Played, poses_of
 from tgdsl.runtime.simulators.memory import refuse_beyond_memory
 
 
@@ -22,10 +22,11 @@ class Record:
     """Keeps steps and writes them.
 
     The file holds, of each control step, its start's `time` (step,) [s], the observations `obs:<group>` (step, env, feature)
-    that the action was chosen from, `qpos` (step, env, nq), the `action` (step, env, joint); and what came of it: `reward`,
-    `term:<name>` (weight and Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. See `Played`. Of each
-    episode that has ended it holds `ended:step`, `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its
-    last observations `ended:obs:<group>` (episode, feature). `joints` and `score_unit` say what joints and scores are.
+    that the action was chosen from, `qpos` (step, env, nq), where there are mocap bodies `mocap_pos` (step, env, body, 3) and
+    `mocap_quat` (step, env, body, 4), the `action` (step, env, joint); and what came of it: `reward`, `term:<name>` (weight and
+    Δt included), `score`, `terminated`, `truncated`, `fault`, (step, env) each. See `Played`. Of each episode that has ended it
+    holds `ended:step`, `ended:env`, `ended:return`, `ended:steps`, `ended:score` (episode,) and its last observations
+    `ended:obs:<group>` (episode, feature). `joints` and `score_unit` say what joints and scores are.
     """
 
     def __init__(self, env: TouchEnv, num_steps: int):
@@ -35,15 +36,16 @@ class Record:
             SimulationError: If this computer has too little memory for so many steps.
         """
         self._env, self._num_steps = env, num_steps
-        numbers = 4 * (sum(env.groups.values()) + env.num_actions) + env.sim.qpos.element_size() * env.sim.qpos.shape[1]
+        self._poses = tuple(poses_of(env))
+        poses = sum(value.element_size() * value[0].numel() for value in poses_of(env).values())
+        numbers = 4 * (sum(env.groups.values()) + env.num_actions) + poses
         refuse_beyond_memory(f"records of {env.num_envs} environments at {num_steps} steps", numbers * env.num_envs * num_steps)
         self._steps: dict[str, np.ndarray] = {}
         self._ended: dict[str, list[np.ndarray]] = {}
 
-    @property
-    def qpos(self) -> Float[np.ndarray, "step env nq"]:
-        """MuJoCo's `qpos` before each step."""
-        return self._steps["qpos"]
+    def poses(self, env: int) -> dict[str, Float[np.ndarray, "step ..."]]:
+        """Return where everything was before each step in one environment, by MuJoCo's names, as `Played.poses`."""
+        return {name: self._steps[name][:, env] for name in self._poses}
 
     def add(self, played: Played) -> None:
         """Keep one step."""
@@ -70,7 +72,7 @@ class Record:
         return {
             "time": np.array(played.index * self._env.control_step),
             **{f"obs:{group}": _numpy(value) for group, value in played.obs.items()},
-            "qpos": _numpy(played.qpos),
+            **{name: _numpy(value) for name, value in played.poses.items()},
             "action": _numpy(played.action),
             "reward": _numpy(step.reward),
             **{f"term:{name}": _numpy(value) for name, value in info.terms.items()},

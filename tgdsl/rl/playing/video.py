@@ -1,4 +1,4 @@
-"""A video of one environment, drawn by MuJoCo with OpenGL from a record of `qpos`, and encoded by ffmpeg.
+"""A video of one environment, drawn by MuJoCo with OpenGL from a record of poses, and encoded by ffmpeg.
 
 Shapes: `step` control steps, `nq` as in MuJoCo's model.
 """
@@ -10,7 +10,7 @@ import copy
 import math
 import subprocess
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def check_camera(model: mujoco.MjModel, camera: str | None) -> None:
 
 def video(
     model: mujoco.MjModel,
-    qpos: Float[np.ndarray, "step nq"],
+    poses: Mapping[str, Float[np.ndarray, "step ..."]],
     control_step: float,
     path: Path,
     camera: str | None = None,
@@ -56,7 +56,7 @@ def video(
 
     Args:
         model: The environment's model.
-        qpos: Its poses, one per control step.
+        poses: Where everything was at each control step, by MuJoCo's names: `qpos`, and `mocap_pos`, `mocap_quat`.
         control_step: Duration of a control step [s].
         path: The file to write, `.mp4`.
         camera: A camera of the scene; default: its first one, or MuJoCo's free camera where it has none.
@@ -68,20 +68,24 @@ def video(
     """
     check_camera(model, camera)
     every = max(1, math.ceil(1.0 / (MAX_RATE * control_step) - 1e-9))
-    shown, encoder = qpos[::every], _encoder()
+    shown, encoder = {name: values[::every] for name, values in poses.items()}, _encoder()
     with closing(_renderer(model)) as renderer, atomic_path(path) as temporary:
-        frames = _told(_frames(model, shown, renderer, camera), len(shown), progress)
+        frames = _told(_frames(model, shown, renderer, camera), len(shown["qpos"]), progress)
         _encode(encoder, frames, 1.0 / (every * control_step), temporary, path)
     return path
 
 
 def _frames(
-    model: mujoco.MjModel, qpos: Float[np.ndarray, "step nq"], renderer: mujoco.Renderer, camera: str | None
+    model: mujoco.MjModel,
+    poses: Mapping[str, Float[np.ndarray, "step ..."]],
+    renderer: mujoco.Renderer,
+    camera: str | None,
 ) -> Iterator[Frame]:
     data = mujoco.MjData(model)
     seen_from = camera if camera is not None else (0 if model.ncam else -1)
-    for pose in qpos:
-        data.qpos[:] = pose
+    for i in range(len(poses["qpos"])):
+        for name, values in poses.items():
+            getattr(data, name)[:] = values[i]
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, seen_from)
         yield renderer.render()
