@@ -11,6 +11,15 @@ from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
 RADIUS = 0.03
 START = (0.0, 0.0, RADIUS)
+RANDOM = """randomise:
+  friction: [0.5, 1.5]
+  mass: [0, 100 g]
+  xy: [-5 mm, 5 mm]
+  yaw: [-0.3, 0.3]
+  drive: {gain: [0.9, 1.1], bias: [-0.01, 0.01], backlash: [0, 0.01], torque_noise: 0.1, delay: [0, 2]}
+  push: {x: [-0.2 N, 0.2 N], interval: [0.05 s, 0.2 s]}
+"""
+NOISY = "noise: noisy\ntouch: depth\n"
 ROBOT = """<mujoco model="tiny">
   <compiler angle="radian" autolimits="true"/>
   <worldbody>
@@ -97,6 +106,32 @@ def tiny_env(
     """Return environments of the tiny task."""
     options = {"threads": 1, **options}
     return TouchEnv(write_task(folder, task, gravity, more), num_envs, **options)
+
+
+def tiny_envs(folder: Path):
+    """Yield a function that makes environments of the tiny task, each in a folder of its own; then close them."""
+    made = []
+
+    def make(*args, **options):
+        own = folder / str(len(made))
+        own.mkdir()
+        made.append(tiny_env(own, *args, **options))
+        return made[-1]
+
+    yield make
+    for env in made:
+        env.close()
+
+
+def actions(env, num, seed=0):
+    """Return random actions of some control steps."""
+    generator = torch.Generator().manual_seed(seed)
+    return [2 * torch.rand((env.num_envs, env.num_actions), generator=generator) - 1 for _ in range(num)]
+
+
+def same(one, other, rows=slice(None)):
+    """Whether two groups of observations are the same to the last bit."""
+    return one.keys() == other.keys() and all(torch.equal(one[name][rows], other[name][rows]) for name in one)
 
 
 class Coasting(InPalmRotate):

@@ -1,0 +1,82 @@
+"""`benchmarks/ablations.py collect`: curves that are kept, and the legs of a run."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up_runs import ITERATIONS, LEGS, PART, ROWS, STEPS, made_up_run
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from ablations_collect import collect, thinned
+from ablations_kept import Taught, read_ablation
+from ablations_page import tables
+from ablations_verdicts import trend
+
+from tgdsl.rl.students.results import Row
+
+STEPS_OF_EACH = ITERATIONS * STEPS * ROWS
+SCORES = {"force": lambda x: 10.0, "bool": lambda x: 8.0, "depth": lambda x: 9.9, "proximity": lambda x: 4.0 * x}
+SCORES |= {"none": lambda x: 1.0}
+
+
+def test_a_score_does_not_count_by_the_episodes_of_others(tmp_path):
+    """The first one drops the object often at first: 99 of 100 episodes; the other one ends an episode, then nine."""
+    names = ["often-x-c-s0", "seldom-x-c-s0"]
+    header = ["iteration", "samples", "seconds", "episodes", *(start + name for start in ("Score/", "Loss/") for name in names)]
+    rows = (("1", "20", "1", "100", "5", "0", "1", "1"), ("2", "40", "2", "10", "5", "1", "1", "1"))
+    curve = [dict(zip(header, row, strict=True)) for row in rows]
+    taught = [Taught(Row("x", "x", "m", "c", 1, 1.0, 0.0, 1.0, 1.0, 10, 20, 1.0), (name,)) for name in names]
+    text = thinned(curve, taught, 1, tmp_path / "curve.csv", np.zeros(2, dtype=bool))
+    assert text.splitlines()[1] == "20,2,5,0.5,1,1"
+
+
+@pytest.mark.parametrize("rows", [60, 15])
+def test_a_thinned_curve_changes_as_much_as_the_whole_one(tmp_path, rows):
+    """A straight line rises by a third of its rise over the last third, in however many points it is kept."""
+    run = made_up_run(tmp_path / "run", SCORES, seeds=1)
+    collect(run, "thin", into=tmp_path / "kept", rows=rows)
+    curves = read_ablation(tmp_path / "kept" / "thin").curves["med"]
+    assert curves.samples[-1] == STEPS_OF_EACH
+    assert trend(curves.samples, curves.score["proximity-hand-clean-s0"]).change == pytest.approx(4.0 / 3.0, rel=5e-3)
+
+
+def started(run, *changes):
+    """Have a run's simulation be of other starts: each the first one but for some of its values and of its document's."""
+    file = run / "med" / "run.json"
+    first = json.loads(file.read_text())["starts"][0]
+    starts = [first | own | {"spec": first["spec"] | spec} for own, spec in changes]
+    file.write_text(json.dumps({"starts": starts}))
+
+
+def test_starts_of_which_no_iteration_is_left_are_no_legs(tmp_path):
+    """One was killed after 250 iterations, its last checkpoint after 240; another one while it evaluated, after the last."""
+    run = made_up_run(tmp_path / "run", SCORES)
+    starts = ((0, "a"), (240, "b"), (240, "c"), (300, "d"))
+    started(run, *(({"iteration": first, "device": device}, {}) for first, device in starts))
+    collect(run, "legs", into=tmp_path / "kept")
+    made = read_ablation(tmp_path / "kept" / "legs").made["simulations"]["med"]
+    assert made["begun"] == list(LEGS) and made["devices"] == ["a", "c"]
+    assert "on a, c: 100 environments, 25.0 min in 2 legs. " in tables(tmp_path / "kept")
+
+
+def test_what_is_part_of_an_episode_follows_from_its_own_leg(tmp_path):
+    """The second leg's episodes are a quarter as long: five iterations of it are left out, and 17 of the first one as before."""
+    run = made_up_run(tmp_path / "run", SCORES)
+    started(run, ({"iteration": 0}, {}), ({"iteration": 240}, {"episode": 2.5}))
+    curve = run / "med" / "curve.csv"
+    with curve.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows[245 : 240 + PART]:
+        row |= {name: "7" for name in row if name.startswith("Score/")}
+    with curve.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    collect(run, "legs", into=tmp_path / "kept")
+    score = read_ablation(tmp_path / "kept" / "legs").curves["med"].score["bool-hand-clean-s0"]
+    assert np.flatnonzero(np.isnan(score)).tolist() == [0, 1, 2, 48]
+    assert score[3] == 8.0 and score[49:51].tolist() == [7.0, 7.0]
