@@ -42,6 +42,7 @@ def problems(call):
         ("touch: forse\n", 8, "touch", "force"),
         ("episode: -1 s\n", 7, "episode", "more than 0"),
         ("physics: {cone: round}\n", 8, "physics.cone", "elliptic"),
+        ("physics: {solref: [9 ms, 1]}\n", 8, "physics", "expected at least two timesteps, 0.01 s"),
         ("physics: {substeps: 0}\n", 8, "physics.substeps", "1"),
         ("action: {scale: 3 mm}\n", 8, "action.scale", "unit of angle"),
         ("action: {mode: absolute, scale: 0.2}\n", 8, "action", "absolute actions have none"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictInt
+from pydantic import Field, StrictInt, model_validator
 
 from tgdsl.fields.models import NonNegative, Number, Positive, Quantity, Radius, Range, RangeOf, SpecModel
 from tgdsl.rl.actuation import ONE, ZERO, ActionSpec, DriveSpec, Factor
@@ -74,6 +74,13 @@ class PhysicsSpec(SpecModel):
     """On a GPU, capacity for contacts per environment."""
     njmax: Whole | None = None
     """On a GPU, capacity for rows of constraints in each environment."""
+
+    @model_validator(mode="after")
+    def _check(self) -> PhysicsSpec:
+        if self.solref is not None and self.solref[0] < 2.0 * self.timestep:
+            least = f"expected at least two timesteps, {2 * self.timestep:g} s: MuJoCo would take that"
+            raise ValueError(f"solref has a time constant of {self.solref[0]:g} s, {least}")
+        return self
 
     @property
     def options(self) -> dict[str, Any]:
