@@ -4,11 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from paper_drives import PAPER
 from warp_cases import warp
 
 import tgdsl
 from tgdsl.errors import SimulationError
-from tgdsl.rl.actuation import BREAKAWAY_SPEED, PAPER, ActionSpec, Actuation, Actuators, DriveSpec
+from tgdsl.rl.actuation import BREAKAWAY_SPEED, ActionSpec, Actuation, Actuators, DriveSpec
 from tgdsl.rl.draws import Draws
 from tgdsl.runtime.batch.simulation import BatchSimulation
 

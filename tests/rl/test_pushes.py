@@ -106,4 +106,3 @@ def test_only_chosen_environments_begin_anew():
 def test_what_cannot_be_is_named():
     with pytest.raises(SimulationError, match=r"pushes every 0.01 s, more often than control steps of 0.025 s"):
         begun(PushSpec(x=(1.0, 1.0), interval=(0.01, 1.0)))
-    assert PushSpec().is_off and not PAPER.is_off

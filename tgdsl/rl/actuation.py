@@ -124,19 +124,6 @@ class DriveSpec(SpecModel):
         return all(getattr(self, name) == getattr(ideal, name) for name in type(self).model_fields if name != "delay")
 
 
-PAPER = DriveSpec(
-    gain=(0.95, 1.05),
-    damping=(0.95, 1.05),
-    strength=(0.95, 1.05),
-    bias=(-0.01, 0.01),
-    deadband=(0.0, 0.005),
-    backlash=(0.0, 0.01),
-    kick=(0.9, 1.1),
-    torque_noise=0.1,
-)
-"""The paper's ranges; its bias in rad."""
-
-
 @dataclass(frozen=True, eq=False)
 class Actuators:
     """The position actuators of some joints, and where both stand in a model.

@@ -44,11 +44,6 @@ class PushSpec(SpecModel):
     duration: Annotated[float, Quantity("time", gt=0.0)] = 0.025
     """How long a push lasts, rounded up to control steps [s]."""
 
-    @property
-    def is_off(self) -> bool:
-        """Whether no force is ever exerted."""
-        return self.x == self.y == self.z == ZERO
-
 
 class Pushes:
     """The pushes of all environments.

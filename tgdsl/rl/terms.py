@@ -33,12 +33,10 @@ def action_rate(now: Now) -> Float[Tensor, " env"]:
     return (now.action - now.last_action).square().sum(dim=1)
 
 
-def joint_limit(
-    now: Now, low: Float[Tensor, " joint"], high: Float[Tensor, " joint"], share: float = FREE_SHARE
-) -> Float[Tensor, " env"]:
-    """Return how far joints are beyond the middle share of their ranges, summed [rad]."""
+def joint_limit(now: Now, low: Float[Tensor, " joint"], high: Float[Tensor, " joint"]) -> Float[Tensor, " env"]:
+    """Return how far joints are beyond the middle `FREE_SHARE` of their ranges, summed [rad]."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    return ((now.joint_pos - middle).abs() - share * half).clamp(min=0.0).sum(dim=1)
+    return ((now.joint_pos - middle).abs() - FREE_SHARE * half).clamp(min=0.0).sum(dim=1)
 
 
 def work(now: Now) -> Float[Tensor, " env"]:

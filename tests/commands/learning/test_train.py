@@ -161,6 +161,16 @@ def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):
     assert 'to learn needs rsl-rl-lib, and what that needs: pip install "tgdsl[rl]" (' in fails("train", "task.yaml", *ON)
 
 
+def test_an_evaluation_tells_which_variants_it_leaves_out(base, here):
+    sensors = base / "sensors.yaml"
+    varied = "{body: item, variants: [{type: box, size: [2 cm, 2 cm, 2 cm]}, {type: sphere, size: [2 cm]}]}"
+    sensors.write_text(sensors.read_text().replace("{body: item}", varied))
+    for envs, says in ((1, ['of the 2 variants of "item" 1 is played: there are no more environments']), (2, [])):
+        code, out, error = here(base, "evaluate", "task.yaml", "--episodes", "2", "--envs", str(envs))
+        assert code == 0, error
+        assert out.splitlines()[:-1] == says
+
+
 def test_mistakes(fails, here, base):
     assert "there is no run to go on with: run.json is missing or empty" in fails("train", "task.yaml", *ON, "--resume", "none")
     assert "train.clip: -1 is out of range, expected more than 0" in fails("train", "task.yaml", *ON, "--set", "train.clip=-1")

@@ -219,8 +219,11 @@ def test_a_clip_bounds_from_where_a_pass_begins(make, kind):
 
 @pytest.mark.parametrize("kind", ["mlp", "convrnn"])
 def test_to_stop_and_go_on_is_to_go_on(make, tmp_path, kind):
-    """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes anew."""
-    chosen = {"networks__touch_kind": kind, "std": 0.1, "max_grad_norm": 0.5, "decoders": "{}"}  # no decoders: a loaded state has no instant
+    """To the bit, where the environments are put where they were; otherwise a checkpoint begins episodes anew.
+
+    Without decoders: what they tell is of an instant, which a loaded state does not have.
+    """
+    chosen = {"networks__touch_kind": kind, "std": 0.1, "max_grad_norm": 0.5, "decoders": "{}"}
     one, other = make(**chosen), make(**chosen)
     for _ in range(2):
         one.iterate()

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from paper_drives import PAPER
 from scipy.spatial.transform import Rotation
 from task_records import Recorder
 from tiny_tasks import tiny_env
 
 from tgdsl.errors import SpecError
-from tgdsl.rl.actuation import PAPER
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task

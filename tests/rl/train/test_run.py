@@ -15,10 +15,11 @@ import torch
 from small_runs import small_learner
 
 from tgdsl.errors import FileError, TgdslError
+from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.differences import differences
 from tgdsl.rl.train import folder as folders
 from tgdsl.rl.train.checkpoint import CheckpointError, read_checkpoint, restore, state_of, write_checkpoint
-from tgdsl.rl.train.folder import RunFolder, made_from
+from tgdsl.rl.train.folder import RunFolder, documents, made_from
 from tgdsl.rl.train.run import DivergedError, Run
 
 EVERY = 1e-9
@@ -169,6 +170,16 @@ def test_the_first_rows_of_a_curve_may_have_no_episodes(tmp_path):
     assert found == [("0", "nan", True), ("4", "8", False), ("0", "nan", True)]
 
 
+def test_a_task_of_ones_own_is_kept_with_its_documents(tmp_path):
+    file = small_tasks.small_task(tmp_path)
+    assert sorted(documents(load_task(file))) == ["sensors.yaml", "task.yaml"]
+    own = tmp_path / "own.py"
+    own.write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Own(InPalmRotate):\n    pass\n")
+    file.write_text(file.read_text().replace("task: in_palm_rotate", "task: own.py:Own"))
+    found = documents(load_task(file))
+    assert sorted(found) == ["own.py", "sensors.yaml", "task.yaml"] and found["own.py"].samefile(own)
+
+
 def test_how_documents_differ():
     before = {"a": {"b": 1, "c": [1, 2]}, "d": 2.0}
     assert differences(before, {"a": {"b": 3, "c": [1, 2]}, "e": 4}) == ["a.b: 1, now 3", "d: 2.0, now null", "e: null, now 4"]
@@ -227,11 +238,7 @@ owner, name = {
 before = getattr(owner, name)
 
 def killed(*arguments, **named):
-    if place in ("curve", "replacing"):
-        before(*arguments, **named)
-    elif place == "writing":
-        pass
-    else:
+    if place != "writing":
         before(*arguments, **named)
     os.kill(os.getpid(), signal.SIGKILL)
 

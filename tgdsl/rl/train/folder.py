@@ -1,7 +1,7 @@
 """A run's folder: what it was made from, where it stands, and what it has learned.
 
 - `run.json`: the task with all that its document leaves out, overrides, seed, versions, hashes; an entry per start
-- `task.yaml` and the sensors' document: as they were found
+- `task.yaml`, the sensors' document, the module of a task of one's own: as they were found
 - `taxels.csv`: the taxels of all sensors
 - `curve.csv`: a row per iteration
 - `checkpoint.pt`: what it goes on from
@@ -19,6 +19,7 @@ import json
 import platform
 import re
 import shutil
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -178,11 +179,14 @@ class RunFolder:
 
 
 def documents(loaded: LoadedTask) -> dict[str, Path]:
-    """Return the files of the task's and the sensors' documents, those that are files, by the names of their copies.
+    """Return the files of the task's and the sensors' documents, and of a task of one's own, by the names of their copies.
 
-    Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
+    Of documents that are files. Two files of one name have that of their folder before it, as in `sub_palm.yaml`.
     """
     own = [file for file in (Path(loaded.source.file), loaded.folder / loaded.spec.document) if file.is_file()]
+    module = sys.modules.get(loaded.task.__module__)
+    if not loaded.task.__module__.startswith("tgdsl.") and module is not None and module.__file__:
+        own.append(Path(module.__file__))
     if len({file.name for file in own}) == len(own):
         return {file.name: file for file in own}
     return {f"{file.resolve().parent.name}_{file.name}": file for file in own}
