@@ -63,6 +63,23 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
     assert other.iteration == 4
 
 
+@pytest.mark.parametrize(("before", "now"), [({}, {"train__rnd": "off"}), ({"train__rnd": "off"}, {})])
+def test_distillation_is_turned_on_and_off_where_a_run_goes_on(tmp_path, before, now):
+    """The networks that act go on; RND that is new begins with weights of its own."""
+    run, learner = begun(tmp_path, **before)
+    run.learn(2, float("inf"))
+    state = read_checkpoint(run._folder.checkpoint)
+    other, _ = small_learner(tmp_path, seed=5, **now)
+    restore(other, state, run._folder.checkpoint)
+    for model in ("actor", "critic"):
+        one, two = (getattr(each.algorithm, model).state_dict() for each in (learner, other))
+        assert all(torch.equal(one[name], two[name]) for name in one)
+    rnd = other.algorithm.rnd
+    assert rnd is None if now else rnd.update_counter == 0
+    found = other.iterate().told
+    assert found["Loss/value"] > 0 and (found["Loss/rnd"] > 0) == (not now)
+
+
 def test_noise_of_a_run_that_goes_on_was_not_drawn_before(tmp_path, monkeypatch):
     """The module's counts go on, from which its random numbers follow; an earlier checkpoint has none of them."""
     loose = small_tasks.SENSORS.replace("threshold: 0.1 mm, release_threshold: 0.05 mm", "threshold: 1 mm")
@@ -75,6 +92,13 @@ def test_noise_of_a_run_that_goes_on_was_not_drawn_before(tmp_path, monkeypatch)
     restore(other, state, run._folder.checkpoint)
     clock = other.env.touch.memory.clock
     assert torch.equal(clock.episode, before.episode + 1) and torch.equal(clock.step, before.step + 1)
+    fewer, _ = small_learner(tmp_path, num_envs=2, noise="noisy")
+    restore(fewer, state, run._folder.checkpoint)
+    assert torch.equal(torch.get_rng_state(), state["processes"][0]["cpu"])
+    fewer.iterate()
+    clock = fewer.env.touch.memory.clock
+    for now, drawn in ((clock.episode, before.episode), (clock.step, before.step), (fewer.env.resets, learner.env.resets)):
+        assert now.min() > drawn.max() > 1
     del state["processes"][0]["touch"]
     restore(other, state, run._folder.checkpoint)
 

@@ -3,14 +3,15 @@
 It holds networks, normalisers, optimisers, learning rate, iteration, random generators, and of each environment how often it
 was reset, how often it was read and how long its episode has lasted. Of the physics it holds nothing: a run that goes on begins
 new episodes, with random numbers that were not drawn before, and whose remaining times are as they were; so the file is small,
-and is written in no time. What is lost are the episodes of that moment.
+and is written in no time. What is lost are the episodes of that moment. Other numbers of environments or processes go on from
+it too, with episodes that begin as in a new run.
 """
 
 from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     """Have a learner go on from a checkpoint; what its physics was has gone.
 
     Args:
-        learner: The learner, of the same groups, networks and number of environments.
+        learner: The learner, of the same groups and networks.
         state: What the checkpoint holds.
         file: Its file, for errors.
 
@@ -107,7 +108,10 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
         CheckpointError: If it is of other groups or networks.
     """
     rank = learner.ranks.rank
-    if state["groups"] != learner.groups:
+    names = state["groups"].keys() | learner.groups.keys()
+    if state["groups"].keys() ^ learner.groups.keys() == {"rnd_state"}:  # RND was turned on or off
+        names -= {"rnd_state"}
+    if any(state["groups"].get(name) != learner.groups.get(name) for name in names):
         raise CheckpointError(f"{file}: learned from the groups {state['groups']}, not {learner.groups}")
     try:
         learner.load_state_dict(state)
@@ -115,16 +119,28 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
         raise CheckpointError(f"{file}: its networks are of other sizes: {str(error).splitlines()[-1].strip()}") from error
     learner.iteration, learner.samples = state["iteration"], state["samples"]
     own = state["processes"][rank] if rank < len(state["processes"]) else None
-    if own is None or own["resets"].shape != learner.env.resets.shape:
-        return  # of other environments: these begin as in a new run
-    learner.env.resets.copy_(own["resets"])
-    for name in _counted(learner.env):
-        if name in own.get("touch", {}):  # an earlier checkpoint has none
-            getattr(learner.env.touch.memory.clock, name).copy_(own["touch"][name])
-    learner.go_on(own["steps"].to(learner.env.device))
+    if own is not None and own["resets"].shape == learner.env.resets.shape:
+        _count_on(learner.env, [own])
+        learner.go_on(own["steps"].to(learner.env.device))
+    else:
+        _count_on(learner.env, state["processes"])
+    if own is None:
+        return
     torch.set_rng_state(own["cpu"])
     if own["cuda"] is not None and learner.env.device.type == "cuda":
         torch.cuda.set_rng_state(own["cuda"], learner.env.device)
+
+
+def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:
+    """Have environments go on to draw what was not drawn: each from its own counts, or all from the largest of any."""
+    counts = {"resets": env.resets} | {name: getattr(env.touch.memory.clock, name) for name in _counted(env)}
+    for name, own in counts.items():
+        kept = [each["resets"] if name == "resets" else each.get("touch", {}).get(name) for each in processes]
+        found = [value for value in kept if value is not None]  # an earlier checkpoint has none of touch
+        if len(found) == 1 and found[0].shape == own.shape:
+            own.copy_(found[0])
+        elif found:
+            own.fill_(max(int(value.max()) for value in found))
 
 
 def _counted(env: TouchEnv) -> tuple[str, ...]:

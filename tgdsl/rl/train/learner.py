@@ -110,13 +110,14 @@ class Learner:
         return {"algorithm": algorithm.save(), "rnd_steps": algorithm.rnd.update_counter if algorithm.rnd else 0}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved; it may hold more than `state_dict` returned.
+        """Go on from what was saved; it may hold more than `state_dict` returned. RND that was off until then begins anew.
 
         Raises:
             RuntimeError: If networks are of other sizes; likewise ValueError and KeyError.
         """
-        self.algorithm.load(dict(state["algorithm"]), None, True)
-        if self.algorithm.rnd:
+        saved, has_rnd = dict(state["algorithm"]), "rnd_state_dict" in state["algorithm"]
+        self.algorithm.load(saved, dict.fromkeys(("actor", "critic", "optimizer", "iteration"), True) | {"rnd": has_rnd}, True)
+        if self.algorithm.rnd and has_rnd:
             self.algorithm.rnd.update_counter = state["rnd_steps"]
 
     def change_rates(self, before: Mapping[str, Any]) -> None:
