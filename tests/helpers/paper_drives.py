@@ -1,4 +1,4 @@
-"""The ranges of drives that the paper randomises."""
+"""The ranges of drives that the paper randomises (Chung et al., *Tactile Genesis*, appendix, "Domain Randomization")."""
 
 from tgdsl.rl.actuation import DriveSpec
 

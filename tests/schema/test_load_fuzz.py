@@ -3,6 +3,7 @@
 import warnings
 from pathlib import Path
 
+import pytest
 from documents import DOCUMENT, valid, write
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -43,6 +44,8 @@ def places(value: object, path: tuple = ()) -> list[tuple]:
 def test_a_radius_of_a_metre_is_warned_of_and_no_error():
     document = valid()
     document["robot"]["layout"]["resolutions"]["low"]["b"]["points"][0]["radius"] = 1
+    with pytest.warns(UserWarning, match=r"points\[0\]\.radius: found 1 m, usually at most 0\.1 m"):
+        assert load(document).problems == []
     never_another_error(document)
 
 

@@ -41,11 +41,9 @@ class Evaluate:
         """Play, and print."""
         from tgdsl.files.write import atomic_write, check_writable, with_folder
         from tgdsl.rl.env import TouchEnv
-        from tgdsl.rl.load import load_task
         from tgdsl.rl.playing.actions import ZeroActor
         from tgdsl.rl.playing.evaluation import SEED, evaluate
         from tgdsl.rl.playing.policy import card_of, policy_for
-        from tgdsl.rl.sensed import num_variants
 
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
@@ -57,14 +55,14 @@ class Evaluate:
             card_of(self.policy)
         seed = SEED if self.seed is None else self.seed
         envs = min(self.envs, self.episodes)
-        loaded = load_task(self.task, parsed_overrides(self.set))
-        variants = num_variants(loaded)
-        if envs < variants:
-            played = "1 is" if envs == 1 else f"the first {envs} are"
-            print(f'of the {variants} variants of "{loaded.spec.object}" {played} played: there are no more environments')
         with StatusLine() as progress:
-            env = TouchEnv(loaded, envs, device=self.device, seed=seed, progress=progress)
+            overrides = parsed_overrides(self.set)
+            env = TouchEnv(self.task, envs, device=self.device, seed=seed, overrides=overrides, progress=progress)
         try:
+            variants = env.task.setup.num_variants
+            if envs < variants:
+                played = "1 is" if envs == 1 else f"the first {envs} are"
+                print(f'of the {variants} variants of "{env.spec.object}" {played} played: there are no more environments')
             actor = ZeroActor(env) if self.policy is None else policy_for(env, self.policy, self.groups)
             for line in actor.changes:
                 print(f"changed since the policy was learned: {line}")
