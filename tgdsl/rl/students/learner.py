@@ -11,6 +11,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,7 +27,7 @@ from tgdsl.rl.students.keys import StudentKey, architecture, groups_of, seen_by
 from tgdsl.rl.students.rollout import Rollout, joined
 from tgdsl.rl.students.student import Architecture, Student, forgotten
 from tgdsl.rl.students.teacher import BoundTeacher
-from tgdsl.rl.train.graphs import Captured
+from tgdsl.rl.train.graphs import Captured, SideBySide
 from tgdsl.rl.train.iteration import Clock, EpisodeTally, Iteration
 from tgdsl.rl.train.ranks import Ranks
 from tgdsl.tensors.torch_internals import copy_each
@@ -169,35 +170,42 @@ class Distiller:
     def _choose(self) -> None:
         """Have the teacher say what should be done, and each student act."""
         with torch.no_grad():
-            self._label.copy_(self._teacher(self._seen))
-            for own, x in zip(self.rollouts, self._inputs, strict=True):
-                x.copy_(own.inputs(self._seen))
-                made = own.stack(x, own.memory)
-                own.memory.copy_(made.memory)
-                self._asked[own.envs].copy_(made.action.flatten(0, 1))
+            acting = [partial(self._act, own, x) for own, x in zip(self.rollouts, self._inputs, strict=True)]
+            self._beside([lambda: self._label.copy_(self._teacher(self._seen)), *acting])
             self._action.copy_(self._asked)
             if self._spec.std:
                 self._action.add_(torch.randn_like(self._action), alpha=self._spec.std)
 
+    def _act(self, own: Rollout, x: Tensor) -> None:
+        """Have a stack act."""
+        x.copy_(own.inputs(self._seen))
+        made = own.stack(x, own.memory)
+        own.memory.copy_(made.memory)
+        self._asked[own.envs].copy_(made.action.flatten(0, 1))
+
     def _answer(self) -> None:
         """Have the students say what they would ask for now in the rollout: an earlier one's a_0 bounds nothing any more."""
         with torch.no_grad():
-            for own in self.rollouts:
-                memory = own.begun
-                for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
-                    made = own.stack(x, memory)
-                    before.copy_(made.action)
-                    memory = forgotten(made.memory, own.split(ended))
+            self._beside([partial(self._answer_by, own) for own in self.rollouts])
+
+    def _answer_by(self, own: Rollout) -> None:
+        memory = own.begun
+        for x, before, ended in zip(own.x, own.before, self._ended, strict=True):
+            made = own.stack(x, memory)
+            before.copy_(made.action)
+            memory = forgotten(made.memory, own.split(ended))
 
     def _epoch(self) -> None:
         """Go through the rollout once."""
-        spec, held = self._spec, [own.begun for own in self.rollouts]
-        for first in range(0, spec.steps, spec.gradient_length):
-            steps, count = slice(first, first + spec.gradient_length), 0
-            for i, own in enumerate(self.rollouts):
-                errors, held[i] = self._descend(own, steps, held[i])
-                self._losses[count : count + len(own.keys)] += errors
-                count += len(own.keys)
+        each = self._losses.split([len(own.keys) for own in self.rollouts])
+        self._beside([partial(self._pass, own, errors) for own, errors in zip(self.rollouts, each, strict=True)])
+
+    def _pass(self, own: Rollout, errors: Float[Tensor, " student"]) -> None:
+        """Have a stack go through the rollout once; add the errors of its actions."""
+        memory = own.begun
+        for first in range(0, self._spec.steps, self._spec.gradient_length):
+            found, memory = self._descend(own, slice(first, first + self._spec.gradient_length), memory)
+            errors += found
 
     def _descend(self, own: Rollout, steps: slice, memory: Tensor) -> tuple[Float[Tensor, " student"], Tensor]:
         """Take one gradient step of a stack; return the errors of its actions, and what it remembers then."""
@@ -222,9 +230,11 @@ class Distiller:
 
     def _look(self) -> None:
         """Take what was seen into account in the students' normalisation."""
-        for own in self.rollouts:
-            for x in own.x:
-                own.stack.look(x)
+        self._beside([partial(self._look_by, own) for own in self.rollouts])
+
+    def _look_by(self, own: Rollout) -> None:
+        for x in own.x:
+            own.stack.look(x)
 
     # The rest
 
@@ -253,6 +263,7 @@ class Distiller:
         self._losses = torch.zeros(len(self.keys), device=device)
         self._scores = torch.zeros((2, num), dtype=torch.float64, device=device)
         has_tf32 = spec.precision == "tf32"
+        self._beside = SideBySide(1 + len(self.rollouts), device)
         self._chosen = Captured(self._choose, device, has_tf32)
         self._answered = Captured(self._answer, device, has_tf32)
         self._learned = Captured(self._epoch, device, has_tf32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Generic, TypeVar
 
 import torch
@@ -78,6 +78,31 @@ class Captured(Generic[T]):
             if was_enabled:
                 gc.enable()
         return graph, made
+
+
+class SideBySide:
+    """Works that neither read nor write what another one writes: on a GPU each on a stream of its own, on a CPU in turn.
+
+    Small kernels of one leave room for those of others. Within a `Captured` function they are parallel branches of its graph.
+    """
+
+    def __init__(self, count: int, device: torch.device | str):
+        """Take how many there are at most, and where their tensors are."""
+        is_cuda = torch.device(device).type == "cuda"
+        self._streams = [torch.cuda.Stream(device) for _ in range(count)] if is_cuda else None
+
+    def __call__(self, works: Sequence[Callable[[], T]]) -> list[T]:
+        """Do them; return what each returns. What is enqueued after them waits for all."""
+        if self._streams is None:
+            return [work() for work in works]
+        made, current = [], torch.cuda.current_stream(self._streams[0].device)
+        for stream, work in zip(self._streams[: len(works)], works, strict=True):
+            stream.wait_stream(current)
+            with torch.cuda.stream(stream):
+                made.append(work())
+        for stream in self._streams[: len(works)]:
+            current.wait_stream(stream)
+        return made
 
 
 @contextlib.contextmanager
