@@ -1,0 +1,81 @@
+"""Students on a GPU: captured, and side by side on streams of their own, they learn what they learn in turn."""
+
+import pytest
+import torch
+from felt_tasks import felt_task
+from written_teachers import teacher
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.students.keys import feels, student_keys
+from tgdsl.rl.students.learner import Distiller
+from tgdsl.rl.students.teacher import Teacher
+from tgdsl.rl.train.graphs import Captured, SideBySide
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU"),
+    pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning"),
+]
+SMALL = {
+    "distill.steps": 4,
+    "distill.std": 0.1,
+    "distill.clip": 0.05,
+    "distill.aggregate": 2,
+    "distill.precision": "float32",
+    "distill.decoders": "{object_size: {scale: 20}}",
+}
+
+
+@pytest.fixture(params=["mlp", "convrnn"])
+def distillers(request, tmp_path):
+    """Return two distillers of stacks of several sizes: one as it is, one that captures nothing and works in turn."""
+    loaded = load_task(felt_task(tmp_path), SMALL | {"distill.networks.touch_kind": request.param})
+    file = teacher(tmp_path / "teacher.pt", loaded, ("priv_proprio", "priv_obj_state"), std=[0.5, 0.25])
+    keys, own = student_keys(["depth", "bool", "none"], ["ends", "all"], ["clean"], 2), Teacher(file, loaded)
+    made = []
+    for _ in range(2):
+        env = TouchEnv(loaded, 4 * len(keys), seed=1, device="cuda", feels=feels(keys, own.felt))
+        made.append(Distiller(env, loaded, own.bound(env), keys, 0))
+    for part in vars(made[1]).values():
+        if isinstance(part, Captured):
+            part._is_captured = False
+    made[1]._beside = SideBySide(0, "cpu")
+    yield made
+    for distiller in made:
+        distiller.env.close()
+
+
+def test_streams_and_graphs_change_nothing(distillers):
+    """Five updates from the same rollouts: two eager ones, then graphs."""
+    found, other = distillers
+    assert len(found.rollouts) == 3
+    for _ in range(5):
+        found.roll()
+        other._begin()
+        for value, its in zip(other._of_rollout(), found._of_rollout(), strict=True):
+            value.copy_(its)
+        for distiller in distillers:
+            distiller.learn()
+        torch.testing.assert_close(found._losses, other._losses, rtol=1e-4, atol=1e-6)
+        for own, its in zip(found.rollouts, other.rollouts, strict=True):
+            for name, value in own.stack.parameters.items():
+                torch.testing.assert_close(value, its.stack.parameters[name], rtol=1e-3, atol=1e-4)
+            for name, value in own.stack.moments.items():
+                torch.testing.assert_close(value, its.stack.moments[name], rtol=1e-9, atol=1e-12)
+    assert found._learned._graph is not None and other._learned._graph is None
+
+
+def test_the_host_waits_for_nothing(distillers):
+    found, _ = distillers
+    for _ in range(3):
+        found.iterate()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(2):
+            found.roll()
+            found.learn()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert all(torch.isfinite(torch.tensor(list(found.iterate().told.values()))))
