@@ -29,7 +29,7 @@ def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
     compliance = constants["compliance"][:, None] + patches.objects.compliance[:, None, :]
     curvature = constants["curvature"][:, None] + patches.objects.curvature[:, None, :]
     cubed = 0.75 * patches.force * compliance / curvature
-    return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, cubed.new_tensor(2.0 / 3.0)))
+    return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, cubed.new_full((), 2.0 / 3.0)))
 
 
 def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants) -> Tensor:
@@ -61,21 +61,26 @@ def resistance(area: Tensor, patches: ContactPatch, lumped: tuple[int, ...], con
         made = _inside(safe, patches)
         count = area.shape[-1]
         is_lumped = [1.0 if i in lumped else 0.0 for i in range(count)]
-        series = made if all(is_lumped) else made * area.new_tensor(is_lumped)
+        series = made if all(is_lumped) else made * _of_objects(is_lumped, area)
     if "contact_conductance" in constants:
         film = 1.0 / (constants["contact_conductance"] * safe)
         halves = [1.0 if i in lumped else 0.5 for i in range(area.shape[-1])]
-        series = series + (film if all(h == 1.0 for h in halves) else film * area.new_tensor(halves))
+        series = series + (film if all(h == 1.0 for h in halves) else film * _of_objects(halves, area))
     elif not lumped:
         return None
     return series
+
+
+def _of_objects(factors: list[float], like: Tensor) -> Tensor:
+    """Return a factor of each object (object,): filled on the device, as a CUDA graph cannot hold a copy from the host."""
+    return torch.stack([like.new_full((), factor) for factor in factors])
 
 
 def _inside(area: Tensor, patches: ContactPatch) -> Tensor:
     """Return the resistance between a patch and the middle of a body of one temperature [K/W]."""
     objects = patches.objects
     k = objects.conductivity[:, None, :]
-    width = planes.power(objects.volume, objects.volume.new_tensor(1.0 / 3.0))[:, None, :]
+    width = planes.power(objects.volume, objects.volume.new_full((), 1.0 / 3.0))[:, None, :]
     radius, side = torch.sqrt(area / planes.pi()), torch.sqrt(area)
     open_part = (1.0 - side / width).clamp(min=0.0)
     return 1.0 / (k * (2.0 * area / width + 4.0 * radius * open_part / (1.0 + 0.5 * radius / width)))
