@@ -42,7 +42,7 @@ def is_cell(objects: Tensor, where: Topology) -> Tensor:
     found = torch.zeros(objects.shape[1:], dtype=objects.dtype, device=objects.device)
     for i, (x, y, z) in enumerate(where.cells):
         if where.links[i] < 0:
-            found[i, :x, :y, :z] = 1.0
+            found[i, :x, :y, :z].fill_(1.0)
     return found
 
 
