@@ -10,6 +10,8 @@ from tgdsl.rl.playing.policy import card_of, policy_for
 
 REPOSITORY = Path(__file__).parents[3]
 POLICIES = sorted((REPOSITORY / "policies").glob("*.pt"))
+CAPPED = "physics.iterations: null, now 10"
+"""Policies of the palm were learned before their tasks had a cap that hardly ever acts: docs/hands.md."""
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 
@@ -27,7 +29,7 @@ def test_it_does_better_than_rest(file):
     num = (8 if "teacher" in card else 16) if is_long else 4
     env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
     policy, obs = policy_for(env, file), env.reset(seed=1)
-    assert not policy.changes
+    assert set(policy.changes) <= {CAPPED}
     steps = env.max_steps - 1  # after the last one of an episode the score is that of the next
     steps = steps if is_long else min(steps, round(2.0 / env.control_step))
     returns = torch.zeros(num)

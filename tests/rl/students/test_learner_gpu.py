@@ -24,6 +24,7 @@ SMALL = {
     "distill.clip": 0.05,
     "distill.aggregate": 2,
     "distill.precision": "float32",
+    "distill.final_learning_rate": 1e-6,
     "distill.decoders": "{object_size: {scale: 20}}",
 }
 
@@ -48,10 +49,12 @@ def distillers(request, tmp_path):
 
 
 def test_streams_and_graphs_change_nothing(distillers):
-    """Five updates from the same rollouts: two eager ones, then graphs."""
+    """Five updates from the same rollouts, at smaller and smaller rates: two eager ones, then graphs."""
     found, other = distillers
     assert len(found.rollouts) == 3
-    for _ in range(5):
+    for number in range(5):
+        for distiller in distillers:
+            distiller.set_rate(number / 5)
         found.roll()
         other._begin()
         for value, its in zip(other._of_rollout(), found._of_rollout(), strict=True):
@@ -74,7 +77,8 @@ def test_the_host_waits_for_nothing(distillers):
     torch.cuda.synchronize()
     torch.cuda.set_sync_debug_mode("error")
     try:
-        for _ in range(2):
+        for share in (0.4, 0.8):
+            found.set_rate(share)
             found.roll()
             found.learn()
     finally:

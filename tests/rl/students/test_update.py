@@ -1,5 +1,6 @@
 """An update is that of separate students, each taught alone in plain torch as the docstrings say: all of it in float64."""
 
+import math
 import random
 from functools import partial
 from statistics import fmean
@@ -40,6 +41,7 @@ class Chosen(NamedTuple):
     max_grad_norm: float | None = None
     num_decoders: int = 0
     aggregate: int = 1
+    final_learning_rate: float | None = None
 
 
 CHOSEN = {
@@ -47,6 +49,7 @@ CHOSEN = {
     "bounded": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0),
     "decoders": Chosen(num_decoders=2),
     "aggregate": Chosen(clip=0.02, aggregate=2),
+    "falling": Chosen(final_learning_rate=1e-4),
     "all": Chosen("inverse_variance", clip=0.02, max_grad_norm=4.0, num_decoders=2, aggregate=2),
 }
 
@@ -70,6 +73,12 @@ class Alone:
         self.optimiser = torch.optim.Adam(student.parameters(), lr=RATE)
         self.seen: list[Tensor] = []
         self.norms: list[float] = []
+
+    def fall(self, share: float) -> None:
+        """Learn at the rate that stands when a share of the run is over."""
+        if self.chosen.final_learning_rate is not None:
+            logarithm = math.log(RATE) + share * (math.log(self.chosen.final_learning_rate) - math.log(RATE))
+            self.optimiser.param_groups[0]["lr"] = math.exp(logarithm)
 
     def acted(self, lesson: Lesson) -> Tensor:
         """What it would ask for now, (step, row, joint)."""
@@ -138,7 +147,7 @@ def make(files, monkeypatch):
         named = [f"{name}: {own}" for name, own in zip(("object_size", "goal_distance"), decoders, strict=True)]
         spec = {"steps": STEPS, "gradient_length": LENGTH, "epochs": EPOCHS, "learning_rate": RATE}
         spec |= {"loss": chosen.loss, "aggregate": chosen.aggregate}
-        spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm")}
+        spec |= {name: getattr(chosen, name) or "null" for name in ("clip", "max_grad_norm", "final_learning_rate")}
         spec["decoders"] = "{" + ", ".join(named[: chosen.num_decoders]) + "}"
         widths = {"encoder.hidden": "[5]", "encoder.size": 4, "hidden": "[8]", "touch_encoder.hidden": "[6]"}
         widths |= {"touch_encoder.size": 6, "convolution.channels": "[2]"} | KINDS[kind]
@@ -193,7 +202,10 @@ def test_an_update_is_that_of_separate_students(make, kind, chosen):
     found._chance.seed(5)
     alone = [Alone(found.student(i), own) for i in range(len(found.keys))]
     kept: list[list[Lesson]] = []
-    for _ in range(NUM_UPDATES):
+    for number in range(NUM_UPDATES):
+        found.set_rate(number / NUM_UPDATES)
+        for each in alone:
+            each.fall(number / NUM_UPDATES)
         kept = [*kept, filled(found, generator)][-own.aggregate :]
         latest = len(kept) - 1
         passes = [latest] + [chance.randrange(len(kept)) if own.aggregate > 1 else latest for _ in range(EPOCHS - 1)]

@@ -1,6 +1,7 @@
 """Runs: what is written, going on after a kill at any instant, and what cannot be written."""
 
 import csv
+import itertools
 import json
 import os
 import resource
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import small_tasks
@@ -61,6 +63,22 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
     assert other.algorithm.rnd.update_counter == learner.algorithm.rnd.update_counter == 12
     other.iterate()
     assert other.iteration == 4
+
+
+def test_a_learner_is_told_how_much_of_its_run_is_over(tmp_path, monkeypatch):
+    """Of the iterations, those made before included; of the time of a command, if of that more is over."""
+    run, learner = begun(tmp_path)
+    shares, iterate = [], learner.iterate
+    learner.iterate = lambda share: shares.append(share) or iterate(share)
+    run.learn(2, float("inf"))
+    run.learn(4, float("inf"))
+    assert shares == [0.0, 1 / 2, 2 / 4, 3 / 4]
+    seconds = itertools.count()  # one passes at each look at the clock
+    monkeypatch.setattr("tgdsl.rl.train.run.time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
+    run.learn(10**9, 10.0)
+    assert shares[4:] == [0.1, 0.3, 0.5, 0.7, 0.9]
+    run.learn(10, 10.0)
+    assert shares[9:] == [9 / 10]  # iterations, not 0.1 of the time
 
 
 @pytest.mark.parametrize(("before", "now"), [({}, {"train__rnd": "off"}), ({"train__rnd": "off"}, {})])

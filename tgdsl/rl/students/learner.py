@@ -78,8 +78,13 @@ class Distiller:
         self._allocate()
         torch.manual_seed(seed)
 
-    def iterate(self) -> Iteration:
-        """Make a rollout, and learn from it."""
+    def iterate(self, share: float = 0.0) -> Iteration:
+        """Make a rollout, and learn from it.
+
+        Args:
+            share: How much of the run is over, 0 to 1: `final_learning_rate` is the rate when all of it is.
+        """
+        self.set_rate(share)
         self.roll()
         self.learn()
         return self._told()
@@ -88,6 +93,13 @@ class Distiller:
     def episode_names(self) -> list[str]:
         """What iterations tell of the episodes that ended, in those that had any."""
         return [*self._tally.names, *(f"Score/{key.name}" for key in self.keys)]
+
+    def set_rate(self, share: float) -> None:
+        """Learn at the rate that stands when a share of the run is over."""
+        first, last = self._spec.learning_rate, self._spec.final_learning_rate
+        self._rate = first if last is None else first * (last / first) ** share
+        for own in self.rollouts:
+            own.stack.set_rate(self._rate)
 
     def roll(self) -> None:
         """Make a rollout; the host does not wait for a GPU, but for captures at the first calls."""
@@ -271,6 +283,7 @@ class Distiller:
         self._gathered: deque[list[Tensor]] = deque(maxlen=spec.aggregate)
         self._chance = random.Random(0)
         self._clock, self._tally, self._is_begun = Clock(device), EpisodeTally(), False
+        self._rate = spec.learning_rate
 
     def _begin(self) -> dict[str, Tensor]:
         """Return the observations to act on; at the first call, begin episodes, the first of which end at random times."""
@@ -310,7 +323,7 @@ class Distiller:
         told = torch.cat([sums, scores, (self._losses / updates).double().to(sums.device)]).tolist()
         self._scores.zero_()
         rollout, update = self._clock.stop()
-        made = self._tally.means(told[: len(sums)])
+        made = self._tally.means(told[: len(sums)]) | {"Loss/learning_rate": self._rate}
         ended, score, loss = (told[len(sums) + i * count :][:count] for i in range(3))
         for key, number, total, error in zip(self.keys, ended, score, loss, strict=True):
             made |= {f"Score/{key.name}": total / number} if number else {}

@@ -83,7 +83,10 @@ class DistillSpec(SpecModel):
     one through one of them at random, as DAgger's set is of all that was seen; 1: the latest alone. A run that goes on begins
     to gather them anew."""
     learning_rate: Positive = 1e-4
-    """Learning rate."""
+    """Learning rate, at the start where it falls."""
+    final_learning_rate: Positive | None = None
+    """Learning rate that it falls to, geometrically with the share that is over of the iterations, or of the minutes of a command
+    if of these more is over; null: it stays."""
     max_grad_norm: Positive | None = 2.0
     """Norm to which the gradient of each student is scaled down; null: it is not."""
     loss: Loss = "mse"
@@ -109,6 +112,11 @@ class DistillSpec(SpecModel):
     def _check(self) -> DistillSpec:
         if self.steps % self.gradient_length:
             raise ValueError(f"steps is {self.steps}, expected a multiple of gradient_length, {self.gradient_length}")
+        if self.final_learning_rate is not None and self.final_learning_rate > self.learning_rate:
+            what = (
+                f"final_learning_rate is {self.final_learning_rate:g}, expected at most learning_rate, {self.learning_rate:g}"
+            )
+            raise ValueError(what)
         if len(set(self.groups or ())) < len(self.groups or ()):
             raise ValueError("groups names a group twice")
         return self

@@ -58,7 +58,8 @@ class Stack:
             dtype: Their dtype.
         """
         self.architecture, self.size = architecture, len(seeds)
-        self._max_norm, self._rate = max_grad_norm, learning_rate
+        self._max_norm, is_cuda = max_grad_norm, torch.device(device).type == "cuda"
+        self._rate = torch.tensor(learning_rate, device=device) if is_cuda else learning_rate  # a graph reads it from there
         students = [made(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
@@ -84,6 +85,14 @@ class Stack:
             for weight, gradient in zip(weights, gradients, strict=True):
                 weight.grad = torch.empty_like(weight).copy_(gradient)  # Adam's fused kernel takes no others' strides
         self.optimiser.step()
+
+    def set_rate(self, learning_rate: float) -> None:
+        """Set Adam's learning rate, from the next step on, also of those that a CUDA graph holds."""
+        if isinstance(self._rate, Tensor):
+            self._rate.fill_(learning_rate)
+        else:
+            self._rate = learning_rate
+            self._rated()
 
     @torch.no_grad()
     def look(self, x: Float[Tensor, "student row feature"]) -> None:
@@ -111,7 +120,7 @@ class Stack:
         return {"networks": networks, "seen": self.moments | {"rows": self.seen}, "optimiser": self.optimiser.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what was saved, with the learning rate that the stack was made with.
+        """Go on from what was saved, with the learning rate that the stack has.
 
         Raises:
             RuntimeError: If it is of other networks.
@@ -132,6 +141,12 @@ class Stack:
         optimiser = state["optimiser"]  # saved on another device perhaps, and at another rate; the options place its `step`
         groups = [group | self._options() for group in optimiser["param_groups"]]
         self.optimiser.load_state_dict({"state": optimiser["state"], "param_groups": groups})
+        self._rated()  # it has copied it
+
+    def _rated(self) -> None:
+        """Have Adam learn at the rate."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._rate
 
     def _normalise(self) -> None:
         """Have the networks normalise by the moments, in place."""

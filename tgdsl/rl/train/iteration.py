@@ -99,8 +99,12 @@ class Learning(Protocol):
         """What iterations tell of the episodes that ended, in those that had any."""
         ...
 
-    def iterate(self) -> Iteration:
-        """Make a rollout, and learn from it."""
+    def iterate(self, share: float = 0.0) -> Iteration:
+        """Make a rollout, and learn from it.
+
+        Args:
+            share: How much of the run is over, 0 to 1: some learn in smaller and smaller steps.
+        """
         ...
 
     def state_dict(self) -> dict[str, Any]:

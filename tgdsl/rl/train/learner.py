@@ -63,8 +63,8 @@ class Learner:
         torch.manual_seed(seed * self.ranks.size + self.ranks.rank)
         self._clock = Clock(env.device)
 
-    def iterate(self) -> Iteration:
-        """Make a rollout, and learn from it."""
+    def iterate(self, share: float = 0.0) -> Iteration:
+        """Make a rollout, and learn from it; `share` changes nothing: the rate adapts by itself."""
         self.roll()
         self.learn()
         return self._told()

@@ -79,7 +79,7 @@ class Run:
         try:
             while not is_over:
                 start = time.monotonic()
-                made = learner.iterate()
+                made = learner.iterate(max(learner.iteration / iterations, (start - begun) / seconds))
                 now = time.monotonic()
                 self.seconds = before + now - begun
                 self._refuse_diverged(made)
