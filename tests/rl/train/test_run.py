@@ -243,9 +243,9 @@ def test_a_run_ends_in_time_and_checkpoints_come_in_time(tmp_path, monkeypatch):
     now, iterate = [0.0], learner.iterate
     monkeypatch.setattr("tgdsl.rl.train.run.time.monotonic", lambda: now[0])
 
-    def slow():
+    def slow(share):
         now[0] += 3.0
-        return iterate()
+        return iterate(share)
 
     monkeypatch.setattr(learner, "iterate", slow)
     saved, save = [], run.save
