@@ -215,18 +215,25 @@ def legs_in(starts: Sequence[dict[str, Any]], iterations: int) -> dict[int, dict
 
 
 def made_from(last: Mapping[str, Any], legs: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what the simulation of a resolution was made from: of all legs the devices, else of the last start."""
+    """Return what the simulation of a resolution was made from: of all legs the devices and rates, else of the last start."""
     return {
         "document": last["task"],
         "task": last["spec"]["task"],
         "begun": list(legs),
         "devices": list(dict.fromkeys(start["device"] for start in legs.values())),
+        "rates": [_rate(leg["spec"]["distill"]) for leg in legs.values()],
         "envs": last["envs"],
         "episode": last["spec"]["episode"],
         "physics": last["spec"]["physics"],
         "distill": last["spec"]["distill"],
         "versions": last["versions"],
     }
+
+
+def _rate(distill: Mapping[str, Any]) -> str:
+    """Return a leg's learning rate, and what it fell to."""
+    last = distill.get("final_learning_rate")  # older runs know of none
+    return f"{distill['learning_rate']:g}" + ("" if last is None else f" falling to {last:g}")
 
 
 def _of_task(file: Path, made: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

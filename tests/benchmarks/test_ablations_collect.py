@@ -55,12 +55,20 @@ def started(run, *changes):
 def test_starts_of_which_no_iteration_is_left_are_no_legs(tmp_path):
     """One was killed after 250 iterations, its last checkpoint after 240; another one while it evaluated, after the last."""
     run = made_up_run(tmp_path / "run", SCORES)
-    starts = ((0, "a"), (240, "b"), (240, "c"), (300, "d"))
-    started(run, *(({"iteration": first, "device": device}, {}) for first, device in starts))
+    starts = ((0, "a", (1e-3, 1e-4)), (240, "b", (5.0, None)), (240, "c", (1e-5, None)), (300, "d", (5.0, None)))
+    told = [{"learning_rate": first, "final_learning_rate": last, "steps": STEPS} for *_, (first, last) in starts]
+    started(
+        run,
+        *(
+            ({"iteration": first, "device": device}, {"distill": own})
+            for (first, device, _), own in zip(starts, told, strict=True)
+        ),
+    )
     collect(run, "legs", into=tmp_path / "kept")
     made = read_ablation(tmp_path / "kept" / "legs").made["simulations"]["med"]
     assert made["begun"] == list(LEGS) and made["devices"] == ["a", "c"]
-    assert "on a, c: 100 environments, 25.0 min in 2 legs. " in tables(tmp_path / "kept")
+    how = "on a, c: 100 environments, 25.0 min in 2 legs, at rates of 0.001 falling to 0.0001 and then 1e-05. "
+    assert how in tables(tmp_path / "kept")
 
 
 def test_what_is_part_of_an_episode_follows_from_its_own_leg(tmp_path):

@@ -45,7 +45,7 @@ def made_up_run(
         (folder / resolution / "evaluation.json").write_text(json.dumps(own))
         start = {"task": f"examples/tasks/{task}.yaml", "device": "made up", "envs": ROWS * len(keys), "versions": {}}
         physics = {"timestep": 0.005, "substeps": 5}
-        start["spec"] = {"task": task, "episode": 10.0, "physics": physics, "distill": {"steps": STEPS}}
+        start["spec"] = {"task": task, "episode": 10.0, "physics": physics, "distill": {"steps": STEPS, "learning_rate": 1e-4}}
         starts = [start | {"iteration": first} for first in LEGS]
         (folder / resolution / "run.json").write_text(json.dumps({"starts": starts}))
         for type_, felt in kinds:
