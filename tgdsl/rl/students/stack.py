@@ -58,8 +58,9 @@ class Stack:
             dtype: Their dtype.
         """
         self.architecture, self.size = architecture, len(seeds)
-        self._max_norm, is_cuda = max_grad_norm, torch.device(device).type == "cuda"
-        self._rate = torch.tensor(learning_rate, device=device) if is_cuda else learning_rate  # a graph reads it from there
+        self._max_norm, self._rate = max_grad_norm, learning_rate
+        if torch.device(device).type == "cuda":
+            self._rate = torch.tensor(learning_rate, dtype=torch.float32, device=device)  # which a CUDA graph reads
         students = [made(architecture, seed).to(device, dtype) for seed in seeds]
         self.memory = students[0].memory
         self.parameters, self.buffers = stack_module_state(students)  # pyright: ignore[reportArgumentType]
