@@ -188,8 +188,8 @@ def _conditions(ablation: Ablation) -> str:
     minutes = max(each.row.minutes for each in ablation.taught)
     said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {envs:,} environments, {minutes:.1f} min"
     said += f" in {legs} legs" if legs > 1 else ""
-    rates = list(dict.fromkeys(simulations[0]["rates"]))
-    said += f", at rates of {' and then '.join(rates)}" if len(rates) > 1 else ""
+    rates = simulations[0]["rates"]
+    said += f", at rates of {' and then '.join(rates)}" if len(set(rates)) > 1 else ""
     said += f" for each of {len(simulations)} resolutions. " if len(simulations) > 1 else ". "
     if made["overrides"]:
         said += "Overrides: " + ", ".join(f"`{name}={value}`" for name, value in made["overrides"].items()) + ". "

@@ -163,7 +163,7 @@ def _safe_roots(squared: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(is_null, 0.0, squared * inverse), inverse
 
 
-def power(depth: Tensor, exponent: Tensor) -> Tensor:
+def power(depth: Tensor, exponent: Tensor | float) -> Tensor:
     """Return d^α of depths d ≥ 0, to α |log₂ d| roundings; where d = 0 its derivatives are 0, not infinite, even for α < 1."""
     is_none = depth <= 0
     if may_look(depth) and bool(is_none.all()):

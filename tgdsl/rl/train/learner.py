@@ -64,7 +64,7 @@ class Learner:
         self._clock = Clock(env.device)
 
     def iterate(self, share: float = 0.0) -> Iteration:
-        """Make a rollout, and learn from it; `share` changes nothing: the rate adapts by itself."""
+        """Make a rollout, and learn from it; `share` changes nothing: the rate adapts to the policy, or stays."""
         self.roll()
         self.learn()
         return self._told()

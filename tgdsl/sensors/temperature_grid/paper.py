@@ -75,7 +75,7 @@ def area(patches: ContactPatch, constants: Constants) -> Tensor:
     compliance = constants["compliance"][:, None] + patches.objects.compliance[:, None, :]
     curvature = constants["curvature"][:, None] + patches.objects.curvature[:, None, :]
     cubed = 0.75 * patches.force * compliance / curvature
-    depth = planes.power(cubed, cubed.new_full((), 2.0 / 3.0)) * curvature
+    depth = planes.power(cubed, 2.0 / 3.0) * curvature
     return torch.maximum(patches.polygon, planes.pi() * depth)
 
 

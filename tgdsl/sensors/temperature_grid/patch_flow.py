@@ -29,7 +29,7 @@ def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
     compliance = constants["compliance"][:, None] + patches.objects.compliance[:, None, :]
     curvature = constants["curvature"][:, None] + patches.objects.curvature[:, None, :]
     cubed = 0.75 * patches.force * compliance / curvature
-    return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, cubed.new_full((), 2.0 / 3.0)))
+    return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, 2.0 / 3.0))
 
 
 def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants) -> Tensor:
@@ -80,7 +80,7 @@ def _inside(area: Tensor, patches: ContactPatch) -> Tensor:
     """Return the resistance between a patch and the middle of a body of one temperature [K/W]."""
     objects = patches.objects
     k = objects.conductivity[:, None, :]
-    width = planes.power(objects.volume, objects.volume.new_full((), 1.0 / 3.0))[:, None, :]
+    width = planes.power(objects.volume, 1.0 / 3.0)[:, None, :]
     radius, side = torch.sqrt(area / planes.pi()), torch.sqrt(area)
     open_part = (1.0 - side / width).clamp(min=0.0)
     return 1.0 / (k * (2.0 * area / width + 4.0 * radius * open_part / (1.0 + 0.5 * radius / width)))
