@@ -31,16 +31,23 @@ class Judged(NamedTuple):
         taught: The students.
         trend: How the mean of their scores changes over the last third; None: too few points.
         is_flat: Whether that has flattened; None where that cannot be told.
+        holds: Whether they do not get worse, flat or not; likewise.
     """
 
     taught: Taught
     trend: Trend | None
     is_flat: bool | None
+    holds: bool | None
 
     @property
-    def is_told(self) -> bool:
-        """Whether they can be worse or better than others: of one seed the interval knows nothing of seeds."""
+    def can_be_worse(self) -> bool:
+        """Whether they can be called worse than others: of one seed the interval knows nothing of seeds."""
         return bool(self.is_flat) and self.taught.row.seeds > 1
+
+    @property
+    def can_be_better(self) -> bool:
+        """Whether others can be called worse than they; likewise."""
+        return bool(self.holds) and self.taught.row.seeds > 1
 
 
 def paper_samples(task: str) -> int | None:
@@ -67,15 +74,18 @@ def judged(ablation: Ablation) -> list[Judged]:
         curves, span = ablation.curves[taught.row.resolution], span_of(ablation, taught.row.resolution)
         score = sum(curves.score[name] for name in taught.names) / len(taught.names)
         made = trend(curves.samples, score)  # pyright: ignore[reportArgumentType]
-        found.append(Judged(taught, made, None if made is None or span is None else made.is_flat(span)))
+        if made is None or span is None:
+            found.append(Judged(taught, made, None, None))
+        else:
+            found.append(Judged(taught, made, made.is_flat(span), made.holds(span, ablation.made["is_less_better"])))
     return found
 
 
 def worse_than(one: Judged, others: Sequence[Judged], is_less_better: bool) -> list[Judged]:
-    """Return those of others that some students are worse than: all curves flat, of several seeds, intervals apart."""
-    if not one.is_told:
+    """Return those of others that some students are worse than: see `ablations_verdicts.py`."""
+    if not one.can_be_worse:
         return []
-    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.is_told]
+    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.can_be_better]
     return [other for other, own in ends if is_worse((one.taught.row.low, one.taught.row.high), own, is_less_better)]
 
 
@@ -173,11 +183,11 @@ def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
     moved = "–" if change is None else "{} ({} to {})".format(*map(_signed, change))
     flat = {True: "yes", False: "no", None: "–"}[own.is_flat]
     beside = _beside(own, found)
-    worse = _named(worse_than(own, beside, ablation.made["is_less_better"]), beside)
-    untold = _named([other for other in beside if not other.is_told], beside)
-    said = "; ".join(part for part in (worse, f"open: {untold}" if untold else "") if part) or "–"
+    worse = worse_than(own, beside, ablation.made["is_less_better"])
+    untold = _named([other for other in beside if not other.can_be_worse and other not in worse], beside)
+    said = "; ".join(part for part in (_named(worse, beside), f"open: {untold}" if untold else "") if part) or "–"
     score = [f"{row.score:.3f}", _bounds(row.low, row.high), _percent(row.held)]
-    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, said if own.is_told else "open"]
+    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, said if own.can_be_worse else "open"]
 
 
 def _conditions(ablation: Ablation) -> str:

@@ -11,9 +11,9 @@ known at either end of that third, as when its last leg was shorter than an epis
 measured, students that feel nothing stand in for them. Points are taken as independent, which those closer than an episode are
 not. A point is the mean score of the control steps since the one before it.
 
-One student is worse than another if both curves have flattened and the 95 % intervals of their scores, over seeds and episodes,
-do not overlap: a curve that still rises says nothing of what can be learned from a type, and neither does one seed, whose
-interval is of episodes alone.
+One student is worse than another if its curve has flattened, the other's does not get worse by those 5 % (flat or still getting
+better), and the 95 % intervals of their scores, over seeds and episodes, do not overlap. A worse one that still gets better
+might catch up, and of one seed nothing is said, as its interval is of episodes alone.
 
 Shapes: `point` points of a curve.
 """
@@ -53,6 +53,10 @@ class Trend(NamedTuple):
     def is_flat(self, span: float) -> bool:
         """Return whether that is no change, beside the range of scores."""
         return max(abs(self.low), abs(self.high)) < FLAT * span
+
+    def holds(self, span: float, is_less_better: bool) -> bool:
+        """Return whether it does not get worse, by more than is no change; it may get better."""
+        return (self.high if is_less_better else -self.low) < FLAT * span
 
 
 def trend(samples: Float[Array, " point"], score: Float[Array, " point"]) -> Trend | None:

@@ -24,6 +24,12 @@ def test_a_straight_line_changes_by_a_third_of_its_rise(slope, is_flat):
     assert found.is_flat(1.0) is is_flat
 
 
+@pytest.mark.parametrize(("slope", "rises", "falls"), [(0.0, True, True), (0.16, True, False), (-0.16, False, True)])
+def test_a_curve_holds_unless_it_gets_worse(slope, rises, falls):
+    found = trend(SAMPLES, 0.3 + slope * SAMPLES / END)
+    assert (found.holds(1.0, False), found.holds(1.0, True)) == (rises, falls)
+
+
 @pytest.mark.parametrize(("rise", "is_flat"), [(0.1, True), (0.2, True), (1.0, False)])
 def test_a_curve_that_levels_off_is_flat_once_it_has(rise, is_flat):
     """1 − exp(−n/τ): over the last third it rises by exp(−2N/3τ) − exp(−N/τ), 0.035 for τ = N/5, 0.15 for τ = N."""
@@ -52,6 +58,7 @@ def test_a_curve_too_noisy_to_tell_is_not_flat():
     calm, wild = (trend(SAMPLES, 0.5 + size * noise) for size in (0.02, 0.2))
     assert wild.high > 0.05 and wild.low < -0.05
     assert calm.is_flat(1.0) and not wild.is_flat(1.0)
+    assert not wild.holds(1.0, False) and not wild.holds(1.0, True)
 
 
 def test_of_few_points_nothing_is_said():
