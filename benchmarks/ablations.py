@@ -5,7 +5,8 @@
     python benchmarks/ablations.py page                       # tables and plots from all that is kept
 
 `collect` copies a run's tables and thinned curves to docs/measured/ablations, in place of what was kept under the name; a run
-that went on with --resume is collected again. `page` writes between the markers of docs/ablations.md, and a plot of each to
+that went on with --resume is collected again. Runs that differ in their overrides alone, as in students' networks, are kept as
+SERIES__WHAT and have one table and plot. `page` writes between the markers of docs/ablations.md, and a plot of each to
 docs/images/ablation_NAME.png.
 """
 

@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 from ablations_kept import KEPT, ROOT, Ablation, KeptError, Taught, kept_ablations, read_rows, read_text
 from ablations_plots import plot, png_of
+from ablations_series import common_overrides, grouped, own_overrides, series_of, series_plot, what_of
 from ablations_verdicts import FLAT, Trend, is_worse, trend
 
 from tgdsl.files.write import atomic_write_all, with_folder
 from tgdsl.rl.students.keys import NONE
+from tgdsl.rl.students.results import Row
 
 PAGE = ROOT / "docs" / "ablations.md"
 BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
@@ -85,8 +87,9 @@ def worse_than(one: Judged, others: Sequence[Judged], is_less_better: bool) -> l
     """Return those of others that some students are worse than: see `ablations_verdicts.py`."""
     if not one.can_be_worse:
         return []
-    ends = [(other, (other.taught.row.low, other.taught.row.high)) for other in others if other.can_be_better]
-    return [other for other, own in ends if is_worse((one.taught.row.low, one.taught.row.high), own, is_less_better)]
+    row, better = one.taught.row, [other for other in others if other.can_be_better]
+    ends = [(other, other.taught.row) for other in better if _are_as_long(row, other.taught.row)]
+    return [other for other, own in ends if is_worse((row.low, row.high), (own.low, own.high), is_less_better)]
 
 
 def tables(folder: Path = KEPT) -> str:
@@ -96,7 +99,8 @@ def tables(folder: Path = KEPT) -> str:
         KeptError: If something that is kept cannot be read.
     """
     reading = read_rows(folder / READING) if (folder / READING).is_file() else []
-    parts = [section(ablation, reading) for ablation in kept_ablations(folder)]
+    groups = grouped(kept_ablations(folder))
+    parts = [series_section(own) if what_of(own[0].name) else section(own[0], reading) for own in groups]
     if reading:
         parts.append(reading_section(reading, read_text(folder / READING)))
     return "\n\n".join(parts) or NOTHING
@@ -117,14 +121,41 @@ def section(ablation: Ablation, reading: Sequence[dict[str, str]] = ()) -> str:
 
     for each in sorted(found, key=rank):
         lines.append(_line([*_row(ablation, each, found), *([force.get(each.taught.row.type, "–")] if force else [])]))
-    for name, kept in (("teacher", ablation.teacher), ("joints at rest", ablation.rest)):
-        if kept is not None:
-            bounds = _bounds(*kept["score_interval"])
-            cells = [f"*{name}*", "", "", f"{kept['score']:.3f}", bounds, _percent(kept["held"])]
-            lines.append(_line([*cells, *[""] * (len(header) - len(cells))]))
-    parts = [f"### {ablation.name}", _conditions(ablation), "\n".join(lines), _verdicts(found, is_less_better)]
+    lines += _yardsticks(ablation, ["", ""], len(header))
+    parts = [f"### {ablation.name}", _conditions([ablation]), "\n".join(lines), _verdicts(found, is_less_better)]
     parts.append(f"![Score over control steps of each student: {ablation.name}](images/ablation_{ablation.name}.png)")
     return "\n\n".join(parts)
+
+
+def series_section(runs: Sequence[Ablation]) -> str:
+    """Return heading, conditions, table and plot of runs that differ in their overrides."""
+    name, is_less_better = series_of(runs[0].name), runs[0].made["is_less_better"]
+    header = ["run", "type", "where", "seeds", f"score [{runs[0].made['unit']}]", "95 %", "held", "control steps of each"]
+    header += ["minutes", "change in the last third (95 %)", "flat", "worse than"]
+    lines = [_line(header), _line(["---"] * len(header))]
+    found = [(run, own) for run in runs for own in judged(run)]
+
+    def is_open(row: Row, other: Judged, worse: Sequence[Judged]) -> bool:
+        return other not in worse and not (other.can_be_worse and _are_as_long(row, other.taught.row))
+
+    for run, own in found:
+        row = own.taught.row
+        beside = [
+            (other, each)
+            for other, each in found
+            if other is not run and (each.taught.row.type, each.taught.where) == (row.type, own.taught.where)
+        ]
+        worse = worse_than(own, [each for _, each in beside], is_less_better)
+        untold = [what_of(other.name) for other, each in beside if is_open(row, each, worse)]
+        names = ", ".join(f"`{what_of(other.name)}`" for other, each in beside if each in worse)
+        said = "; ".join(part for part in (names, f"open: {', '.join(f'`{one}`' for one in untold)}" if untold else "") if part)
+        cells = _cells(run, own)
+        what = [f"`{what_of(run.name)}`", *(f"`{key}={value}`" for key, value in own_overrides(run, runs).items())]
+        line = [", ".join(what), *cells[:-2], f"{row.minutes:.1f}", *cells[-2:], (said or "–") if own.can_be_worse else "open"]
+        lines.append(_line(line))
+    lines += _yardsticks(runs[0], ["", "", ""], len(header))
+    plotted = f"![Score over control steps of each student: {name}](images/ablation_{name}.png)"
+    return "\n\n".join([f"### {name}", _conditions(runs), "\n".join(lines), plotted])
 
 
 def reading_section(rows: Sequence[dict[str, str]], text: str) -> str:
@@ -168,7 +199,10 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
         FileError: If something cannot be written.
     """
     images = page.parent / "images"
-    contents = {images / f"ablation_{own.name}.png": png_of(plot(own)) for own in kept_ablations(folder)}
+    contents = {
+        images / f"ablation_{series_of(own[0].name)}.png": png_of(series_plot(own) if what_of(own[0].name) else plot(own[0]))
+        for own in grouped(kept_ablations(folder))
+    }
     contents[page] = written(read_text(page), tables(folder), page).encode()
     for file in contents:
         with_folder(file)
@@ -177,33 +211,54 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
 
 
 def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
+    beside = _beside(own, found)
+    worse = worse_than(own, beside, ablation.made["is_less_better"])
+    untold = _named([other for other in beside if not other.can_be_worse and other not in worse], beside)
+    said = "; ".join(part for part in (_named(worse, beside), f"open: {untold}" if untold else "") if part) or "–"
+    return [*_cells(ablation, own), said if own.can_be_worse else "open"]
+
+
+def _cells(ablation: Ablation, own: Judged) -> list[str]:
+    """Return type, place, seeds, score, its interval, held, control steps, change and whether it is flat."""
     row, change, paper = own.taught.row, own.trend, paper_samples(_task(ablation))
     place = ", ".join(part for part in own.taught.where if part)
     steps = _millions(row.samples) + (f" ({_percent(row.samples / paper, 2)} of the paper's)" if paper else "")
     moved = "–" if change is None else "{} ({} to {})".format(*map(_signed, change))
     flat = {True: "yes", False: "no", None: "–"}[own.is_flat]
-    beside = _beside(own, found)
-    worse = worse_than(own, beside, ablation.made["is_less_better"])
-    untold = _named([other for other in beside if not other.can_be_worse and other not in worse], beside)
-    said = "; ".join(part for part in (_named(worse, beside), f"open: {untold}" if untold else "") if part) or "–"
     score = [f"{row.score:.3f}", _bounds(row.low, row.high), _percent(row.held)]
-    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat, said if own.can_be_worse else "open"]
+    return [f"`{row.type}`", place, f"{row.seeds}", *score, steps, moved, flat]
 
 
-def _conditions(ablation: Ablation) -> str:
-    made = ablation.made
-    simulations, task = list(made["simulations"].values()), _task(ablation)
+def _are_as_long(one: Row, other: Row) -> bool:
+    """Return whether students of two runs learned for about as many control steps: else a slow one may just be early."""
+    return abs(one.samples - other.samples) <= 0.1 * max(one.samples, other.samples)
+
+
+def _yardsticks(ablation: Ablation, before: list[str], width: int) -> list[str]:
+    """Return the rows of teacher and joints at rest, with so many cells between name and score."""
+    lines = []
+    for name, kept in (("teacher", ablation.teacher), ("joints at rest", ablation.rest)):
+        if kept is not None:
+            cells = [f"*{name}*", *before, f"{kept['score']:.3f}", _bounds(*kept["score_interval"]), _percent(kept["held"])]
+            lines.append(_line([*cells, *[""] * (width - len(cells))]))
+    return lines
+
+
+def _conditions(runs: Sequence[Ablation]) -> str:
+    """Return under which conditions students were taught, in one run, or in several alike but for overrides."""
+    made, task = runs[0].made, _task(runs[0])
+    simulations = [own for run in runs for own in run.made["simulations"].values()]
     devices = ", ".join(dict.fromkeys(device for own in simulations for device in own["devices"]))
-    legs, envs = max(len(own["begun"]) for own in simulations), simulations[0]["envs"]
-    minutes = max(each.row.minutes for each in ablation.taught)
-    said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {envs:,} environments, {minutes:.1f} min"
+    legs, envs = max(len(own["begun"]) for own in simulations), dict.fromkeys(f"{own['envs']:,}" for own in simulations)
+    said = f"`{made['document']}`, taught by `{made['teacher']}` on {devices}: {' and '.join(envs)} environments"
+    said += f", {max(each.row.minutes for each in runs[0].taught):.1f} min" if len(runs) == 1 else ", a run each"
     said += f" in {legs} legs" if legs > 1 else ""
     rates = simulations[0]["rates"]
     said += f", at rates of {' and then '.join(rates)}" if len(set(rates)) > 1 else ""
-    said += f" for each of {len(simulations)} resolutions. " if len(simulations) > 1 else ". "
-    if made["overrides"]:
-        said += "Overrides: " + ", ".join(f"`{name}={value}`" for name, value in made["overrides"].items()) + ". "
-    spans = [span for resolution in made["resolutions"] if (span := span_of(ablation, resolution)) is not None]
+    said += f" for each of {len(made['resolutions'])} resolutions. " if len(made["resolutions"]) > 1 else ". "
+    if alike := common_overrides(runs):
+        said += "Overrides: " + ", ".join(f"`{name}={value}`" for name, value in alike.items()) + ". "
+    spans = [span for run in runs for resolution in run.made["resolutions"] if (span := span_of(run, resolution)) is not None]
     if spans:
         low, high = min(spans), max(spans)
         bound = f"{FLAT * low:.3g}" if low == high else f"{FLAT * low:.3g} to {FLAT * high:.3g}"

@@ -19,6 +19,7 @@ from ablations_collect import collect
 from ablations_kept import KEPT, LIMIT, KeptError, kept_ablations, read_ablation
 from ablations_page import BEGIN, END, NOTHING, PAGE, judged, paper_samples, tables, worse_than, write_page, written
 from ablations_plots import plot
+from ablations_series import series_of
 
 from tgdsl.rl.load import load_task
 
@@ -207,7 +208,7 @@ def test_the_page_that_is_committed_is_that_of_what_is_kept():
     text = PAGE.read_text(encoding="utf-8")
     assert text == written(text, tables()), "run: python benchmarks/ablations.py page"
     found = kept_ablations()
-    pictures = [PAGE.parent / "images" / f"ablation_{own.name}.png" for own in found]
+    pictures = {PAGE.parent / "images" / f"ablation_{series_of(own.name)}.png" for own in found}
     assert sorted((PAGE.parent / "images").glob("ablation_*.png")) == sorted(pictures)
     sizes = [sum(file.stat().st_size for file in (KEPT / own.name).rglob("*.*")) for own in found]
     assert all(size <= LIMIT for size in sizes)

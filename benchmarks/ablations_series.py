@@ -1,0 +1,84 @@
+"""Runs that differ in their documents' overrides alone, as in the networks of students, side by side.
+
+They are kept as SERIES__WHAT, `cube_encoders__lstm` beside `cube_encoders__cnn`, and have one table and one plot in
+docs/ablations.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+from ablations_kept import Ablation, KeptError
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+BETWEEN = "__"
+ALIKE = ("document", "teacher", "unit", "is_less_better")
+"""What of `distill.json` the runs of a series have in common."""
+
+
+def series_of(name: str) -> str:
+    """Return the name of the series that an ablation is of, its own if of none."""
+    return name.partition(BETWEEN)[0]
+
+
+def what_of(name: str) -> str:
+    """Return what an ablation is in its series."""
+    return name.partition(BETWEEN)[2]
+
+
+def grouped(ablations: Sequence[Ablation]) -> list[list[Ablation]]:
+    """Return ablations by series, each of no series alone.
+
+    Raises:
+        KeptError: If runs of a series are of unlike documents or teachers, or one is called as the series is.
+    """
+    found = [list(own) for _, own in groupby(ablations, key=lambda each: series_of(each.name))]
+    for own in found:
+        if len(own) > 1 and not all(what_of(each.name) for each in own):
+            raise KeptError(f"{own[0].name}: a series of runs has that name too: {own[1].name}")
+        for each in own[1:]:
+            unlike = [name for name in ALIKE if each.made[name] != own[0].made[name]]
+            if unlike:
+                what = f'{unlike[0]} "{each.made[unlike[0]]}", expected "{own[0].made[unlike[0]]}"'
+                raise KeptError(f"{each.name}: {what}, as {own[0].name} has it: they are of one series")
+    return found
+
+
+def common_overrides(runs: Sequence[Ablation]) -> dict[str, str]:
+    """Return the overrides that all runs have alike."""
+    first, *others = (each.made["overrides"] for each in runs)
+    return {name: value for name, value in first.items() if all(own.get(name) == value for own in others)}
+
+
+def own_overrides(run: Ablation, runs: Sequence[Ablation]) -> dict[str, str]:
+    """Return the overrides that a run does not have in common with the others."""
+    alike = common_overrides(runs)
+    return {name: value for name, value in run.made["overrides"].items() if name not in alike}
+
+
+def series_plot(runs: Sequence[Ablation]) -> Figure:
+    """Return the plot of a series: scores over control steps of each student, mean and range of the seeds."""
+    figure = Figure(figsize=(5.7, 3.4), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    lines = [(run, each) for run in runs for each in run.taught]
+    for i, (run, each) in enumerate(lines):
+        curves = run.curves[each.row.resolution]
+        score = np.stack([curves.score[name] for name in each.names])
+        label = ", ".join((what_of(run.name), *([each.row.type, *each.where] if len(run.taught) > 1 else ())))
+        colour = colormaps["tab10"](i % 10)
+        axes.plot(curves.samples / 1e6, score.mean(axis=0), color=colour, linewidth=1.3, label=label)
+        axes.fill_between(curves.samples / 1e6, score.min(axis=0), score.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+    for name, dashes in (("teacher", "--"), ("rest", ":")):
+        kept = next((own for run in runs if (own := getattr(run, name)) is not None), None)
+        if kept is not None and math.isfinite(kept["score"]):
+            label = {"rest": "joints at rest"}.get(name, name)
+            axes.axhline(kept["score"], color="black", linestyle=dashes, linewidth=1.0, label=label)
+    axes.set_xlabel("million control steps of each student", fontsize=9)
+    axes.set_ylabel(f"score [{runs[0].made['unit']}]" if len(runs[0].made["unit"]) < 20 else runs[0].made["unit"])
+    axes.grid(True, color="#e3e5e8", linewidth=0.6)
+    figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+    return figure
