@@ -92,6 +92,11 @@ def worse_than(one: Judged, others: Sequence[Judged], is_less_better: bool) -> l
     return [other for other, own in ends if is_worse((row.low, row.high), (own.low, own.high), is_less_better)]
 
 
+def is_open(one: Judged, other: Judged, worse: Sequence[Judged]) -> bool:
+    """Return whether others may turn out better than some students, which are worse than `worse` already."""
+    return other not in worse and not (other.can_be_worse and _are_as_long(one.taught.row, other.taught.row))
+
+
 def tables(folder: Path = KEPT) -> str:
     """Return all that stands between the markers.
 
@@ -133,26 +138,29 @@ def series_section(runs: Sequence[Ablation]) -> str:
     header = ["run", "type", "where", "seeds", f"score [{runs[0].made['unit']}]", "95 %", "held", "control steps of each"]
     header += ["minutes", "change in the last third (95 %)", "flat", "worse than"]
     lines = [_line(header), _line(["---"] * len(header))]
-    found = [(run, own) for run in runs for own in judged(run)]
-
-    def is_open(row: Row, other: Judged, worse: Sequence[Judged]) -> bool:
-        return other not in worse and not (other.can_be_worse and _are_as_long(row, other.taught.row))
-
-    for run, own in found:
-        row = own.taught.row
+    found = [(f"`{what_of(run.name)}`", run, own) for run in runs for own in judged(run)]
+    for name_of_run, run, own in found:
+        kind = (own.taught.row.type, own.taught.where)
         beside = [
-            (other, each)
-            for other, each in found
-            if other is not run and (each.taught.row.type, each.taught.where) == (row.type, own.taught.where)
+            (what, each) for what, _, each in found if what != name_of_run and (each.taught.row.type, each.taught.where) == kind
         ]
         worse = worse_than(own, [each for _, each in beside], is_less_better)
-        untold = [what_of(other.name) for other, each in beside if is_open(row, each, worse)]
-        names = ", ".join(f"`{what_of(other.name)}`" for other, each in beside if each in worse)
-        said = "; ".join(part for part in (names, f"open: {', '.join(f'`{one}`' for one in untold)}" if untold else "") if part)
-        cells = _cells(run, own)
-        what = [f"`{what_of(run.name)}`", *(f"`{key}={value}`" for key, value in own_overrides(run, runs).items())]
-        line = [", ".join(what), *cells[:-2], f"{row.minutes:.1f}", *cells[-2:], (said or "–") if own.can_be_worse else "open"]
-        lines.append(_line(line))
+        names = ", ".join(what for what, each in beside if each in worse)
+        untold = ", ".join(what for what, each in beside if is_open(own, each, worse))
+        changed = [f"`{key}={value}`" for key, value in own_overrides(run, runs).items()]
+        *cells, moved, flat = _cells(run, own)
+        lines.append(
+            _line(
+                [
+                    ", ".join([name_of_run, *changed]),
+                    *cells,
+                    f"{own.taught.row.minutes:.1f}",
+                    moved,
+                    flat,
+                    _verdict(own, names, untold),
+                ]
+            )
+        )
     lines += _yardsticks(runs[0], ["", "", ""], len(header))
     plotted = f"![Score over control steps of each student: {name}](images/ablation_{name}.png)"
     return "\n\n".join([f"### {name}", _conditions(runs), "\n".join(lines), plotted])
@@ -213,9 +221,15 @@ def write_page(folder: Path = KEPT, page: Path = PAGE) -> list[Path]:
 def _row(ablation: Ablation, own: Judged, found: Sequence[Judged]) -> list[str]:
     beside = _beside(own, found)
     worse = worse_than(own, beside, ablation.made["is_less_better"])
-    untold = _named([other for other in beside if not other.can_be_worse and other not in worse], beside)
-    said = "; ".join(part for part in (_named(worse, beside), f"open: {untold}" if untold else "") if part) or "–"
-    return [*_cells(ablation, own), said if own.can_be_worse else "open"]
+    untold = [other for other in beside if is_open(own, other, worse)]
+    return [*_cells(ablation, own), _verdict(own, _named(worse, beside), _named(untold, beside))]
+
+
+def _verdict(own: Judged, worse: str, untold: str) -> str:
+    """Return what some students are worse than, and of which others that is open."""
+    if not own.can_be_worse:
+        return "open"
+    return "; ".join(part for part in (worse, f"open: {untold}" if untold else "") if part) or "–"
 
 
 def _cells(ablation: Ablation, own: Judged) -> list[str]:

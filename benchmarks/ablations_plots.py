@@ -36,7 +36,7 @@ def plot(ablation: Ablation) -> Figure:
     for axes in panels[len(places) :]:
         axes.set_axis_off()
     for axes in panels[::columns]:
-        axes.set_ylabel(f"score [{ablation.made['unit']}]" if len(ablation.made["unit"]) < 20 else ablation.made["unit"])
+        axes.set_ylabel(score_label(ablation))
     handles = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside right upper", frameon=False, fontsize=8)
     return figure
@@ -46,18 +46,33 @@ def panel(axes: Axes, ablation: Ablation, taught: list[Taught], where: tuple[str
     """Draw the students of one place: the mean over seeds, and from the least to the largest of them."""
     ranked = sorted(taught, key=lambda each: each.row.score * (1 if ablation.made["is_less_better"] else -1))
     for each in ranked[:MOST_LINES]:
-        curves = ablation.curves[each.row.resolution]
-        score = np.stack([curves.score[name] for name in each.names])
-        millions, colour = curves.samples / 1e6, COLOURS[each.row.type]
-        axes.plot(millions, score.mean(axis=0), color=colour, linewidth=1.3, label=each.row.type)
-        axes.fill_between(millions, score.min(axis=0), score.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+        draw(axes, ablation, each, COLOURS[each.row.type], each.row.type)
+    draw_yardsticks(axes, ablation)
+    left_out = f" (best {MOST_LINES} of {len(ranked)})" if len(ranked) > MOST_LINES else ""
+    axes.set_title(", ".join(part for part in where if part) + left_out, fontsize=9, loc="left")
+
+
+def draw(axes: Axes, ablation: Ablation, taught: Taught, colour: tuple[float, ...] | str, label: str) -> None:
+    """Draw students that differ in their seeds alone: the mean over seeds, and from the least to the largest of them."""
+    curves = ablation.curves[taught.row.resolution]
+    score, millions = np.stack([curves.score[name] for name in taught.names]), curves.samples / 1e6
+    axes.plot(millions, score.mean(axis=0), color=colour, linewidth=1.3, label=label)
+    axes.fill_between(millions, score.min(axis=0), score.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+
+
+def draw_yardsticks(axes: Axes, ablation: Ablation) -> None:
+    """Draw teacher and joints at rest; name the axis of control steps."""
     for name, kept, dashes in (("teacher", ablation.teacher, "--"), ("joints at rest", ablation.rest, ":")):
         if kept is not None:
             axes.axhline(kept["score"], color="black", linestyle=dashes, linewidth=1.0, label=name)
-    left_out = f" (best {MOST_LINES} of {len(ranked)})" if len(ranked) > MOST_LINES else ""
-    axes.set_title(", ".join(part for part in where if part) + left_out, fontsize=9, loc="left")
     axes.set_xlabel("million control steps of each student", fontsize=9)
     axes.grid(True, color="#e3e5e8", linewidth=0.6)
+
+
+def score_label(ablation: Ablation) -> str:
+    """Return what stands at the axis of scores."""
+    unit = ablation.made["unit"]
+    return f"score [{unit}]" if len(unit) < 20 else unit
 
 
 def png_of(figure: Figure) -> bytes:

@@ -6,12 +6,10 @@ docs/ablations.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import groupby
 
-import numpy as np
 from ablations_kept import Ablation, KeptError
+from ablations_plots import draw, draw_yardsticks, score_label
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
@@ -36,8 +34,10 @@ def grouped(ablations: Sequence[Ablation]) -> list[list[Ablation]]:
     Raises:
         KeptError: If runs of a series are of unlike documents or teachers, or one is called as the series is.
     """
-    found = [list(own) for _, own in groupby(ablations, key=lambda each: series_of(each.name))]
-    for own in found:
+    found: dict[str, list[Ablation]] = {}
+    for each in ablations:
+        found.setdefault(series_of(each.name), []).append(each)
+    for own in found.values():
         if len(own) > 1 and not all(what_of(each.name) for each in own):
             raise KeptError(f"{own[0].name}: a series of runs has that name too: {own[1].name}")
         for each in own[1:]:
@@ -45,7 +45,7 @@ def grouped(ablations: Sequence[Ablation]) -> list[list[Ablation]]:
             if unlike:
                 what = f'{unlike[0]} "{each.made[unlike[0]]}", expected "{own[0].made[unlike[0]]}"'
                 raise KeptError(f"{each.name}: {what}, as {own[0].name} has it: they are of one series")
-    return found
+    return list(found.values())
 
 
 def common_overrides(runs: Sequence[Ablation]) -> dict[str, str]:
@@ -66,19 +66,9 @@ def series_plot(runs: Sequence[Ablation]) -> Figure:
     axes = figure.subplots()
     lines = [(run, each) for run in runs for each in run.taught]
     for i, (run, each) in enumerate(lines):
-        curves = run.curves[each.row.resolution]
-        score = np.stack([curves.score[name] for name in each.names])
         label = ", ".join((what_of(run.name), *([each.row.type, *each.where] if len(run.taught) > 1 else ())))
-        colour = colormaps["tab10"](i % 10)
-        axes.plot(curves.samples / 1e6, score.mean(axis=0), color=colour, linewidth=1.3, label=label)
-        axes.fill_between(curves.samples / 1e6, score.min(axis=0), score.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-    for name, dashes in (("teacher", "--"), ("rest", ":")):
-        kept = next((own for run in runs if (own := getattr(run, name)) is not None), None)
-        if kept is not None and math.isfinite(kept["score"]):
-            label = {"rest": "joints at rest"}.get(name, name)
-            axes.axhline(kept["score"], color="black", linestyle=dashes, linewidth=1.0, label=label)
-    axes.set_xlabel("million control steps of each student", fontsize=9)
-    axes.set_ylabel(f"score [{runs[0].made['unit']}]" if len(runs[0].made["unit"]) < 20 else runs[0].made["unit"])
-    axes.grid(True, color="#e3e5e8", linewidth=0.6)
+        draw(axes, run, each, colormaps["tab10"](i % 10), label)
+    draw_yardsticks(axes, runs[0])
+    axes.set_ylabel(score_label(runs[0]))
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
     return figure

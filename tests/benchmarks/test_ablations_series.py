@@ -56,6 +56,12 @@ def test_of_runs_of_other_lengths_nothing_is_said(kept):
     assert rows["lstm"].endswith("| yes | `rising`; open: `cnn`, `mlp` |")
 
 
+def test_a_name_that_sorts_in_between_does_not_part_a_series(kept, tmp_path):
+    for name in ("nets2", "nets__0"):
+        collect(made_up_run(tmp_path / name, {"force": lambda x: 7.0}), name, into=kept)
+    assert [line for line in tables(kept).splitlines() if line.startswith("#")] == ["### nets2", "### nets"]
+
+
 def test_a_series_has_one_plot(kept, tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"{BEGIN}\n{END}\n")
