@@ -24,7 +24,7 @@ from tgdsl.rl.load import load_task
 
 ROWS, DIGITS = 60, 4
 """Most rows of a curve, and digits of its numbers."""
-NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
+NAME = re.compile(r"[a-z0-9]+(_{1,2}[a-z0-9]+)*")
 STUDENTS = ("Score/", "Loss/")
 """What columns of students' curves begin with."""
 EVALUATED = (
@@ -65,7 +65,8 @@ def collect(
     if rows < 1:
         raise KeptError(f"--rows {rows}: expected at least 1")
     if not NAME.fullmatch(name):
-        raise KeptError(f'"{name}" is no name for an ablation, expected small letters, digits and _')
+        what = "expected small letters and digits, with _ between them, or SERIES__WHAT"
+        raise KeptError(f'"{name}" is no name for an ablation, {what}')
     asked = read_json(run / "distill.json", "a run of tgdsl distill")
     if not asked.get("resolutions"):
         raise KeptError(f"{run / 'distill.json'}: there are no resolutions: this is not what tgdsl distill writes")

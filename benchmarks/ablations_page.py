@@ -149,18 +149,8 @@ def series_section(runs: Sequence[Ablation]) -> str:
         untold = ", ".join(what for what, each in beside if is_open(own, each, worse))
         changed = [f"`{key}={value}`" for key, value in own_overrides(run, runs).items()]
         *cells, moved, flat = _cells(run, own)
-        lines.append(
-            _line(
-                [
-                    ", ".join([name_of_run, *changed]),
-                    *cells,
-                    f"{own.taught.row.minutes:.1f}",
-                    moved,
-                    flat,
-                    _verdict(own, names, untold),
-                ]
-            )
-        )
+        line = [", ".join([name_of_run, *changed]), *cells, f"{own.taught.row.minutes:.1f}", moved, flat]
+        lines.append(_line([*line, _verdict(own, names, untold)]))
     lines += _yardsticks(runs[0], ["", "", ""], len(header))
     plotted = f"![Score over control steps of each student: {name}](images/ablation_{name}.png)"
     return "\n\n".join([f"### {name}", _conditions(runs), "\n".join(lines), plotted])

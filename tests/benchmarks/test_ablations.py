@@ -245,7 +245,8 @@ def test_mistakes(tmp_path, capsys, monkeypatch):
         assert not (tmp_path / "kept").exists()
         return str(error.value)
 
-    assert '"a/b" is no name for an ablation' in refused(name="a/b")
+    for name in ("a/b", "", "nets__", "__cnn", "a___b"):
+        assert f'"{name}" is no name for an ablation' in refused(name=name)
     assert "--rows 0: expected at least 1" in refused(rows=0)
     assert "distill.json: cannot read this file" in refused(lambda run: (run / "distill.json").unlink())
     assert "table.csv: cannot read this file" in refused(lambda run: (run / "table.csv").unlink())
