@@ -10,6 +10,8 @@ from tgdsl.rl.train.model import EncodedModel, Gaussian
 from tgdsl.rl.train.normalising import Normalisation, RewardNormalisation
 
 GROUPS = {"tactile_sensors": 6, "goal": 3, "proprio": 4}
+MOMENTS = 1e-4
+"""Relative; an offset of 1e5 spreads is rounded in float32 by up to 0.3 % of one, which is 1e-5 of the variance."""
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
 
@@ -78,21 +80,52 @@ def test_drawn_numbers_are_those_of_torch():
 
 @pytest.mark.parametrize("until", [None, 40])
 def test_normalisation_is_rsl_rl_s_own_in_place(until):
-    """Of metres and of thousands; and, after `until` rows, of no more."""
-    own, other = Normalisation([3], 1e-2, until), EmpiricalNormalization([3], 1e-2, until)
+    """In float64, of metres and of thousands; and, after `until` rows, of no more."""
+    own, other = Normalisation([3], 1e-2, until), EmpiricalNormalization([3], 1e-2, until).double()
     places = {name: value.data_ptr() for name, value in own.state_dict().items()}
     generator = torch.Generator().manual_seed(0)
     for _ in range(4):
         rows = torch.randn((16, 3), generator=generator) * torch.tensor([1e-3, 1.0, 1e3]) + torch.tensor([0.1, 5.0, -1e3])
         own.update(rows)
-        other.update(rows)
-        torch.testing.assert_close(own(rows), other(rows), rtol=1e-5, atol=1e-6)
+        other.update(rows.double())
+        torch.testing.assert_close(own(rows), other(rows.double()).float(), rtol=1e-5, atol=1e-6)
     for name, value in other.state_dict().items():
-        torch.testing.assert_close(own.state_dict()[name], value, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(own.state_dict()[name], value, rtol=1e-8, atol=1e-12)
     assert {name: value.data_ptr() for name, value in own.state_dict().items()} == places
     own.eval()
     own.update(rows + 1.0)
     torch.testing.assert_close(own.state_dict()["_mean"], other.state_dict()["_mean"])
+
+
+def test_moments_follow_what_changes_late():
+    """Offsets of up to 1e5 spreads, and all moves by a spread after 1e9 rows: by float64 moments of all rows, joined."""
+    rows, updates = 1_000, 10_000
+    own, generator = Normalisation(9, 1e-5), torch.Generator().manual_seed(0)
+    x = 1e-2 * torch.randn((rows, 9), generator=generator) + torch.linspace(0.0, 1e3, 9)
+    late = x + 1e-2
+    own.update(x)
+    own.count.fill_(10**9)  # the same rows again and again change nothing else
+    for _ in range(updates):
+        own.update(late)
+    (mean, var), (late_mean, late_var) = (
+        (each.mean(dim=0), each.var(dim=0, correction=0)) for each in (x.double(), late.double())
+    )
+    share = rows * updates / (10**9 + rows * updates)
+    var = torch.lerp(var, late_var, share) + share * (1.0 - share) * (late_mean - mean).square()
+    mean = torch.lerp(mean, late_mean, share)
+    torch.testing.assert_close(own.mean.double(), mean, rtol=0.0, atol=1e-9)
+    torch.testing.assert_close(own.std.double(), var.sqrt(), rtol=MOMENTS, atol=0.0)
+    assert own(x).dtype == torch.float32
+
+
+def test_moments_of_older_checkpoints_are_float32():
+    own, old = Normalisation(3), EmpiricalNormalization(3)
+    rows = 3.0 * observations(40)["goal"] + 1.0
+    old.update(rows)
+    own.load_state_dict(old.state_dict())
+    for name in ("_mean", "_var", "_std"):
+        assert torch.equal(own.state_dict()[name], old.state_dict()[name].double())
+    torch.testing.assert_close(own(rows), old(rows))
 
 
 def test_a_small_eps_does_not_hide_what_is_in_metres_and_a_bound_keeps_what_is_rare():

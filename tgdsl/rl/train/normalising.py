@@ -1,6 +1,6 @@
 """rsl_rl's normalisers, kept on the device: no branch waits for a tensor's value, and memory stays where it is.
 
-Over several processes mean and variance are those of the joint batch.
+Moments are float64: after many rows a change is lost in float32. Over several processes they are those of the joint batch.
 
 Shapes: `row` rows of a batch, a row may have any shape.
 """
@@ -18,6 +18,11 @@ from tgdsl.rl.train.ranks import num_processes, summed
 class Normalisation(EmpiricalNormalization):
     """rsl_rl's empirical normalisation, bounded: clamp((x − mean)/(std + eps), ±clip)."""
 
+    _mean: Tensor
+    _var: Tensor
+    _std: Tensor
+    count: Tensor
+
     def __init__(self, shape: int | list[int], eps: float = 1e-2, until: int | None = None, clip: float = float("inf")):
         """Begin with mean 0 and variance 1.
 
@@ -29,10 +34,12 @@ class Normalisation(EmpiricalNormalization):
         """
         super().__init__(shape, eps, until)
         self.clip = float(clip)
+        for name in ("_mean", "_var", "_std"):
+            self.register_buffer(name, getattr(self, name).double())
 
     def forward(self, x: Tensor) -> Tensor:
         """Return rows normalised, (row, feature)."""
-        return ((x - self._mean) / (self._std + self.eps)).clamp(-self.clip, self.clip)
+        return ((x - self._mean.to(x.dtype)) / (self._std + self.eps).to(x.dtype)).clamp(-self.clip, self.clip)
 
     @torch.jit.unused
     def update(self, x: Float[Tensor, "row ..."]) -> None:
@@ -41,24 +48,23 @@ class Normalisation(EmpiricalNormalization):
             return
         with torch.no_grad():
             num = x.shape[0] * num_processes()
-            mean = x.sum(dim=0, keepdim=True)
+            mean = x.sum(dim=0, keepdim=True, dtype=torch.float64)
             summed(mean)
             mean /= num
-            var = (x - mean).square().sum(dim=0, keepdim=True)
+            var = (x - mean.to(x.dtype)).square().sum(dim=0, keepdim=True, dtype=torch.float64)
             summed(var)
             var /= num
             self._take(num, mean.view_as(self._mean), var.view_as(self._var))
 
     def _take(self, num: int, mean: Tensor, var: Tensor) -> None:
         """Take a batch's mean and variance into account, in place."""
-        count: Tensor = self.count  # pyright: ignore[reportAssignmentType]
-        is_open = torch.ones_like(count, dtype=torch.bool) if self.until is None else count < self.until
-        rate = is_open * (num / (count + num).to(mean.dtype))
+        is_open = torch.ones_like(self.count, dtype=torch.bool) if self.until is None else self.count < self.until
+        rate = is_open * (num / (self.count + num).to(mean.dtype))
         delta = mean - self._mean
         self._mean += rate * delta
         self._var += rate * (var - self._var + delta * (mean - self._mean))
         self._std.copy_(self._var.sqrt())
-        count += num * is_open
+        self.count += num * is_open
 
 
 class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
@@ -84,5 +90,5 @@ class RewardNormalisation(EmpiricalDiscountedVariationNormalization):
         if self.training:
             total.mul_(self.gamma).add_(rew)
             self.emp_norm.update(total)
-        std: Tensor = self.emp_norm._std
+        std = self.emp_norm._std.to(rew.dtype)
         return torch.where(std > 0, rew / std, rew).view_as(rew)
