@@ -17,7 +17,7 @@ from PIL import Image
 
 from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.policy import policy_for
+from tgdsl.rl.playing.policy import policy_for, read_policy
 
 COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
 """Images beside and below one another, and pixels of each."""
@@ -26,7 +26,7 @@ COLUMNS, ROWS, WIDTH, HEIGHT = 6, 2, 240, 200
 def poses(options: argparse.Namespace) -> tuple[mujoco.MjModel, int, list[np.ndarray]]:
     """Return the model, the object's body, and `qpos` at the instants that are drawn."""
     env = TouchEnv(options.task, 1, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
-    policy, obs, found = policy_for(env, options.policy), env.reset(), []
+    policy, obs, found = policy_for(env, read_policy(options.policy)), env.reset(), []
     first, every = (round(time / env.control_step) for time in (options.first, options.every))
     for step in range(first + every * COLUMNS * ROWS):
         if step >= first and (step - first) % every == 0:

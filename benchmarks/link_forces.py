@@ -15,13 +15,13 @@ import torch
 
 from tgdsl.commands.arguments import parsed_overrides
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.policy import policy_for
+from tgdsl.rl.playing.policy import policy_for, read_policy
 
 
 def link_forces(options: argparse.Namespace) -> tuple[torch.Tensor, torch.Tensor]:
     """Return forces [N] and depths [mm], of all links, instants and environments in one row, until episodes end."""
     env = TouchEnv(options.task, options.envs, seed=options.seed, overrides=parsed_overrides(tuple(options.set)))
-    policy, obs, found, depths = policy_for(env, options.policy), env.reset(), [], []
+    policy, obs, found, depths = policy_for(env, read_policy(options.policy)), env.reset(), [], []
     going_on = torch.ones(options.envs, dtype=torch.bool)
     for _ in range(env.max_steps):
         made = env.step(policy(obs))

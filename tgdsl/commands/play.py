@@ -15,6 +15,7 @@ from tgdsl.errors import TgdslError
 if TYPE_CHECKING:
     from tgdsl.rl.env import TouchEnv
     from tgdsl.rl.playing.actor import Actor
+    from tgdsl.rl.playing.policy import PolicyFile
     from tgdsl.rl.playing.record import Record
 
 _FILES = {"record": "played.npz", "video": "played.mp4"}
@@ -55,6 +56,7 @@ class Play:
         from tgdsl.files.write import check_writable, with_folder
         from tgdsl.rl.playing.actions import check_actions
         from tgdsl.rl.playing.play import steps_of
+        from tgdsl.rl.playing.policy import read_policy
         from tgdsl.rl.playing.record import Record
 
         files = {name: check_writable(self.out / file) for name, file in _FILES.items()}
@@ -63,12 +65,13 @@ class Play:
         if self.groups and self.policy is None:
             raise TgdslError("--groups are those of a policy; give one with --policy")
         check_actions(self.actions)
+        policy = None if self.policy is None else read_policy(self.policy)
         with StatusLine() as progress:
             env = self._env(progress)
         try:
             steps = steps_of(env, self.seconds)
             record = Record(env, steps)
-            self._steps(env, self._actor(env), record, steps)
+            self._steps(env, self._actor(env, policy), record, steps)
             record.write(with_folder(files["record"]))
             print(f"record: {files['record']}")
             if self.video:
@@ -85,13 +88,13 @@ class Play:
         check_camera(env.sim.model, self.camera)
         return env
 
-    def _actor(self, env: TouchEnv) -> Actor:
+    def _actor(self, env: TouchEnv, saved: PolicyFile | None) -> Actor:
         from tgdsl.rl.playing.actions import actor_of
         from tgdsl.rl.playing.policy import policy_for
 
-        if self.policy is None:
+        if saved is None:
             return actor_of(env, self.actions, self.seed)
-        policy = policy_for(env, self.policy, self.groups)
+        policy = policy_for(env, saved, self.groups)
         for line in policy.changes:
             print(f"changed since the policy was learned: {line}")
         return policy

@@ -8,6 +8,7 @@ import pytest
 from small_runs import ARGUMENTS
 from small_tasks import small_task
 
+from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.checkpoint import read_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -153,6 +154,24 @@ def test_time_is_a_limit_too(base, here):
         code, out, error = here(base, *start, "--minutes", minutes, *more)
         assert code == 0, error
         assert f"after {iterations} iterations" in out
+
+
+@pytest.mark.parametrize("words", [("evaluate", "--episodes", "2"), ("play", "--seconds", "0.1", "--no-video")])
+def test_a_policy_is_read_once(base, here, monkeypatch, words):
+    """Before environments are made: what is written into its file meanwhile is another policy."""
+    assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
+    file, made = base / "out" / "task" / "policy.pt", TouchEnv.__init__
+
+    def replaced(self, *arguments, **options):
+        file.write_bytes(b"another one, half written")
+        made(self, *arguments, **options)
+
+    monkeypatch.setattr(TouchEnv, "__init__", replaced)
+    command, *options = words
+    code, _, error = here(base, command, "task.yaml", "--policy", str(file), "--envs", "2", *options)
+    assert code == 0, error
+    said = here(base, command, "task.yaml", "--policy", str(file), "--envs", "2", *options)[2]
+    assert said.startswith(f"tgdsl: {file}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it")
 
 
 def test_without_rsl_rl_the_error_names_what_to_install(fails, monkeypatch):

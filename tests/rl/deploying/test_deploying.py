@@ -12,7 +12,7 @@ from pressing_hands import CALIBRATION, ORDER, SCALE, TURN, Blind, press_policy,
 from tgdsl.rl.deploying.deploy import Deployment, deploy
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.evaluation import SEED, evaluate
-from tgdsl.rl.playing.policy import policy_for
+from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.runtime.xhand1.velocity import VelocityFilter
 from tgdsl.runtime.xhand1.wire.payloads import JOINTS
 
@@ -42,7 +42,7 @@ def blind(task):
 def in_environments(task, file, **overrides):
     """Return observations and targets of each step of the first episodes of environments, (step, env, …), and scores."""
     env = TouchEnv(task, EPISODES, threads=1, overrides=overrides)
-    policy, obs, steps = policy_for(env, file), env.reset(SEED), []
+    policy, obs, steps = policy_for(env, read_policy(file)), env.reset(SEED), []
     for _ in range(env.max_steps):
         made = env.step(policy(obs))
         target = env.actuation.target.clone() if not made.info.ended.any() else None  # the next episode's
@@ -118,7 +118,7 @@ SOURCES = {"simulation": {}, "emulator": LOCKSTEP}
 def test_the_emulators_score_is_that_of_the_simulation(task, policy):
     """A policy that acts on what it feels: within the interval of as many episodes in environments."""
     env = TouchEnv(task, EPISODES, threads=1, overrides={"joint_vel": "measured"})
-    expected = evaluate(env, policy_for(env, policy), EPISODES)
+    expected = evaluate(env, policy_for(env, read_policy(policy)), EPISODES)
     env.close()
     simulated = deploy(task, policy, episodes=EPISODES).scores
     assert simulated.mean == pytest.approx(expected.score, abs=1e-5)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tgdsl.rl.env import TouchEnv
-from tgdsl.rl.playing.policy import card_of, policy_for
+from tgdsl.rl.playing.policy import policy_for, read_policy
 
 REPOSITORY = Path(__file__).parents[3]
 POLICIES = sorted((REPOSITORY / "policies").glob("*.pt"))
@@ -23,12 +23,13 @@ def test_it_does_better_than_rest(file):
     Its card names no place on the machine where it was learned.
     """
     assert file.stat().st_size <= 8 * 2**20
-    card = card_of(file)
+    saved = read_policy(file)
+    card = saved.card
     assert card["score"]["episodes"] >= 1000 and str(Path.home()) not in str(card) and "/tmp" not in str(card)
     is_long = "teacher" in card or card["score"]["task"] == "in_hand_repose"
     num = (8 if "teacher" in card else 16) if is_long else 4
     env = TouchEnv(REPOSITORY / card["task"], num, threads=1, overrides=card["overrides"])
-    policy, obs = policy_for(env, file), env.reset(seed=1)
+    policy, obs = policy_for(env, saved), env.reset(seed=1)
     assert set(policy.changes) <= {CAPPED}
     steps = env.max_steps - 1  # after the last one of an episode the score is that of the next
     steps = steps if is_long else min(steps, round(2.0 / env.control_step))

@@ -5,7 +5,7 @@ import torch
 from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 
-from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups
+from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups, read_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 GROUPS = {"proprio": 6, "goal": 7}
@@ -28,7 +28,7 @@ def test_it_acts_as_the_network_that_was_exported(tmp_path):
     """With normalised observations and a distribution, of which an exported policy returns the mean."""
     model, obs = network(obs_normalization=True, distribution_cfg={"class_name": "GaussianDistribution"})
     model.obs_normalizer._mean.fill_(0.3)
-    policy = Policy(exported(model, tmp_path / "policy.pt"), GROUPS, 3, 2)
+    policy = Policy(read_policy(exported(model, tmp_path / "policy.pt")), GROUPS, 3, 2)
     action = policy({**obs, "priv_obj_state": torch.zeros(3, 15)})
     torch.testing.assert_close(action, model(obs).detach())
     assert not action.requires_grad
@@ -36,7 +36,7 @@ def test_it_acts_as_the_network_that_was_exported(tmp_path):
 
 def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
     model, obs = network(RNNModel, num_envs=1, rnn_type="gru", rnn_hidden_dim=4, rnn_num_layers=1)
-    policy = Policy(exported(model, tmp_path / "policy.pt"), GROUPS, 1, 2)
+    policy = Policy(read_policy(exported(model, tmp_path / "policy.pt")), GROUPS, 1, 2)
     obs = dict(obs)
     first, second = policy(obs), policy(obs)
     assert not torch.equal(first, second)
@@ -47,7 +47,7 @@ def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
     with pytest.raises(
         PolicyError, match=r"does not take proprio \(6\) \+ goal \(7\) = 13 numbers of 3 environments: .*hidden"
     ):
-        Policy(tmp_path / "policy.pt", GROUPS, 3, 2)
+        Policy(read_policy(tmp_path / "policy.pt"), GROUPS, 3, 2)
 
 
 def test_groups_are_named_or_those_of_a_hand_that_there_are():
@@ -67,7 +67,7 @@ def test_policies_that_do_not_fit(tmp_path):
     }
     for (names, num_actions), message in cases.items():
         with pytest.raises(PolicyError) as raised:
-            Policy(file, {name: GROUPS[name] for name in names}, 3, num_actions)
+            Policy(read_policy(file), {name: GROUPS[name] for name in names}, 3, num_actions)
         assert str(raised.value) == f"{file}: {message}"
 
 
@@ -84,15 +84,15 @@ def test_modules_that_are_no_policies(tmp_path):
     for kind, message in messages.items():
         torch.jit.script(kind()).save(str(tmp_path / "module.pt"))
         with pytest.raises(PolicyError, match=message):
-            Policy(tmp_path / "module.pt", GROUPS, 3, 2)
+            Policy(read_policy(tmp_path / "module.pt"), GROUPS, 3, 2)
 
 
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(PolicyError) as raised:
-        Policy(tmp_path / "none.pt", GROUPS, 3, 2)
+        Policy(read_policy(tmp_path / "none.pt"), GROUPS, 3, 2)
     assert str(raised.value) == f"{tmp_path}/none.pt: cannot read this file: No such file or directory"
     torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # what the runner keeps: no policy by itself
     (tmp_path / "text.pt").write_text("no module")
     for name in ("model_0.pt", "text.pt"):
         with pytest.raises(PolicyError, match=rf"{name}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit`"):
-            Policy(tmp_path / name, GROUPS, 3, 2)
+            Policy(read_policy(tmp_path / name), GROUPS, 3, 2)

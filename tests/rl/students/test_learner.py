@@ -11,7 +11,7 @@ from tgdsl.errors import SpecError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
 from tgdsl.rl.playing.evaluation import evaluate, evaluate_each
-from tgdsl.rl.playing.policy import policy_for
+from tgdsl.rl.playing.policy import policy_for, read_policy
 from tgdsl.rl.sensed import Felt
 from tgdsl.rl.students.keys import feels, student_keys
 from tgdsl.rl.students.learner import Distiller
@@ -328,7 +328,7 @@ def test_a_teacher_may_feel(make, tmp_path):
         bound, obs = own.bound(env), env.reset(4)
         assert bound.groups == ("proprio", "tactile_sensors/depth/all/clean")
         alone = TouchEnv(loaded, 2, seed=1, threads=1)
-        torch.testing.assert_close(bound(obs), policy_for(alone, file)(alone.reset(4)))
+        torch.testing.assert_close(bound(obs), policy_for(alone, read_policy(file))(alone.reset(4)))
         alone.close()
     finally:
         env.close()

@@ -6,10 +6,9 @@ import pytest
 import torch
 from small_runs import small_learner
 
-from tgdsl.rl.playing.policy import PolicyError, card_of, policy_for
+from tgdsl.rl.playing.policy import PolicyError, policy_for, read_policy
 from tgdsl.rl.train.folder import made_from
-from tgdsl.rl.train.policies import card_of as card_for
-from tgdsl.rl.train.policies import write_policy
+from tgdsl.rl.train.policies import card_of, write_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
@@ -21,22 +20,22 @@ def test_a_policy_brings_its_card(tmp_path):
     """
     learner, loaded = small_learner(tmp_path, train__actor="[tactile_sensors, proprio]")
     learner.iterate()
-    card = card_for(learner, made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
+    card = card_of(learner, made_from(loaded, learner.env, 0, {"a": 1}, 1), 90.0, "tgdsl train task.yaml")
     file = tmp_path / "a policy.pt"
     write_policy(learner, card, file)
-    assert card_of(file) == card == json.loads((tmp_path / "a policy.json").read_text())
+    assert read_policy(file).card == card == json.loads((tmp_path / "a policy.json").read_text())
     assert card["groups"] == {"tactile_sensors": 4, "proprio": 6} and card["minutes"] == 1.5 and card["samples"] == 16
     env = learner.env
-    policy, obs = policy_for(env, file), env.reset(3)
+    policy, obs = policy_for(env, read_policy(file)), env.reset(3)
     assert policy.groups == ("tactile_sensors", "proprio")
     with torch.no_grad():
         torch.testing.assert_close(policy(obs), learner.algorithm.actor(learner._seen(obs)))
     write_policy(learner, card | {"joints": ["bend", "swing"]}, file)
     with pytest.raises(PolicyError, match="this policy moves bend, swing, not swing, bend"):
-        policy_for(env, file)
+        policy_for(env, read_policy(file))
     write_policy(learner, card | {"taxels": "0"}, file)
     with pytest.raises(PolicyError, match="this policy feels with other taxels"):
-        policy_for(env, file)
+        policy_for(env, read_policy(file))
     learned = card["spec"]
     for other, message in (
         ({"task": "screwdriver"}, f'was learned in the task "screwdriver", not "{learned["task"]}"'),
@@ -45,30 +44,30 @@ def test_a_policy_brings_its_card(tmp_path):
     ):
         write_policy(learner, card | {"spec": learned | other}, file)
         with pytest.raises(PolicyError, match=message):
-            policy_for(env, file)
+            policy_for(env, read_policy(file))
     write_policy(learner, card | {"spec": learned | {"touch": "depth"}}, file)
     with pytest.raises(PolicyError, match=f"this policy feels depth, not {learned['touch']}; try --set touch=depth"):
-        policy_for(env, file)
+        policy_for(env, read_policy(file))
     write_policy(learner, card | {"spec": learned | {"action": {"mode": "other"}}}, file)
     with pytest.raises(PolicyError, match=r'was learned with other actions: {"mode": "other"}, here'):
-        policy_for(env, file)
+        policy_for(env, read_policy(file))
     write_policy(learner, card, file)
     with pytest.raises(
         PolicyError, match=r"takes tactile_sensors \(4\) \+ proprio \(6\), not proprio \(6\) \+ tactile_sensors"
     ):
-        policy_for(env, file, ("proprio", "tactile_sensors"))
+        policy_for(env, read_policy(file), ("proprio", "tactile_sensors"))
     less = {name: value for name, value in learned["action"].items() if name != "smoothing"}  # of an older tgdsl
     rounded = learned["action"] | {"scale": learned["action"]["scale"] * (1.0 + 1e-15)}  # 0.7 cm are not quite 7 mm
     for action in (less, rounded):
         write_policy(learner, card | {"spec": learned | {"action": action}}, file)
-        assert policy_for(env, file).groups == ("tactile_sensors", "proprio")
+        assert policy_for(env, read_policy(file)).groups == ("tactile_sensors", "proprio")
     pushes = {"push": {**learned["randomise"]["push"], "interval": [2.0 * (1.0 + 1e-15), 4.0]}}
     for before, expected in (
         ({"episode": learned["episode"] * (1.0 + 1e-15), "randomise": learned["randomise"] | pushes}, []),
         ({"episode": 2.0 * learned["episode"]}, [f"episode: {2.0 * learned['episode']}, now {learned['episode']}"]),
     ):
         write_policy(learner, card | {"spec": learned | before}, file)
-        assert policy_for(env, file).changes == expected
+        assert policy_for(env, read_policy(file)).changes == expected
     for lacking, message in (
         ({**card, "spec": {}}, "has no spec.task"),
         ({**card, "spec": learned | {"physics": {"timestep": 0.005}}}, r"has no spec\.physics\.substeps"),
@@ -77,9 +76,9 @@ def test_a_policy_brings_its_card(tmp_path):
     ):
         torch.jit.save(torch.jit.load(file), file, _extra_files={"card.json": json.dumps(lacking)})
         with pytest.raises(PolicyError, match=f"its card.json {message}: this is not what tgdsl train writes"):
-            card_of(file)
+            read_policy(file)
     blind, _ = small_learner(tmp_path)
     write_policy(blind, card | {"taxels": "0", "groups": {name: env.groups[name] for name in blind.groups["actor"]}}, file)
-    assert policy_for(env, file).groups == ("priv_proprio", "goal", "priv_obj_state")
+    assert policy_for(env, read_policy(file)).groups == ("priv_proprio", "goal", "priv_obj_state")
     with pytest.raises(PolicyError, match="this policy takes 31 numbers, not proprio"):
-        policy_for(env, file, ("proprio",))
+        policy_for(env, read_policy(file), ("proprio",))

@@ -214,7 +214,7 @@ class _Part:
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}
-            origin["teacher_sha256"] = hashlib.sha256(Path(self._asked["teacher"]).read_bytes()).hexdigest()
+            origin["teacher_sha256"] = hashlib.sha256(self.teacher.saved.content).hexdigest()
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
                 print(f"changed since the run began: {line}")

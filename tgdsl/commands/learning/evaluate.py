@@ -43,7 +43,7 @@ class Evaluate:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.playing.actions import ZeroActor
         from tgdsl.rl.playing.evaluation import SEED, evaluate
-        from tgdsl.rl.playing.policy import card_of, policy_for
+        from tgdsl.rl.playing.policy import policy_for, read_policy
 
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
@@ -51,8 +51,7 @@ class Evaluate:
             raise TgdslError("--groups are those of a policy; give one with --policy")
         if self.out is not None:
             check_writable(self.out)
-        if self.policy is not None:
-            card_of(self.policy)
+        policy = None if self.policy is None else read_policy(self.policy)
         seed = SEED if self.seed is None else self.seed
         envs = min(self.envs, self.episodes)
         with StatusLine() as progress:
@@ -63,7 +62,7 @@ class Evaluate:
             if envs < variants:
                 played = "1 is" if envs == 1 else f"the first {envs} are"
                 print(f'of the {variants} variants of "{env.spec.object}" {played} played: there are no more environments')
-            actor = ZeroActor(env) if self.policy is None else policy_for(env, self.policy, self.groups)
+            actor = ZeroActor(env) if policy is None else policy_for(env, policy, self.groups)
             for line in actor.changes:
                 print(f"changed since the policy was learned: {line}")
             with StatusLine() as progress:

@@ -150,7 +150,7 @@ class Train:
         """Write the policy, evaluate it, and say so."""
         from tgdsl.files.write import atomic_write
         from tgdsl.rl.playing.evaluation import evaluate
-        from tgdsl.rl.playing.policy import policy_for
+        from tgdsl.rl.playing.policy import policy_for, read_policy
         from tgdsl.rl.train.policies import card_of, write_policy
 
         command = shlex.join(["tgdsl", *sys.argv[1:]])
@@ -161,7 +161,8 @@ class Train:
         )
         if self.episodes:
             with StatusLine() as progress:
-                found = evaluate(learner.env, policy_for(learner.env, folder.policy), self.episodes, progress=progress)
+                actor = policy_for(learner.env, read_policy(folder.policy))
+                found = evaluate(learner.env, actor, self.episodes, progress=progress)
             write_policy(learner, card | {"score": found.plain()}, folder.policy)
             atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(found)

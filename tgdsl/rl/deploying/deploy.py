@@ -222,7 +222,7 @@ class Deployment:
         pairs = [age + own for age, own in zip(sums.ages, sums.inferences, strict=True) if age is not None]
         return Report(
             task=spec.task,
-            policy=str(self.prepared.file),
+            policy=str(self.prepared.saved.file),
             source=self.source,
             unit=self.prepared.loaded.task.score_unit,
             episodes=len(sums.scores) if self.has_scene else max(1, len(sums.are_held)),

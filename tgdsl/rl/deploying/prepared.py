@@ -19,7 +19,16 @@ from tgdsl.console.progress import Progress
 from tgdsl.errors import LowerError, SimulationError, TgdslError, listed
 from tgdsl.rl.actuation import Actuators
 from tgdsl.rl.load import LoadedTask, load_task
-from tgdsl.rl.playing.policy import ACTOR_GROUPS, Policy, PolicyError, card_of, changes_since, check_card, check_learned
+from tgdsl.rl.playing.policy import (
+    ACTOR_GROUPS,
+    Policy,
+    PolicyError,
+    PolicyFile,
+    changes_since,
+    check_card,
+    check_learned,
+    read_policy,
+)
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
 from tgdsl.rl.start import moved_joints
 from tgdsl.scene.scene import SceneModels
@@ -43,7 +52,7 @@ class Prepared:
     """A policy with all that is needed to connect it.
 
     Attributes:
-        file: The policy's file.
+        saved: The policy's file.
         loaded: The task's document, with what the policy feels and is asked for.
         sensed: Its module: what the policy feels and the task looks at, and the joints.
         felt: What the policy feels; None: nothing.
@@ -56,7 +65,7 @@ class Prepared:
         changes: What of the task was otherwise when the policy was learned, a line each.
     """
 
-    file: Path
+    saved: PolicyFile
     loaded: LoadedTask
     sensed: Sensed
     felt: Felt | None
@@ -80,7 +89,7 @@ class Prepared:
         Raises:
             PolicyError: If it does not take its groups, or moves other joints.
         """
-        return Policy(self.file, self.groups, 1, len(self.moved.names))
+        return Policy(self.saved, self.groups, 1, len(self.moved.names))
 
 
 def prepare(
@@ -116,7 +125,8 @@ def prepare(
         DeployError: If it sees what no hand can know, or is asked for what it cannot be.
     """
     loaded = load_task(task, overrides)
-    card = card_of(policy)
+    saved = read_policy(policy)
+    card = saved.card
     changes: Sequence[str] = ()
     if card is not None:
         check_learned(card, policy, loaded.spec)
@@ -143,7 +153,7 @@ def prepare(
         raise loaded.error(("joints",), str(error)) from error
     sizes = {name: _size(name, card, sensed, felt, len(moved), asked) for name in names}
     actuator_id = _actuators(model, joints)
-    found = Prepared(policy, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
+    found = Prepared(saved, loaded, sensed, felt, sizes, asked, model, joints, actuator_id, actuators, changes)
     found.policy()
     return found
 

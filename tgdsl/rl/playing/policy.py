@@ -9,10 +9,12 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,47 @@ CARD = "card.json"
 
 class PolicyError(TgdslError):
     """A policy that cannot be read, or that is of other sizes than the environments."""
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyFile:
+    """A policy's file as it was when it was read; what is written into it later is another policy.
+
+    Attributes:
+        file: The file.
+        content: Its bytes.
+        card: Its card; None: it has none.
+    """
+
+    file: Path
+    content: bytes
+    card: dict[str, Any] | None
+
+    def module(self, device: torch.device | str) -> torch.jit.ScriptModule:
+        """Return the network, with a memory of its own."""
+        return _module(self.content, device)
+
+
+def read_policy(file: Path) -> PolicyFile:
+    """Read a policy's file, once.
+
+    Raises:
+        PolicyError: If it cannot be read, or is no TorchScript.
+    """
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise PolicyError(f"{file}: cannot read this file: {error.strerror or error}") from error
+    extra: dict[str, Any] = {CARD: ""}
+    try:
+        _module(content, "cpu", extra)
+        card = json.loads(extra[CARD]) if extra[CARD] else None
+    except (RuntimeError, ValueError) as error:
+        what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
+        raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
+    if card is not None:
+        _check_fields(card, file)
+    return PolicyFile(file, content, card)
 
 
 def actor_groups(
@@ -70,22 +113,22 @@ class Policy(Actor):
     """
 
     def __init__(
-        self, file: Path, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
+        self, saved: PolicyFile, groups: Mapping[str, int], num_envs: int, num_actions: int, device: torch.device | str = "cpu"
     ):
-        """Read a policy, and see that it fits.
+        """See that a policy fits.
 
         Args:
-            file: The TorchScript file.
+            saved: Its file.
             groups: Size of each group of observations that it takes, in its order.
             num_envs: Number of environments.
             num_actions: Number of joints that it moves.
             device: Where it computes.
 
         Raises:
-            PolicyError: If it cannot be read, or does not fit.
+            PolicyError: If it does not fit.
         """
         self.groups, self._num_envs = tuple(groups), num_envs
-        self._module, card = _read(file, device)
+        self._module, card, file = saved.module(device), saved.card, saved.file
         total = sum(groups.values())
         taken = f"{' + '.join(f'{name} ({size})' for name, size in groups.items())} = {total}"
         first = next((weight.shape[1] for weight in self._module.parameters() if weight.ndim == 2), total)
@@ -120,18 +163,18 @@ class Policy(Actor):
             self._module.reset()
 
 
-def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
+def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> Policy:
     """Return a policy that acts in some environments.
 
     Args:
         env: The environments.
-        file: The policy.
+        saved: The policy's file.
         named: Groups of observations that it takes, in its order; default: see `actor_groups`.
 
     Raises:
-        PolicyError: If it cannot be read, is for other environments, or feels something else than they do.
+        PolicyError: If it is for other environments, or feels something else than they do.
     """
-    card = card_of(file)
+    card, file = saved.card, saved.file
     if card is not None:
         check_learned(card, file, env.spec)
         check_card(card, file, env.joint_names, env.touch.taxels_id)
@@ -139,7 +182,7 @@ def policy_for(env: TouchEnv, file: Path, named: Sequence[str] = ()) -> Policy:
         if GROUP in card["groups"] and felt != env.spec.touch:
             raise PolicyError(f"{file}: this policy feels {felt}, not {env.spec.touch}; try --set touch={felt}")
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
-    policy = Policy(file, groups, env.num_envs, env.num_actions, env.device)
+    policy = Policy(saved, groups, env.num_envs, env.num_actions, env.device)
     if card is not None:
         policy.changes = changes_since(card, env.spec)
     return policy
@@ -155,15 +198,6 @@ def changes_since(card: Mapping[str, Any], spec: TaskSpec, leave_out: tuple[str,
     """
     unfelt = () if GROUP in card["groups"] else OF_TOUCH
     return spec_differences(card["spec"], spec.model_dump(mode="json"), type(spec), (*OF_LEARNING, *unfelt, *leave_out))
-
-
-def card_of(file: Path) -> dict[str, Any] | None:
-    """Return a policy's card; None if it has none.
-
-    Raises:
-        PolicyError: If the policy cannot be read.
-    """
-    return _read(file, "cpu")[1]
 
 
 def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str = "policy") -> None:
@@ -217,28 +251,11 @@ def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxel
         raise PolicyError(f"{file}: this policy feels with other taxels: its taxels.csv lists them")
 
 
-def _read(file: Path, device: torch.device | str) -> tuple[torch.jit.ScriptModule, dict[str, Any] | None]:
-    """Return the module of a TorchScript file, and its card, if it has one.
-
-    Raises:
-        PolicyError: If it cannot be read.
-    """
-    try:
-        content = file.open("rb")
-    except OSError as error:
-        raise PolicyError(f"{file}: cannot read this file: {error.strerror or error}") from error
-    extra: dict[str, Any] = {CARD: ""}
-    with content, warnings.catch_warnings():
+def _module(content: bytes, device: torch.device | str, extra_files: dict[str, Any] | None = None) -> torch.jit.ScriptModule:
+    """Return the module that a TorchScript file holds; `extra_files` are filled in."""
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself, which rsl_rl writes
-        try:
-            module = torch.jit.load(content, map_location=device, _extra_files=extra).eval()
-            card = json.loads(extra[CARD]) if extra[CARD] else None
-        except (RuntimeError, ValueError, OSError) as error:
-            what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
-            raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
-    if card is not None:
-        _check_fields(card, file)
-    return module, card
+        return torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra_files).eval()
 
 
 def _check_fields(card: Any, file: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
-from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, card_of, changes_since, check_card, check_learned
+from tgdsl.rl.playing.policy import OF_TOUCH, Policy, PolicyError, changes_since, check_card, check_learned, read_policy
 from tgdsl.rl.sensed import GROUP, Felt, compile_sensed
 
 WARM_CALLS = 3
@@ -25,7 +25,7 @@ class Teacher:
     """A learned policy, seen to be of this task.
 
     Attributes:
-        file: Its file.
+        saved: Its file.
         card: Its card.
         felt: What it feels; None: nothing.
         changes: What else of the task was otherwise when it was learned, a line each.
@@ -38,8 +38,8 @@ class Teacher:
             PolicyError: If it cannot be read, has no card, or was learned in another task, with other joints or actions, or a
                 loss needs the deviations of its actions, which it does not tell.
         """
-        self.file = file
-        card = card_of(file)
+        self.saved = read_policy(file)
+        card = self.saved.card
         if card is None or "spec" not in card:
             raise PolicyError(f"{file}: this policy has no card that says how it was learned, as `tgdsl train` writes it")
         check_learned(card, file, loaded.spec, "teacher")
@@ -65,7 +65,7 @@ class Teacher:
         if self.felt is None:
             return
         loaded = own_task(self._loaded, self.felt)
-        check_card(self.card, self.file, self.card["joints"], compile_sensed(loaded, "cpu").touch.taxels_id)
+        check_card(self.card, self.saved.file, self.card["joints"], compile_sensed(loaded, "cpu").touch.taxels_id)
 
     def bound(self, env: TouchEnv) -> BoundTeacher:
         """Return it for some environments.
@@ -86,7 +86,7 @@ class BoundTeacher:
 
     def __init__(self, teacher: Teacher, env: TouchEnv):
         """See that it fits."""
-        card, file = teacher.card, teacher.file
+        card, file = teacher.card, teacher.saved.file
         if list(env.joint_names) != list(card["joints"]):
             moved = (", ".join(names) for names in (card["joints"], env.joint_names))
             raise PolicyError("{}: this teacher moves {}, not {}".format(file, *moved))
@@ -97,7 +97,8 @@ class BoundTeacher:
                 what = "is not there" if found is None else f"has {found} numbers, not {size}: probes or objects are others"
                 raise PolicyError(f'{file}: this teacher sees the group "{name}", which {what}')
         self.groups = tuple(names.values())
-        self._policy = Policy(file, {name: env.groups[name] for name in self.groups}, env.num_envs, env.num_actions, env.device)
+        groups = {name: env.groups[name] for name in self.groups}
+        self._policy = Policy(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
         self.std = torch.tensor(card["std"], device=env.device) if card.get("std") else None
         for _ in range(WARM_CALLS):
             self({name: torch.zeros((env.num_envs, env.groups[name]), device=env.device) for name in self.groups})
