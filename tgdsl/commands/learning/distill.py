@@ -178,7 +178,7 @@ class _Part:
         check_felt(self._loaded, self._felt)
 
     def check(self, is_resumed: bool) -> None:
-        """See that the folder can be written, that there are such taxels, and that a teacher that feels does so with them.
+        """See that the run can begin or go on in its folder, that there are such taxels, and that a teacher feels with them.
 
         Raises:
             TgdslError: If not.
@@ -187,6 +187,8 @@ class _Part:
         from tgdsl.rl.sensed import compile_sensed
 
         self._goes_on = is_resumed and self._folder.checkpoint.is_file()
+        if self._goes_on:
+            self._folder.check(is_resumed=True)
         check_writable(self._folder.checkpoint)
         self.teacher.check_taxels()
         if len(self._asked["resolutions"]) > 1:  # else it is compiled next

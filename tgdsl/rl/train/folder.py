@@ -37,6 +37,8 @@ from tgdsl.rl.playing.differences import differences, spec_differences
 from tgdsl.rl.spec import TaskSpec
 
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
+COLUMNS = ("iteration", "samples", "seconds")
+"""First columns of a curve."""
 COPIES = 3
 """How many checkpoints must find room on the disk before a run begins: the old one, the new one, and what else is written."""
 
@@ -86,12 +88,13 @@ class RunFolder:
 
         Raises:
             FileError: If the folder cannot be written.
-            TgdslError: If there is a run already, or none to go on with.
+            TgdslError: If there is a run already, or none to go on with, or what should be its curve is none.
         """
         if not is_resumed and self.has_run:
             raise TgdslError(f"{self.path}: this folder holds a run; go on with --resume {self.path}, or give another --out")
         if is_resumed and not self.checkpoint.is_file():
             raise TgdslError(f"{self.path}: there is no checkpoint.pt to go on with")
+        self.rows()
         check_writable(self.checkpoint)
 
     def check_room(self, size: int) -> None:
@@ -132,23 +135,41 @@ class RunFolder:
         return starts[-1]
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of the curve; none if there is no curve."""
+        """Return the rows of the curve but for a line, header or row, that was half written when the run was killed.
+
+        Raises:
+            TgdslError: If it is no curve.
+        """
         if not self.curve.is_file():
             return []
-        with self.curve.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+        text = self.curve.read_text(encoding="utf-8", errors="replace")
+        lines = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
+        names: list[str] = next(lines, [*COLUMNS])
+        if names[: len(COLUMNS)] != list(COLUMNS):
+            raise self._no_curve(1, names, f"the columns {', '.join(COLUMNS)}, …")
+        rows = []
+        for row in lines:
+            if len(row) != len(names) or not row[0].isdecimal():
+                raise self._no_curve(lines.line_num, row, f"{len(names)} values of an iteration")
+            rows.append(dict(zip(names, row, strict=True)))
+        return rows
 
     def keep_rows(self, iterations: int) -> None:
-        """Drop the curve's rows beyond some iterations: those that are made again."""
-        rows = self.rows()
-        whole = [row for row in rows if None not in row.values()]  # not half written when the run was killed
-        kept = [row for row in whole if int(row["iteration"]) <= iterations]
-        if len(kept) < len(rows):
-            text = io.StringIO()
-            writer = csv.DictWriter(text, list(rows[0]), extrasaction="ignore", lineterminator="\n")
+        """Drop the curve's rows beyond some iterations, which are made again, and what was half written.
+
+        Raises:
+            TgdslError: If it is no curve.
+            FileError: If it cannot be written.
+        """
+        kept = [row for row in self.rows() if int(row["iteration"]) <= iterations]
+        text = io.StringIO()
+        if kept:
+            writer = csv.DictWriter(text, list(kept[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(kept)
-            atomic_write(self.curve, text.getvalue().encode())
+        content = text.getvalue().encode()
+        if self.curve.is_file() and self.curve.read_bytes() != content:
+            atomic_write(self.curve, content)
 
     def add_row(self, row: Mapping[str, float | int]) -> None:
         """Add a row to the curve, under the names that its first row had; nan is what is not known.
@@ -164,6 +185,11 @@ class RunFolder:
             if file.tell() == 0:
                 writer.writeheader()
             writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in row.items()})
+
+    def _no_curve(self, line: int, found: list[str], expected: str) -> TgdslError:
+        """Return the error of a file that is no curve."""
+        first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
+        return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
 
     def _read(self) -> dict[str, Any]:
         try:
