@@ -172,7 +172,7 @@ def test_what_is_refused_leaves_a_run_as_it_was(base, here):
 
 
 def test_resolutions_are_simulations_one_after_the_other(base, here):
-    """One that the layout lacks is named before the first begins."""
+    """One that the layout lacks is named before the first begins, and one that cannot go on before the first goes on."""
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
     code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "low,med", *SMALL)
     assert code == 2 and '"med"' in error and not (base / "out").exists()
@@ -186,6 +186,12 @@ def test_resolutions_are_simulations_one_after_the_other(base, here):
         json.loads((base / "both" / name / "students" / "depth-ends-clean-s1.json").read_text()) for name in ("low", "high")
     ]
     assert [card["groups"]["tactile_sensors"] for card in cards] == [4, 9]
+    file = base / "both" / "high" / "checkpoint.pt"
+    file.write_bytes(file.read_bytes()[:-1])
+    kept = {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
+    code, out, error = here(base, "distill", "task.yaml", "--resume", "both", "--device", "cpu", "--iterations", "2")
+    assert (code, out) == (2, "") and f"both/high/checkpoint.pt: found {len(kept[file]):,} bytes that are cut off" in error
+    assert kept == {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
 
 
 def test_mistakes_are_named_before_anything_runs(base, fails):

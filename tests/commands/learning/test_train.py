@@ -216,6 +216,19 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_anew(base, her
     assert "this folder holds a run" in here(base, *train)[2]
 
 
+def test_a_checkpoint_that_is_cut_off_is_refused_and_nothing_is_lost(base, here, fails):
+    assert here(base, "train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)[0] == 0
+    file = base / "out" / "task" / "checkpoint.pt"
+    file.write_bytes(file.read_bytes()[:999])
+    kept = {each: each.read_bytes() for each in (base / "out").rglob("*") if each.is_file()}
+    for out in ("out/task", "other"):
+        said = fails("train", "task.yaml", *ON, "--resume", "out/task", "--out", out)
+        assert said.startswith(
+            "tgdsl: out/task/checkpoint.pt: found 999 bytes that are cut off, or of something else, expected"
+        )
+    assert {each: each.read_bytes() for each in (base / "out").rglob("*") if each.is_file()} == kept
+
+
 def test_what_is_set_anew_replaces_what_stands_below_it(base, here):
     """And speed is that of the iterations made since, in as many environments as there are now."""
     train = ("train", "task.yaml", "--device", "cpu", "--episodes", "0", *ARGUMENTS)

@@ -171,13 +171,35 @@ def test_other_groups_networks_and_files_are_refused_by_name(tmp_path):
     more, _ = small_learner(tmp_path, num_envs=5)
     restore(more, state, file)  # of another number of environments: these begin anew
     assert int(more.env.steps.sum()) == 0
-    for content in (b"", b"no checkpoint", file.read_bytes()[:1000]):
-        (tmp_path / "other.pt").write_bytes(content)
-        with pytest.raises(CheckpointError, match=r"other\.pt: cannot read this checkpoint"):
-            read_checkpoint(tmp_path / "other.pt")
-    torch.save({"actor": 1}, tmp_path / "other.pt")
-    with pytest.raises(CheckpointError, match="this is no checkpoint of `tgdsl train` or `tgdsl distill`"):
-        read_checkpoint(tmp_path / "other.pt")
+
+
+def test_what_is_no_checkpoint_is_named(tmp_path):
+    """With what was found, and what would be right: nothing of torch's own advice, some of which is to run what is found."""
+    file, other = tmp_path / "whole.pt", tmp_path / "other.pt"
+    run, _ = begun(tmp_path)
+    state = read_checkpoint(run._folder.checkpoint)
+    write_checkpoint(state, file)
+    content = file.read_bytes()
+
+    def found():
+        with pytest.raises(CheckpointError) as raised:
+            read_checkpoint(other)
+        before, after = f"{other}: found ", ", expected a checkpoint of `tgdsl train` or `tgdsl distill`; "
+        assert str(raised.value).startswith(before)
+        said, hint = str(raised.value).removeprefix(before).split(after)
+        assert hint == "put back a copy of one, or begin anew with another --out"
+        return said
+
+    for part in (b"", b"no checkpoint", content[:1000], content[: len(content) // 2], content[:-1]):
+        other.write_bytes(part)
+        assert found() == f"{len(part):,} bytes that are cut off, or of something else"
+    for value in ({"actor": 1}, [1], Path("a")):  # of which the last is not read: to do so might run it
+        torch.save(value, other)
+        assert found() == "a file of something else"
+    write_checkpoint(state | {"format": 2}, other)
+    assert found() == "a checkpoint of format 2, not 1, of another version of tgdsl"
+    write_checkpoint({name: value for name, value in state.items() if name not in ("samples", "groups")}, other)
+    assert found() == "a checkpoint without groups, samples"
     with pytest.raises(CheckpointError, match=r"none\.pt: there is no checkpoint"):
         read_checkpoint(tmp_path / "none.pt")
 

@@ -178,17 +178,19 @@ class _Part:
         check_felt(self._loaded, self._felt)
 
     def check(self, is_resumed: bool) -> None:
-        """See that the run can begin or go on in its folder, that there are such taxels, and that a teacher feels with them.
+        """Read the checkpoint; see that the run can begin or go on in its folder, and that a teacher feels with its taxels.
 
         Raises:
             TgdslError: If not.
         """
         from tgdsl.files.write import check_writable
         from tgdsl.rl.sensed import compile_sensed
+        from tgdsl.rl.train.checkpoint import read_checkpoint
 
         self._goes_on = is_resumed and self._folder.checkpoint.is_file()
         if self._goes_on:
             self._folder.check(is_resumed=True)
+        self._state = read_checkpoint(self._folder.checkpoint) if self._goes_on else None
         check_writable(self._folder.checkpoint)
         self.teacher.check_taxels()
         if len(self._asked["resolutions"]) > 1:  # else it is compiled next
@@ -202,13 +204,13 @@ class _Part:
         """
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.students.learner import Distiller
-        from tgdsl.rl.train.checkpoint import read_checkpoint, restore
+        from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import made_from
         from tgdsl.rl.train.run import Run
         from tgdsl.rl.train.telling import ProgressBar
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
-        state = read_checkpoint(folder.checkpoint) if self._goes_on else None
+        state = self._state
         with StatusLine() as progress:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:

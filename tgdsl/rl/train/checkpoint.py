@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import os
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.iteration import Learning
 
 FORMAT = 1
+KEYS = frozenset({"iteration", "samples", "seconds", "groups", "processes"})
+"""What checkpoints hold beside networks and optimisers."""
 
 
 class CheckpointError(TgdslError):
@@ -82,18 +85,33 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
     """Return what a checkpoint holds, on the CPU.
 
     Raises:
-        CheckpointError: If it cannot be read.
+        CheckpointError: If it cannot be read, or is none.
     """
     if not file.is_file():
         raise CheckpointError(f"{file}: there is no checkpoint")
     try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever torch and pickle raise
-        why = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise CheckpointError(f"{file}: cannot read this checkpoint: {why}") from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise CheckpointError(f"{file}: this is no checkpoint of `tgdsl train` or `tgdsl distill`, or one of another version")
+        opened = file.open("rb")
+    except OSError as error:
+        raise CheckpointError(f"{file}: cannot read this file: {error.strerror or error}") from error
+    with opened:
+        try:
+            state = torch.load(opened, map_location="cpu", weights_only=True)
+        except Exception as error:  # whatever torch and pickle raise, OSError too
+            cut = f"{file.stat().st_size:,} bytes that are cut off, or of something else"
+            raise _no_checkpoint(file, "a file of something else" if zipfile.is_zipfile(file) else cut) from error
+    if not isinstance(state, dict) or "format" not in state:
+        raise _no_checkpoint(file, "a file of something else")
+    if state["format"] != FORMAT:
+        raise _no_checkpoint(file, f"a checkpoint of format {state['format']}, not {FORMAT}, of another version of tgdsl")
+    if missing := sorted(KEYS - state.keys()):
+        raise _no_checkpoint(file, f"a checkpoint without {', '.join(missing)}")
     return state
+
+
+def _no_checkpoint(file: Path, found: str) -> CheckpointError:
+    """Return the error of a file from which no run can go on."""
+    hint = "put back a copy of one, or begin anew with another --out"
+    return CheckpointError(f"{file}: found {found}, expected a checkpoint of `tgdsl train` or `tgdsl distill`; {hint}")
 
 
 def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
