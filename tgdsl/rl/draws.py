@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt
 from torch import Tensor
 
+from tgdsl.errors import SimulationError
 from tgdsl.sensors.noise.random import mix, mix_on_host, normal_pair, sensor_key, uniform, uniform_on_host
 from tgdsl.tensors.env_ids import few_ids
 from tgdsl.tensors.fused import FusedCall
@@ -62,8 +63,11 @@ class Draws:
             device: Where the numbers are wanted.
             first_env: Number of the first environment, counted over all processes.
             is_compiled: Whether the hash, some fifty small operations, is compiled by torch.
+
+        Raises:
+            SimulationError: If the seed has more than 64 bits.
         """
-        self.seed, self._device = seed, torch.device(device)
+        self.seed, self._device = _checked(seed), torch.device(device)
         self._envs = torch.arange(first_env, first_env + num_envs, dtype=torch.int64, device=self._device)
         self._is_on_host = self._device.type == "cpu" and not is_compiled
         self._known: dict[tuple[tuple[str, int], ...], _Streams] = {}
@@ -71,8 +75,12 @@ class Draws:
         self._words, self._shares = (FusedCall(m, is_compiled, has_fixed_shapes=False) for m in (self._hash, self._share))
 
     def reseed(self, seed: int) -> None:
-        """Choose another seed, in place: graphs that were captured draw its numbers."""
-        self.seed = seed
+        """Choose another seed, in place: graphs that were captured draw its numbers.
+
+        Raises:
+            SimulationError: If it has more than 64 bits.
+        """
+        self.seed = _checked(seed)
         self._ahead.clear()
         for sizes, streams in self._known.items():
             streams.begun.copy_(self._begun([what for what, _ in sizes]))
@@ -204,3 +212,9 @@ def within(share: Float[Tensor, "env num"], low: float, high: float) -> Float[Te
 def whole(share: Float[Tensor, "env num"], low: int, high: int) -> Int[Tensor, "env num"]:
     """Return shares, from 0 to 1, as whole numbers from `low` to `high`, both included."""
     return low + (share * (high - low + 1)).to(torch.int64).clamp(max=high - low)
+
+
+def _checked(seed: int) -> int:
+    if not -(2**63) <= seed < 2**63:
+        raise SimulationError(f"the seed is {seed}, expected a whole number of 64 bits: from −2⁶³ to 2⁶³ − 1")
+    return seed

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from numbers import Integral
 from os import PathLike
 from typing import Any
 
@@ -60,6 +61,7 @@ class TouchEnv:
         steps: Control steps of each environment's present episode; may be written.
     """
 
+    @torch.inference_mode(False)  # what is remembered is written outside of inference mode too
     def __init__(
         self,
         task: str | PathLike[str] | Mapping[str, Any] | LoadedTask,
@@ -97,6 +99,9 @@ class TouchEnv:
             SpecError: All mistakes of the document, at their places.
             SimulationError: If the scene cannot be simulated as the document says.
         """
+        if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
+            raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
+        num_envs = int(num_envs)
         chosen = simulator_of(device, simulator)
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
         self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)

@@ -127,6 +127,23 @@ def test_a_run_goes_on_as_it_began_and_says_what_has_changed(base, here, monkeyp
         assert code == 2 and "distill.json: it has no teacher: this is not what tgdsl distill writes" in error
 
 
+def test_a_run_goes_on_with_its_teacher_wherever_that_is_now(base, here):
+    """It is told by its bytes."""
+    few = (*TEACHER, "--types", "none", "--seeds", "1", "--envs", "2", "--episodes", "0", *SMALL)
+    assert here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "run")[0] == 0
+    (base / "sub").mkdir()
+    (base / "teacher.pt").rename(base / "sub" / "moved.pt")
+    on = ("--resume", str(base / "run"), "--device", "cpu", "--episodes", "0", "--iterations")
+    code, _, error = here(base, "distill", "task.yaml", *on, "2")
+    assert code == 2 and "teacher.pt: cannot read this file" in error
+    code, _, error = here(base / "sub", "distill", "../task.yaml", *on, "2", "--teacher", "moved.pt")
+    assert code == 0, error
+    assert json.loads((base / "run" / "distill.json").read_text())["teacher"] == "moved.pt"
+    teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
+    code, _, error = here(base, "distill", "task.yaml", *on, "3", "--teacher", "teacher.pt")
+    assert code == 2 and "--teacher teacher.pt: this run began with moved.pt; begin another one" in error
+
+
 def test_a_teacher_that_does_not_say_what_it_feels_is_refused(base, fails):
     loaded = load_task(base / "task.yaml", {"touch": "depth"})
     spec = {name: value for name, value in loaded.spec.model_dump(mode="json").items() if name != "resolution"}
@@ -163,6 +180,11 @@ def test_what_is_refused_leaves_a_run_as_it_was(base, here):
     assert code == 0, error
     assert json.loads((base / "run" / "distill.json").read_text())["overrides"]["distill.learning_rate"] == "1e-5"
     (base / "run" / "default" / "checkpoint.pt").unlink()
+    kept = {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    code, _, error = here(base, "distill", "task.yaml", *on)
+    assert code == 2 and "run/default: there is no checkpoint.pt to go on with" in error
+    assert kept == {file: file.read_bytes() for file in (base / "run").rglob("*") if file.is_file()}
+    (base / "run" / "default" / "curve.csv").unlink()  # as of one that was killed before its first checkpoint
     code, _, error = here(base, "distill", "task.yaml", *on)
     assert code == 0, error
     assert [row["iteration"] for row in rows_of(base / "run" / "default" / "curve.csv")] == ["1", "2"]

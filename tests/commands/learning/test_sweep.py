@@ -16,7 +16,7 @@ from tgdsl.commands.learning.sweep_document import Trial, load_sweep
 from tgdsl.commands.learning.sweep_trial import left, run_trial
 from tgdsl.errors import SpecError
 from tgdsl.rl.load import load_task
-from tgdsl.rl.train.checkpoint import FORMAT, read_checkpoint
+from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "tasks" / "sweep.yaml"
@@ -88,6 +88,27 @@ def test_the_example():
         ),
         ({"matrix": {"--out": ["a", "b"]}}, "1:", "has no option --out that a sweep may set"),
         ({"matrix": {"--seed": [1, 1]}}, "1:", "two combinations are the same"),
+        (
+            {"matrix": {"--placements": ["a b", "a_b"]}, "command": "distill", "fixed": {"--teacher": "task.yaml"}},
+            "1:",
+            "two combinations have one name: placements=a_b",
+        ),
+        (
+            {"matrix": {"rewards": [{"spin": 1}], "rewards.spin": [1, 2]}},
+            "rewards.spin",
+            "lies below matrix.rewards, which would",
+        ),
+        (
+            {"matrix": {"train": [{"steps": 8}]}, "fixed": {"train.rnd": "off"}},
+            "fixed.train.rnd",
+            "lies below matrix.train, which",
+        ),
+        ({"matrix": {"--seed": [1, 2]}, "fixed": {"--seed": 3}}, "matrix.--seed", "--seed stands under fixed too"),
+        (
+            {"matrix": {"--types": ["bool," * 40]}, "command": "distill", "fixed": {"--teacher": "task.yaml"}},
+            "1:",
+            "the name of a run's folder has 206 characters, expected 200 at most: types=bool,bool",
+        ),
         ({"matrix": {"--seed": []}}, "1:", "at least 1"),
         ({"matrix": {}}, "1:", "at least 1"),
         ({"matrix": {"action.scael": [0.1]}}, "action", "scael"),
@@ -148,7 +169,8 @@ def test_a_run_that_goes_on_learns_the_minutes_that_are_left(tmp_path, place):
     (tmp_path / place).mkdir(exist_ok=True)
     (tmp_path / place / "curve.csv").write_text("iteration,samples,seconds\n1,8,9.0\n2,16,12.0\n3,2")
     for seconds, expected in ((9.0, 0.35), (42.0, 0.0)):
-        torch.save({"format": FORMAT, "seconds": seconds}, tmp_path / place / "checkpoint.pt")
+        state = dict.fromkeys(KEYS) | {"format": FORMAT, "seconds": seconds}
+        torch.save(state, tmp_path / place / "checkpoint.pt")
         found = left(words, tmp_path)
         assert found[:3] + found[4:] == words[:3] + words[4:] and float(found[3]) == pytest.approx(expected)
 
@@ -173,7 +195,7 @@ def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
     (base / "z").mkdir()
     (base / "z" / "checkpoint.pt").write_text("")
     wrong = run_trial(Trial("z", {}, ("train", "task.yaml", "--minutes", "1")), str(base / "z"))
-    assert wrong.startswith("failed: CheckpointError: ") and "cannot read this checkpoint" in wrong
+    assert wrong.startswith("failed: CheckpointError: ") and "checkpoint.pt: found 0 bytes that are cut off" in wrong
     (base / "broken.py").write_text("raise ZeroDivisionError('of this test')")
     monkeypatch.setattr("runpy.run_module", lambda *_, **__: runpy.run_path(str(base / "broken.py")))
     assert run_trial(Trial("y", {}, ("train", "task.yaml")), str(base / "y")) == "failed: ZeroDivisionError: of this test"

@@ -66,7 +66,7 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
 
 
 def test_a_learner_is_told_how_much_of_its_run_is_over(tmp_path, monkeypatch):
-    """Of the iterations, those made before included; of the time of a command, if of that more is over."""
+    """Of iterations, or of time, if of that more is over; what was learned before is included of both."""
     run, learner = begun(tmp_path)
     shares, iterate = [], learner.iterate
     learner.iterate = lambda share: shares.append(share) or iterate(share)
@@ -75,10 +75,15 @@ def test_a_learner_is_told_how_much_of_its_run_is_over(tmp_path, monkeypatch):
     assert shares == [0.0, 1 / 2, 2 / 4, 3 / 4]
     seconds = itertools.count()  # one passes at each look at the clock
     monkeypatch.setattr("tgdsl.rl.train.run.time", SimpleNamespace(monotonic=lambda: float(next(seconds))))
+    run.seconds = 0.0
     run.learn(10**9, 10.0)
     assert shares[4:] == [0.1, 0.3, 0.5, 0.7, 0.9]
-    run.learn(10, 10.0)
-    assert shares[9:] == [9 / 10]  # iterations, not 0.1 of the time
+    run.seconds = 30.0  # of a run that was killed, of 40 s: it goes on at three quarters
+    run.learn(10**9, 10.0)
+    assert shares[9:] == [31 / 40, 33 / 40, 35 / 40, 37 / 40, 39 / 40]
+    run.seconds = 0.0
+    run.learn(15, 10.0)
+    assert shares[14:] == [14 / 15]  # iterations, not 0.1 of the time
 
 
 @pytest.mark.parametrize(("before", "now"), [({}, {"train__rnd": "off"}), ({"train__rnd": "off"}, {})])
@@ -224,6 +229,55 @@ def test_what_a_folder_says(tmp_path):
     assert [row["iteration"] for row in curve] == ["1", "2", "3"]
     assert [int(row["samples"]) for row in curve] == [16, 32, 48]
     assert all(float(row["Loss/value"]) > 0 for row in curve)
+
+
+@pytest.mark.parametrize(
+    ("group", "value"), [("goal", torch.inf), ("priv_obj_props", torch.inf), ("priv_obj_props", torch.nan)]
+)
+def test_what_is_not_finite_is_in_no_checkpoint(tmp_path, group, value):
+    """One number of one observation in the last iteration; its group is named."""
+    run, learner = begun(tmp_path)
+    run.learn(1, float("inf"))
+    content, observe = run._folder.checkpoint.read_bytes(), learner._seen
+
+    def seen(obs):
+        return observe({**obs, group: torch.where(torch.arange(obs[group].shape[1]) == 1, value, obs[group])})
+
+    learner._seen = seen
+    with pytest.raises(DivergedError, match=r"iteration 2: ") as raised:
+        run.learn(2, float("inf"))
+    assert run._folder.checkpoint.read_bytes() == content
+    if value == torch.inf:  # not a number is in losses at once
+        network = "actor" if group == "goal" else "critic"
+        assert f"{network}_state_dict.obs_normalizer._mean, which observes {group}, is not finite" in str(raised.value)
+
+
+def test_two_processes_do_not_run_in_one_folder(tmp_path):
+    """Another one holds it; when that is killed, it is free."""
+    folder = RunFolder(tmp_path / "run")
+    code = f"import time; from pathlib import Path; from tgdsl.rl.train.folder import RunFolder\nwith RunFolder(Path({str(folder.path)!r})).held(): print(flush=True); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with (
+            pytest.raises(TgdslError, match="run: another process runs in this folder; wait until it has ended"),
+            folder.held(),
+        ):
+            pass
+        other.kill()
+        other.wait()
+        with folder.held():
+            assert list(folder.path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["[]", '{"starts": 3}', '{"starts": [{"seed": 0}]}', "{}"])
+def test_what_does_not_say_what_a_run_was_made_from_is_refused(tmp_path, text):
+    folder = RunFolder(tmp_path)
+    folder.run.write_text(text)
+    with pytest.raises(
+        TgdslError, match=r"run\.json: expected what a run was made from, as tgdsl writes it: starts with envs, "
+    ):
+        folder.last_start()
 
 
 def test_the_first_rows_of_a_curve_may_have_no_episodes(tmp_path):

@@ -6,6 +6,8 @@ import hashlib
 import json
 import shlex
 import sys
+import warnings
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -84,7 +86,7 @@ class Distill:
         overrides = joined_overrides(before.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
         self._check(given, before.get("overrides", {}))
-        asked = self._asked(loaded, before)
+        asked = self._asked(loaded, before, folder)
         prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
         asked["envs"] = prepared[0].envs
         if self.resume is None:
@@ -99,6 +101,7 @@ class Distill:
         for part in prepared:
             own, unit = part.taught(folder / "distill.json" if part is prepared[0] else None)
             rows += own
+        _warn_unlike(rows)
         if rows:
             write_table(rows, table)
             print(f"{shown(rows, unit, loaded.task.is_less_better)}\ntable: {table}")
@@ -116,8 +119,13 @@ class Distill:
             if value is not None and not value >= least:
                 raise TgdslError(f"--{name} {value}: expected at least {least}")
 
-    def _asked(self, loaded: LoadedTask, before: dict[str, Any]) -> dict[str, Any]:
+    def _asked(self, loaded: LoadedTask, before: dict[str, Any], folder: Path) -> dict[str, Any]:
         """Return who is taught, by whom and where, as plain values.
+
+        Args:
+            loaded: The task's document.
+            before: What a run that goes on began with.
+            folder: Its folder.
 
         Raises:
             TgdslError: If a run that goes on shall teach others, there is no teacher, or no resolution, or one is named twice.
@@ -134,7 +142,7 @@ class Distill:
             "seed": self.seed,
         }
         for name, value in given.items():
-            if before and value is not None and value != before[name]:
+            if before and value is not None and value != before[name] and not self._is_moved(name, before, folder):
                 raise TgdslError(f"--{name} {_text(value)}: this run began with {_text(before[name])}; begin another one")
         default = {"types": ["all"], "placements": [spec.placement], "noise": [spec.noise], "seeds": 3, "seed": 0}
         default |= {"resolutions": [spec.resolution or "default"], "envs": None, "teacher": None}
@@ -144,9 +152,24 @@ class Distill:
         names = asked["resolutions"]
         if not names:
             raise TgdslError("--resolutions: expected one at least")
+        if self.resolutions is not None and "default" in names:
+            what = "that is what a run calls the document's own; leave it out, and --set resolution=default"
+            raise TgdslError(f"--resolutions {_text(names)}: {what}")
         if len(set(names)) < len(names):
             raise TgdslError(f"--resolutions {_text(names)}: one is named twice")
         return asked
+
+    def _is_moved(self, name: str, before: dict[str, Any], folder: Path) -> bool:
+        """Whether the teacher that is named is that of a run that goes on, in another place than when it began."""
+        from tgdsl.rl.train.folder import RunFolder
+
+        if name != "teacher" or self.teacher is None or not self.teacher.is_file():
+            return False
+        starts = [
+            RunFolder(folder / own).last_start() for own in before["resolutions"] if (folder / own / "run.json").is_file()
+        ]
+        found = hashlib.sha256(self.teacher.read_bytes()).hexdigest()
+        return bool(starts) and all(start.get("teacher_sha256") == found for start in starts)
 
 
 class _Part:
@@ -171,11 +194,11 @@ class _Part:
         types = _known(self._loaded, asked["types"])
         self._keys = student_keys(types, asked["placements"], asked["noise"], asked["seeds"])
         self.teacher = Teacher(Path(asked["teacher"]), self._loaded)
+        self._felt = feels(self._keys, self.teacher.felt)
+        check_felt(self._loaded, self._felt)
         unit = len(self._keys) * num_variants(self._loaded)
         self.envs = asked["envs"] or max(1, ENVS // unit) * unit
         check_blocks(self.envs, len(self._keys), num_variants(self._loaded))
-        self._felt = feels(self._keys, self.teacher.felt)
-        check_felt(self._loaded, self._felt)
 
     def check(self, is_resumed: bool) -> None:
         """Read the checkpoint; see that the run can begin or go on in its folder, and that a teacher feels with its taxels.
@@ -187,7 +210,7 @@ class _Part:
         from tgdsl.rl.sensed import compile_sensed
         from tgdsl.rl.train.checkpoint import read_checkpoint
 
-        self._goes_on = is_resumed and self._folder.checkpoint.is_file()
+        self._goes_on = is_resumed and self._folder.has_run  # one that had not begun begins
         if self._goes_on:
             self._folder.check(is_resumed=True)
         self._state = read_checkpoint(self._folder.checkpoint) if self._goes_on else None
@@ -210,7 +233,7 @@ class _Part:
         from tgdsl.rl.train.telling import ProgressBar
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
-        state = self._state
+        state, held = self._state, ExitStack()
         with StatusLine() as progress:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
@@ -222,6 +245,8 @@ class _Part:
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
                 print(f"changed since the run began: {line}")
+            held.enter_context(folder.held())
+            folder.check(is_resumed=self._goes_on)  # what was there when nobody held it
             if file is not None:
                 _write(file, self._asked | {"overrides": self._given})
             folder.begin(origin | taught, loaded, env)
@@ -236,6 +261,7 @@ class _Part:
                 bar.close()
             return self._finish(distiller, origin, run.seconds), env.task.score_unit
         finally:
+            held.close()
             env.close()
 
     def _changes(self, origin: dict[str, Any], model: type[TaskSpec]) -> list[str]:
@@ -265,6 +291,14 @@ class _Part:
         plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
         _write(self._folder.evaluation, plain)
         return rows_of(keys, found, self._resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
+
+
+def _warn_unlike(rows: list[Row]) -> None:
+    """Say of resolutions that had unlike numbers of control steps: their scores do not compare."""
+    steps = {row.resolution: row.samples for row in rows}
+    if steps and max(steps.values()) > 1.1 * min(steps.values()):
+        found = ", ".join(f"{name} {number:,}" for name, number in steps.items())
+        warnings.warn(f"students had unlike numbers of control steps, {found}: `--iterations` makes them alike", stacklevel=3)
 
 
 def _check_new(folder: Path, resolutions: list[str]) -> None:

@@ -50,6 +50,10 @@ class SweepSpec(SpecModel):
     """How often a run goes on whose worker has died."""
 
 
+LONGEST = 200
+"""Most characters of the name of a run, which a folder has."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One run of a sweep: its name, what of the matrix it has, and the command's words but for `--out` and `--resume`."""
@@ -72,6 +76,7 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
         raise SpecError(problems)
     _check_options(source, spec)
     _check_values(source, spec, file.parent)
+    _check_below(source, spec)
     trials = []
     for values in itertools.product(*spec.matrix.values()):
         settings = dict(zip(spec.matrix, values, strict=True))
@@ -84,9 +89,45 @@ def load_sweep(file: Path) -> tuple[SweepSpec, list[Trial]]:
             words += [name, text] if name.startswith("--") else ["--set", f"{name}={text}"]
         name = ",".join(f"{name.lstrip('-')}={value}" for name, value in settings.items())
         trials.append(Trial(re.sub(r"[^\w.=,+-]", "_", name), settings, tuple(words)))
-    if len({trial.name for trial in trials}) < len(trials):
-        raise SpecError([source.problem(("matrix",), "two combinations are the same")])
+    _check_names(source, trials)
     return spec, trials
+
+
+def _check_below(source: Source, spec: SweepSpec) -> None:
+    """See that no setting lies below another one, which would replace it.
+
+    Raises:
+        SpecError: All that do.
+    """
+    places = [(place, name) for place in ("fixed", "matrix") for name in getattr(spec, place)]
+    problems = []
+    for place, name in places:
+        for other, above in places:
+            if (place, other) == ("matrix", "fixed") and name == above:
+                problems.append(source.problem((place, name), f"{name} stands under {other} too", on_key=True))
+            if name.startswith(f"{above}."):
+                what = f"lies below {other}.{above}, which would replace it: write it there, or single values here"
+                problems.append(source.problem((place, name), f"{name} {what}", on_key=True))
+    if problems:
+        raise SpecError(problems)
+
+
+def _check_names(source: Source, trials: list[Trial]) -> None:
+    """See that each trial has a name of its own, by which a folder can be called.
+
+    Raises:
+        SpecError: If not.
+    """
+    found: dict[str, Trial] = {}
+    for trial in trials:
+        if len(trial.name) > LONGEST:
+            what = (
+                f"the name of a run's folder has {len(trial.name)} characters, expected {LONGEST} at most: {trial.name[:60]}…"
+            )
+            raise SpecError([source.problem(("matrix",), what)])
+        if (other := found.setdefault(trial.name, trial)) is not trial:
+            alike = "two combinations are the same" if other.words == trial.words else "two combinations have one name"
+            raise SpecError([source.problem(("matrix",), f"{alike}: {trial.name}")])
 
 
 def _check_options(source: Source, spec: SweepSpec) -> None:

@@ -7,6 +7,7 @@ import runpy
 import shlex
 import sys
 import traceback
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,8 +30,7 @@ def run_trial(trial: Trial, folder: str) -> str:
         return "was made before"
     place.mkdir(parents=True, exist_ok=True)
     atomic_write(asked, json.dumps(trial.words).encode())
-    with (place / "log.txt").open("a") as log:
-        sys.stdout, sys.stderr = log, log
+    with (place / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             if (place / "checkpoint.pt").is_file() or (place / "distill.json").is_file():
                 words = [*left([*trial.words], place), "--resume", folder]

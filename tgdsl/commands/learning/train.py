@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,7 +82,7 @@ class Train:
         state = read_checkpoint(source.checkpoint) if source else None
         ranks.join(device)
         try:
-            self._learn(loaded, folder, ranks, device, overrides, before, state)
+            self._learn(loaded, folder, ranks, device, overrides, before, state, is_same)
         finally:
             ranks.leave()
 
@@ -105,6 +106,7 @@ class Train:
         overrides: dict[str, Any],
         before: dict[str, Any],
         state: dict[str, Any] | None,
+        is_same: bool,
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.checkpoint import restore
@@ -113,6 +115,7 @@ class Train:
         from tgdsl.rl.train.run import Run
         from tgdsl.rl.train.telling import ProgressBar
 
+        held = ExitStack()
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)
         with StatusLine() as progress:
@@ -129,6 +132,8 @@ class Train:
                 for line in changes(before, origin, type(loaded.spec)) if before else ():
                     end = "; a run that goes on keeps its deviations" if line.startswith(INITIAL_STD) else ""
                     print(f"changed since the run began: {line}{end}")
+                held.enter_context(folder.held())
+                folder.check(is_resumed=is_same)  # what was there when nobody held it
                 folder.begin(origin, loaded, env)
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and not run.has_board:
@@ -144,6 +149,7 @@ class Train:
             if ranks.is_first:
                 self._finish(learner, folder, origin, run.seconds)
         finally:
+            held.close()
             env.close()
 
     def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], seconds: float) -> None:
@@ -156,6 +162,7 @@ class Train:
         command = shlex.join(["tgdsl", *sys.argv[1:]])
         card = card_of(learner, origin, seconds, command)
         write_policy(learner, card, folder.policy)
+        folder.evaluation.unlink(missing_ok=True)  # of what the policy was before
         print(
             f"policy: {folder.policy}, after {learner.iteration} iterations, {learner.samples:,} steps, {seconds / 60:.1f} min"
         )
@@ -166,5 +173,3 @@ class Train:
             write_policy(learner, card | {"score": found.plain()}, folder.policy)
             atomic_write(folder.evaluation, (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
             print(found)
-        else:
-            folder.evaluation.unlink(missing_ok=True)  # of what the policy was before

@@ -13,6 +13,7 @@ import torch
 from scipy.stats import t as student_t
 
 from tgdsl.console.progress import Progress, silent
+from tgdsl.errors import TgdslError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 
@@ -91,7 +92,12 @@ def evaluate_each(
         episodes: How many episodes count of each block.
         seed: What all that is random in the environments follows from.
         progress: Is told how many episodes have ended.
+
+    Raises:
+        TgdslError: If no episode is asked for.
     """
+    if episodes < 1:
+        raise TgdslError(f"found {episodes} episodes, expected at least 1")
     size = env.num_envs // blocks
     quota = torch.full((blocks, size), episodes // size, dtype=torch.int64, device=env.device)
     quota[:, : episodes % size] += 1

@@ -140,7 +140,7 @@ class Policy(Actor):
             raise PolicyError(f"{file}: this policy takes {own}, not {taken}; name its groups, in its order")
         try:
             with torch.no_grad():
-                made = self._module(torch.zeros((num_envs, total), device=device))
+                made = self._module(torch.zeros((num_envs, total), dtype=torch.float32, device=device))
         except Exception as error:  # whatever TorchScript raises
             last = str(error).strip().splitlines()[-1]
             what = f"this policy does not take {taken} numbers of {num_envs} environments"

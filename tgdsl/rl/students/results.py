@@ -11,9 +11,10 @@ import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import fmean, stdev
+from statistics import fmean
 from typing import Any, NamedTuple
 
+import numpy as np
 from scipy.stats import t as student_t
 
 from tgdsl.console.progress import Progress
@@ -91,7 +92,7 @@ def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
     halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in found]
     half = math.sqrt(sum(own**2 for own in halves)) / num
     if num > 1:
-        half = max(half, float(student_t.ppf(0.975, num - 1)) * stdev(scores) / math.sqrt(num))
+        half = max(half, float(student_t.ppf(0.975, num - 1) * np.std(scores, ddof=1)) / math.sqrt(num))
     return fmean(scores) - half, fmean(scores) + half
 
 

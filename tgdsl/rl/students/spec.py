@@ -85,8 +85,8 @@ class DistillSpec(SpecModel):
     learning_rate: Positive = 1e-4
     """Learning rate, at the start where it falls."""
     final_learning_rate: Positive | None = None
-    """Learning rate that it falls to, geometrically with the share that is over of all iterations, or of a command's minutes if
-    of these more is over; null: it stays."""
+    """Learning rate that it falls to, geometrically with the share that is over of all iterations, or of all minutes if of
+    these more is over, those before the run went on included; null: it stays."""
     max_grad_norm: Positive | None = 2.0
     """Norm to which the gradient of each student is scaled down; null: it is not."""
     loss: Loss = "mse"

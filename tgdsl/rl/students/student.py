@@ -152,7 +152,7 @@ class Remembering(nn.Module):
 
 def deployed(student: Student) -> torch.jit.ScriptModule:
     """Return a student as TorchScript, on the CPU."""
-    own = copy.deepcopy(student).cpu().eval()
+    own = copy.deepcopy(student).cpu().eval().requires_grad_(False)  # what remembers would keep a graph of all its steps
     own.decoders = nn.ModuleList()
     x, memory = torch.zeros((2, own.architecture.num_features)), torch.zeros((2, own.memory))
     with torch.no_grad():

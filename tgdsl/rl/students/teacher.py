@@ -99,9 +99,12 @@ class BoundTeacher:
         self.groups = tuple(names.values())
         groups = {name: env.groups[name] for name in self.groups}
         self._policy = Policy(teacher.saved, groups, env.num_envs, env.num_actions, env.device)
-        self.std = torch.tensor(card["std"], device=env.device) if card.get("std") else None
+        self.std = torch.tensor(card["std"], dtype=torch.float32, device=env.device) if card.get("std") else None
+        zeros = {
+            name: torch.zeros((env.num_envs, size), dtype=torch.float32, device=env.device) for name, size in groups.items()
+        }
         for _ in range(WARM_CALLS):
-            self({name: torch.zeros((env.num_envs, env.groups[name]), device=env.device) for name in self.groups})
+            self(zeros)
         self.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from tgdsl.errors import TgdslError
+from tgdsl.errors import TgdslError, listed
 from tgdsl.files.write import atomic_open
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.iteration import Learning
@@ -147,6 +148,33 @@ def restore(learner: Learning, state: Mapping[str, Any], file: Path) -> None:
     torch.set_rng_state(own["cpu"])
     if own["cuda"] is not None and learner.env.device.type == "cuda":
         torch.cuda.set_rng_state(own["cuda"], learner.env.device)
+
+
+def not_finite(state: Any, networks: Mapping[str, Sequence[str]], sizes: Mapping[str, int], path: str = "") -> str:
+    """Return the name of the first tensor of a state that holds something else than finite numbers; none: nothing.
+
+    Of moments of observations with the groups that these are of.
+
+    Args:
+        state: The state, or a part of it.
+        networks: Groups of observations of each network.
+        sizes: Size of each group.
+        path: Where the part is.
+    """
+    if isinstance(state, Mapping):
+        parts = (not_finite(part, networks, sizes, f"{path}.{name}".lstrip(".")) for name, part in state.items())
+        return next(filter(None, parts), "")
+    if isinstance(state, list | tuple):
+        return next(filter(None, (not_finite(part, networks, sizes, f"{path}.{i}") for i, part in enumerate(state))), "")
+    if not isinstance(state, Tensor) or not state.is_floating_point() or bool(state.isfinite().all()):
+        return ""
+    if "normalizer" not in path and ".seen." not in path:
+        return path
+    wrong = (~state.isfinite()).reshape(-1, state.shape[-1] if state.ndim else 1).any(dim=0).tolist()
+    own = [name for name in networks if f"{name}_state_dict" in path] or list(networks)  # one of rsl_rl's, or students
+    columns = [[group for group in networks[name] for _ in range(sizes.get(group, 0))] for name in own]
+    found = (group for each in columns if len(each) == len(wrong) for group, is_it in zip(each, wrong, strict=True) if is_it)
+    return f"{path}, which observes {listed([*dict.fromkeys(found)])},"
 
 
 def _count_on(env: TouchEnv, processes: Sequence[Mapping[str, Any]]) -> None:

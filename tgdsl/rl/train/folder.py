@@ -13,14 +13,17 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import io
 import json
+import os
 import platform
 import re
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -39,6 +42,8 @@ from tgdsl.rl.spec import TaskSpec
 PACKAGES = ("tgdsl", "torch", "rsl-rl-lib", "tensordict", "mujoco", "mujoco-warp", "warp-lang", "numpy")
 COLUMNS = ("iteration", "samples", "seconds")
 """First columns of a curve."""
+ASKED = frozenset({"spec", "seed", "envs", "module", "taxels"})
+"""What of a start is asked when the run goes on."""
 COPIES = 3
 """How many checkpoints must find room on the disk before a run begins: the old one, the new one, and what else is written."""
 
@@ -97,6 +102,27 @@ class RunFolder:
         self.rows()
         check_writable(self.checkpoint)
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the folder, which is made if it is not there, against other processes; it is free again if this one is killed.
+
+        Raises:
+            TgdslError: If another process holds it.
+        """
+        with_folder(self.run)
+        folder = os.open(self.path, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                what = "another process runs in this folder; wait until it has ended, or give another --out"
+                raise TgdslError(f"{self.path}: {what}") from error
+            except OSError:  # a file system that has no locks
+                pass
+            yield
+        finally:
+            os.close(folder)
+
     def check_room(self, size: int) -> None:
         """See that checkpoints of a size find room.
 
@@ -116,8 +142,7 @@ class RunFolder:
         """
         with_folder(self.run)
         self._clean()
-        before = self._read() if self.has_run else {}
-        starts = [*before.get("starts", []), dict(made_from)]
+        starts = [*(self._read()["starts"] if self.has_run else []), dict(made_from)]
         atomic_write(self.run, (json.dumps({"starts": starts}, indent=2, ensure_ascii=False) + "\n").encode())
         for name, file in documents(loaded).items():
             atomic_write(self.path / name, file.read_bytes())
@@ -129,7 +154,7 @@ class RunFolder:
         Raises:
             TgdslError: If that cannot be read.
         """
-        starts = self._read().get("starts", [])
+        starts = self._read()["starts"]
         if not starts:
             raise TgdslError(f"{self.path}: there is no run to go on with: run.json is missing or empty")
         return starts[-1]
@@ -193,9 +218,15 @@ class RunFolder:
 
     def _read(self) -> dict[str, Any]:
         try:
-            return json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {}
+            found = json.loads(self.run.read_text(encoding="utf-8")) if self.run.is_file() else {"starts": []}
         except (OSError, ValueError) as error:
             raise TgdslError(f"{self.run}: cannot read this file: {error}") from error
+        starts = found.get("starts") if isinstance(found, dict) else None
+        if not isinstance(starts, list) or not all(isinstance(own, dict) and own.keys() >= ASKED for own in starts):
+            raise TgdslError(
+                f"{self.run}: expected what a run was made from, as tgdsl writes it: starts with {', '.join(sorted(ASKED))}"
+            )
+        return found
 
     def _clean(self) -> None:
         """Remove temporary files that a run which was killed has left."""

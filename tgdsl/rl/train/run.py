@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from tgdsl.errors import TgdslError
-from tgdsl.rl.train.checkpoint import state_of, write_checkpoint
+from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
 from tgdsl.rl.train.telling import Board
 
 
 class DivergedError(TgdslError):
-    """A policy whose losses are no numbers any more."""
+    """A policy whose losses, or whose state, are no numbers any more."""
 
 
 Shown = Callable[[Mapping[str, float | int], float], None]
@@ -57,8 +57,19 @@ class Run:
         return self._board is not None and self._board.is_there
 
     def save(self) -> int:
-        """Write a checkpoint; return its size [byte], 0 of a process that writes none."""
-        state = state_of(self._learner, self.seconds)
+        """Write a checkpoint; return its size [byte], 0 of a process that writes none.
+
+        Raises:
+            DivergedError: If something of it is no finite number; the checkpoint that is there stays.
+            FileError: If it cannot be written; likewise.
+        """
+        learner = self._learner
+        state = state_of(learner, self.seconds)
+        if wrong := not_finite(state, learner.groups, learner.env.groups):
+            raise DivergedError(
+                f"iteration {learner.iteration}: {wrong} is not finite: something that the environments return was not, or it "
+                f"grew beyond all bounds; {self._folder.checkpoint} is from before"
+            )
         return write_checkpoint(state, self._folder.checkpoint) if self._writes else 0
 
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
@@ -69,8 +80,11 @@ class Run:
             seconds: Time from now on [s]; may be infinite. Of 0 no iteration is made.
             shown: Is shown each iteration.
 
+        Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
+        included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
+
         Raises:
-            DivergedError: If the losses are no numbers any more; the last checkpoint is from before.
+            DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
             FileError: If something cannot be written; likewise.
         """
         learner, before = self._learner, self.seconds
@@ -79,7 +93,7 @@ class Run:
         try:
             while not is_over:
                 start = time.monotonic()
-                made = learner.iterate(max(learner.iteration / iterations, (start - begun) / seconds))
+                made = learner.iterate(max(learner.iteration / iterations, (before + start - begun) / (before + seconds)))
                 now = time.monotonic()
                 self.seconds = before + now - begun
                 self._refuse_diverged(made)
