@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -136,6 +137,14 @@ def did_you_mean(found: str, names: Iterable[str], what: str = "names") -> str:
     if near:
         return f'did you mean "{near[0]}"?'
     return f"known {what}: {listed(known)}"
+
+
+def raised_at(file: str, error: Exception) -> str:
+    """Return a file of a user's own code, and the line in it that an error comes from, if any: `task.py:12`."""
+    if isinstance(error, SyntaxError) and error.filename == file:
+        return f"{file}:{error.lineno}"
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+    return f"{file}:{lines[-1]}" if lines else file
 
 
 def listed(names: Sequence[str], limit: int = 12) -> str:

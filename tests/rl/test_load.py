@@ -71,9 +71,9 @@ def test_all_mistakes_are_told_at_once(tmp_path):
         ("keyframe: home", "keyframe: hom", 6, "keyframe", 'the scene has no keyframe "hom"'),
         ("sensors.yaml", "sensor.yaml", 3, "document", 'there is no file "sensor.yaml"'),
         ("in_palm_rotate", "in_palm_rotat", 2, "task", 'there is no task "in_palm_rotat"'),
-        ("in_palm_rotate", "nowhere.py:Task", 2, "task", "there is no file"),
+        ("in_palm_rotate", "nowhere.py:Task", 2, "task", "nowhere.py: FileNotFoundError: there is no such file"),
         ("in_palm_rotate", "pathlib:Path", 2, "task", "no subclass of tgdsl.rl.task.Task"),
-        ("in_palm_rotate", "pathlib:Paths", 2, "task", "AttributeError"),
+        ("in_palm_rotate", "pathlib:Paths", 2, "task", 'pathlib has no class "Paths"'),
     ],
 )
 def test_what_does_not_fit_the_scene_is_told_at_its_place(tmp_path, old, new, line, path, says):
@@ -142,6 +142,28 @@ def test_a_task_of_ones_own_stands_beside_its_document(tmp_path):
     task.write_text(task.read_text().replace("extra: 4", "extra: x"))
     (found,) = problems(lambda: load_task(task))
     assert found.path == "extra" and found.line == 8
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("import nowhere", "ModuleNotFoundError: No module named 'nowhere'"),
+        ("x = = 1", "SyntaxError: invalid syntax"),
+        ("y = x", "NameError: name 'x' is not defined"),
+        ("class Spec(InPalmRotate.Spec):\n    extra = 1", "PydanticUserError: A non-annotated attribute was detected"),
+    ],
+)
+def test_what_the_file_of_a_task_of_ones_own_raises_is_told_with_its_line(tmp_path, line, says):
+    (tmp_path / "code").mkdir()
+    own = tmp_path / "code" / "own.py"
+    own.write_text(f"from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n{line}\n")
+    task = write_task(tmp_path, task="code/own.py:Own")
+    (found,) = problems(lambda: load_task(task))
+    assert (found.file, found.line, found.path) == (str(task), 2, "task")
+    assert found.what.startswith(f'cannot import "code/own.py:Own": {own}:2: {says}')
+    own.write_text("from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\nclass Owl(InPalmRotate):\n    pass\n")
+    (found,) = problems(lambda: load_task(task))
+    assert (found.what, found.hint) == ('code/own.py has no class "Own"', 'did you mean "Owl"?')
 
 
 @pytest.mark.parametrize(

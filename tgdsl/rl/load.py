@@ -11,7 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean
+from tgdsl.errors import Problem, SpecError, TgdslError, did_you_mean, raised_at
 from tgdsl.rl.spec import TaskSpec
 from tgdsl.rl.task import Task
 from tgdsl.rl.tasks import TASKS
@@ -89,10 +89,16 @@ def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
         hint = f"{did_you_mean(name, TASKS, 'tasks')}; one of your own is package.module:Class or file.py:Class"
         raise SpecError([source.problem(("task",), f'there is no task "{name}"', hint)])
     try:
-        found = getattr(_own_module(module, folder), class_)
-    except (ImportError, OSError, SyntaxError, AttributeError) as error:
-        what = f'cannot import "{name}": {type(error).__name__}: {error}'
+        own = _own_module(module, folder)
+    except Exception as error:  # whatever a user's code raises
+        place = f"{raised_at(str((folder / module).resolve()), error)}: " if module.endswith(".py") else ""
+        what = f'cannot import "{name}": {place}{type(error).__name__}: {error}'
         raise SpecError([source.problem(("task",), what)]) from error
+    found = getattr(own, class_, None)
+    if found is None:
+        tasks = [key for key, value in vars(own).items() if isinstance(value, type) and issubclass(value, Task)]
+        hint = did_you_mean(class_, tasks, "tasks in it")
+        raise SpecError([source.problem(("task",), f'{module} has no class "{class_}"', hint)])
     if not (isinstance(found, type) and issubclass(found, Task)):
         raise SpecError([source.problem(("task",), f'"{name}" is no subclass of tgdsl.rl.task.Task')])
     return found
@@ -108,7 +114,7 @@ def _own_module(name: str, folder: Path) -> Any:
         return sys.modules[known]
     made = importlib.util.spec_from_file_location(known, file)
     if made is None or made.loader is None or not file.is_file():
-        raise FileNotFoundError(f"there is no file {file}")
+        raise FileNotFoundError("there is no such file")
     module = importlib.util.module_from_spec(made)
     sys.modules[known] = module
     sys.path.insert(0, str(file.parent))  # modules beside it, as where Python runs the file

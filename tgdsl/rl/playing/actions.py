@@ -6,7 +6,6 @@ Shapes: `env` environments, `joint` joints that the policy moves, `feature` numb
 from __future__ import annotations
 
 import runpy
-import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.errors import TgdslError, did_you_mean
+from tgdsl.errors import TgdslError, did_you_mean, raised_at
 from tgdsl.rl.draws import Draws
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
@@ -81,7 +80,7 @@ class ScriptActor(Actor):
         try:
             found = self._function(env, obs)
         except Exception as error:  # whatever a user's code raises
-            place = f"{_place(self._file, error)}: {self._name}" if self._file else self._name
+            place = f"{raised_at(self._file, error)}: {self._name}" if self._file else self._name
             raise ScriptError(f"{place}: {type(error).__name__}: {error}") from error
         try:
             action = torch.as_tensor(found, dtype=torch.float32, device=env.device)
@@ -144,16 +143,8 @@ def _script_of(actions: str) -> tuple[ScriptFunction, str, str]:
     try:
         found = runpy.run_path(file, run_name=Path(file).stem)
     except Exception as error:  # whatever a user's code raises
-        raise ScriptError(f"{_place(file, error)}: {type(error).__name__}: {error}") from error
+        raise ScriptError(f"{raised_at(file, error)}: {type(error).__name__}: {error}") from error
     functions = [key for key, value in found.items() if callable(value) and not key.startswith("_")]
     if not callable(found.get(name)):
         raise ScriptError(f'{file}: there is no function "{name}"; {did_you_mean(name, functions, "functions")}')
     return found[name], file, name
-
-
-def _place(file: str, error: Exception) -> str:
-    """Return a file, and the line in it that an error comes from."""
-    if isinstance(error, SyntaxError) and error.filename == file:
-        return f"{file}:{error.lineno}"
-    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
-    return f"{file}:{lines[-1]}" if lines else file

@@ -215,13 +215,19 @@ def check_learned(card: Mapping[str, Any], file: Path, spec: TaskSpec, who: str 
     theirs, ours = dict(card["spec"]), spec.model_dump(mode="json")
     with suppress(ValidationError):  # what is no action here differs
         theirs["action"] = type(spec.action).model_validate(theirs["action"]).model_dump(mode="json")  # of today's fields
-    if theirs["task"] != ours["task"]:
+    if _without_folder(theirs["task"]) != _without_folder(ours["task"]):
         raise PolicyError(f'{file}: this {who} was learned in the task "{theirs["task"]}", not "{ours["task"]}"')
     steps = [round(own["physics"]["timestep"] * own["physics"]["substeps"], 9) for own in (theirs, ours)]
     for name, before, now in (("actions", theirs["action"], ours["action"]), ("control steps [s]", *steps)):
         if not is_close(before, now):
             texts = (json.dumps(value, ensure_ascii=False) for value in (before, now))
             raise PolicyError("{}: this {} was learned with other {}: {}, here {}".format(file, who, name, *texts))
+
+
+def _without_folder(task: str) -> str:
+    """Return a task's name; of one in a file, whose folder is relative to the document, without that: `task.py:Class`."""
+    file, colon, class_ = task.rpartition(":")
+    return f"{Path(file).name}{colon}{class_}"
 
 
 def _is_in_order(card: Mapping[str, int], groups: Mapping[str, int]) -> bool:
