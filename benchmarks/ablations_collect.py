@@ -89,6 +89,7 @@ def collect(
     if task is None:
         raise KeptError(f"{run}: it was made from {document}, which is not here: collect it where that is")
     plain = {"document": _shown(document), "unit": task.score_unit, "is_less_better": task.is_less_better} | asked
+    plain.pop("teacher_from_here", None)  # a place on this machine
     files["distill.json"] = _json(_without_paths(plain | {"simulations": made}))
     for given, kept in ((teacher, "teacher.json"), (rest, "rest.json")):
         own = given or into / name / kept

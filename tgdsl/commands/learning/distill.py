@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shlex
 import sys
 import warnings
@@ -81,7 +82,7 @@ class Distill:
         if self.resume is not None and self.out is not None:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
         folder = self.resume or self.out or Path("out") / f"{self.task.stem}_students"
-        before = _read(folder / "distill.json") if self.resume else {}
+        before = _read(folder) if self.resume else {}
         given = parsed_overrides(self.set)
         overrides = joined_overrides(before.get("overrides", {}), given)
         loaded = load_task(self.task, overrides)
@@ -132,7 +133,7 @@ class Distill:
         """
         spec = loaded.spec
         given: dict[str, Any] = {
-            "teacher": None if self.teacher is None else str(self.teacher),
+            "teacher": None if self.teacher is None else _same(self.teacher, before.get("teacher")),
             "types": _names(self.types),
             "placements": _names(self.placements),
             "noise": _names(self.noise),
@@ -248,7 +249,8 @@ class _Part:
             held.enter_context(folder.held())
             folder.check(is_resumed=self._goes_on)  # what was there when nobody held it
             if file is not None:
-                _write(file, self._asked | {"overrides": self._given})
+                own = os.path.relpath(Path(self._asked["teacher"]).resolve(), file.parent.resolve())
+                _write(file, self._asked | {"overrides": self._given, "teacher_from_here": own})
             folder.begin(origin | taught, loaded, env)
             run = Run(distiller, folder, loaded.spec.distill.checkpoint, state["seconds"] if state else 0.0)
             total = command.iterations or loaded.spec.distill.iterations
@@ -338,7 +340,9 @@ def _write(file: Path, plain: dict[str, Any]) -> None:
     atomic_write(file, (json.dumps(plain, indent=2, ensure_ascii=False) + "\n").encode())
 
 
-def _read(file: Path) -> dict[str, Any]:
+def _read(folder: Path) -> dict[str, Any]:
+    """Return what a run was asked for, its teacher as it is named in the working folder."""
+    file = folder / "distill.json"
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -346,4 +350,10 @@ def _read(file: Path) -> dict[str, Any]:
     names = ("teacher", "types", "placements", "noise", "seeds", "resolutions", "envs", "seed", "overrides")
     if missing := [name for name in names if not isinstance(found, dict) or name not in found]:
         raise TgdslError(f"{file}: it has no {missing[0]}: this is not what tgdsl distill writes")
-    return found
+    own = folder.resolve() / found.get("teacher_from_here", "")
+    return found | {"teacher": _same(Path(os.path.relpath(own)), found["teacher"])} if own.is_file() else found
+
+
+def _same(file: Path, name: str | None) -> str:
+    """Return the name that a file goes by, if that is one of it; else its own."""
+    return name if name is not None and file.resolve() == Path(name).resolve() else str(file)

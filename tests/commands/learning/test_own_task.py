@@ -1,0 +1,56 @@
+"""A task of one's own whose files stand in folders of their own, from wherever it is learned."""
+
+import json
+
+import pytest
+import small_tasks
+from small_runs import ARGUMENTS
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+ON = ("--device", "cpu", "--envs", "4", "--iterations")
+FEW = ("--set", "distill.steps=4", "--set", "distill.networks.encoder.hidden=[8]", "--set", "distill.networks.hidden=[8]")
+CODE = """from factors import twice
+from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
+
+
+class Own(InPalmRotate):
+    def reward(self, now, is_over):
+        return {name: twice(value) for name, value in super().reward(now, is_over).items()}
+"""
+
+
+@pytest.fixture
+def base(tmp_path):
+    """Files in `code`, `robots`, `sensors` and `tasks/mine`, and two folders to work in."""
+    for name in ("code", "robots", "sensors", "tasks/mine", "here", "there/below"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "code" / "own.py").write_text(CODE)
+    (tmp_path / "code" / "factors.py").write_text("def twice(value):\n    return 2.0 * value\n")
+    (tmp_path / "robots" / "scene.xml").write_text(small_tasks.SCENE)
+    (tmp_path / "sensors" / "all.yaml").write_text(small_tasks.SENSORS.replace("scene.xml", "../robots/scene.xml"))
+    task = small_tasks.TASK.replace("in_palm_rotate", "../../code/own.py:Own").replace("sensors.yaml", "../../sensors/all.yaml")
+    (tmp_path / "tasks" / "mine" / "task.yaml").write_text(task)
+    (tmp_path / "tasks" / "moved.yaml").write_text(task.replace("../../", "../"))
+    return tmp_path
+
+
+def test_it_is_learned_and_goes_on_from_anywhere(base, here):
+    """Its document may also stand elsewhere, as long as it names the same files."""
+    task, moved, run = "../tasks/mine/task.yaml", "../../tasks/moved.yaml", "../../here/out/task"
+    for folder, *words in (
+        ("here", "train", task, *ON, "1", "--episodes", "4", *ARGUMENTS),
+        ("there/below", "train", "../" + task, "--resume", run, *ON, "2", "--episodes", "0"),
+        ("there/below", "train", moved, "--resume", run, *ON, "3", "--episodes", "0"),
+        ("there/below", "evaluate", moved, "--policy", f"{run}/policy.pt", "--episodes", "4", "--envs", "4"),
+        ("here", "distill", task, "--teacher", "out/task/policy.pt", "--types", "bool", "--seeds", "1", *ON, "1", *FEW),
+        ("there/below", "distill", moved, "--resume", f"{run}_students", *ON, "2"),
+        ("there/below", "distill", moved, "--resume", f"{run}_students", *ON, "3", "--teacher", f"{run}/policy.pt"),
+        ("here", "distill", task, "--resume", "out/task_students", *ON, "3", "--teacher", "./out/../out/task/policy.pt"),
+    ):
+        code, _, error = here(base / folder, *words, *(("--episodes", "4") if words[0] == "distill" else ()))
+        assert code == 0, (words, error)
+    kept = base / "here" / "out" / "task"
+    assert (kept / "own.py").read_text() == CODE and (kept / "all.yaml").is_file()
+    starts = json.loads((base / "here" / "out" / "task_students" / "default" / "run.json").read_text())["starts"]
+    assert [start["teacher"] for start in starts] == ["out/task/policy.pt", *[f"{run}/policy.pt"] * 2, "out/task/policy.pt"]
+    assert len({start["teacher_sha256"] for start in starts}) == 1
