@@ -50,7 +50,8 @@ class TouchEnv:
     `tactile_sensors` (none with `touch: none`), `priv_proprio` (`proprio` and the force on each link [N]), and the task's own.
 
     Attributes:
-        spec: The task's document.
+        loaded: The task's document, and where it stands.
+        spec: What it says.
         task: The task.
         sim: The simulation.
         touch: The module.
@@ -104,7 +105,8 @@ class TouchEnv:
         num_envs = int(num_envs)
         chosen = simulator_of(device, simulator)
         loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
-        self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
+        self.loaded, self.spec = loaded, loaded.spec
+        sensed = sensed or compile_sensed(loaded, device, progress, feels=feels)
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
         is_cuda = self.touch.device.type == "cuda"
         is_compiled = is_cuda if compiled is None else compiled

@@ -136,7 +136,7 @@ def compile_sensed(
             of the sensors' document.
         RobotError: If a robot or scene file cannot be read.
     """
-    spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, _document(loaded)
+    spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, sensors_document(loaded)
     kinds = _kinds(document)
     by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
     overrides: dict[str, Any] = {"observations": {}}
@@ -233,7 +233,7 @@ def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
     Raises:
         SpecError: If not, or all mistakes of the sensors' document.
     """
-    kinds = _kinds(_document(loaded))
+    kinds = _kinds(sensors_document(loaded))
     for each in feels:
         _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",))
 
@@ -244,7 +244,7 @@ def types_of(loaded: LoadedTask) -> list[str]:
     Raises:
         SpecError: All mistakes of the sensors' document.
     """
-    kinds = _kinds(_document(loaded)).values()
+    kinds = _kinds(sensors_document(loaded)).values()
     return ["none", *(name for name, (kind, _) in SENSED.items() if kind in kinds)]
 
 
@@ -254,7 +254,7 @@ def num_variants(loaded: LoadedTask) -> int:
     Raises:
         SpecError: All mistakes of the sensors' document, or if a variant that the task names is not there.
     """
-    document, spec = _document(loaded), loaded.spec
+    document, spec = sensors_document(loaded), loaded.spec
     return (
         len(document.spec.objects[spec.object].variants or ()) or 1
         if spec.variants is None
@@ -280,7 +280,7 @@ def _variants(loaded: LoadedTask, document: Loaded) -> list[Any]:
     return [known[variant] for variant in spec.variants]
 
 
-def _document(loaded: LoadedTask) -> Loaded:
+def sensors_document(loaded: LoadedTask) -> Loaded:
     """Return the sensors' document.
 
     Raises:

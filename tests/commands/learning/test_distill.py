@@ -141,7 +141,7 @@ def test_a_run_goes_on_with_its_teacher_wherever_that_is_now(base, here):
     assert json.loads((base / "run" / "distill.json").read_text())["teacher"] == "moved.pt"
     teacher(base / "teacher.pt", load_task(base / "task.yaml"), ["priv_proprio"])
     code, _, error = here(base, "distill", "task.yaml", *on, "3", "--teacher", "teacher.pt")
-    assert code == 2 and "--teacher teacher.pt: this run began with moved.pt; begin another one" in error
+    assert code == 2 and "--teacher teacher.pt: this run began with sub/moved.pt; begin another one" in error
 
 
 def test_a_teacher_that_does_not_say_what_it_feels_is_refused(base, fails):

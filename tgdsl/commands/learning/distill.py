@@ -227,6 +227,7 @@ class _Part:
             file: Where what the run goes on with is written, once nothing is refused any more; None: it has been.
         """
         from tgdsl.rl.env import TouchEnv
+        from tgdsl.rl.playing.surroundings import changes_around
         from tgdsl.rl.students.learner import Distiller
         from tgdsl.rl.train.checkpoint import restore
         from tgdsl.rl.train.folder import made_from
@@ -239,6 +240,8 @@ class _Part:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
             distiller = Distiller(env, loaded, self.teacher.bound(env), self._keys, seed)
+            for line in changes_around(self.teacher.card, loaded, env.sim.model) if file is not None else ():
+                print(f"changed since the teacher was learned: {line}")
             if state is not None:
                 restore(distiller, state, folder.checkpoint)
             origin = made_from(loaded, env, seed, self._overrides, 1) | {"teacher": self._asked["teacher"]}

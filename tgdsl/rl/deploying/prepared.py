@@ -29,6 +29,7 @@ from tgdsl.rl.playing.policy import (
     check_learned,
     read_policy,
 )
+from tgdsl.rl.playing.surroundings import changes_around
 from tgdsl.rl.sensed import GROUP, PER_LINK, Felt, Sensed, compile_sensed
 from tgdsl.rl.start import moved_joints
 from tgdsl.scene.scene import SceneModels
@@ -146,6 +147,7 @@ def prepare(
     moved, model = moved_joints(loaded, sensed), SceneModels(sensed.touch.plan.scene).model({})
     if card is not None:
         check_card(card, policy, moved, _taxels(loaded, sensed, feels))
+        changes = [*changes, *changes_around(card, loaded, model)]
     joints = sensed.touch.inputs.joints
     try:
         actuators = Actuators.of(model, moved)

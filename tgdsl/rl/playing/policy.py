@@ -27,6 +27,7 @@ from tgdsl.errors import TgdslError, did_you_mean
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
 from tgdsl.rl.playing.differences import is_close, spec_differences
+from tgdsl.rl.playing.surroundings import changes_around
 from tgdsl.rl.sensed import GROUP
 from tgdsl.rl.spec import TaskSpec
 
@@ -184,7 +185,7 @@ def policy_for(env: TouchEnv, saved: PolicyFile, named: Sequence[str] = ()) -> P
     groups = {name: env.groups[name] for name in actor_groups(env.groups, named, card)}
     policy = Policy(saved, groups, env.num_envs, env.num_actions, env.device)
     if card is not None:
-        policy.changes = changes_since(card, env.spec)
+        policy.changes = [*changes_since(card, env.spec), *changes_around(card, env.loaded, env.sim.model)]
     return policy
 
 

@@ -20,7 +20,7 @@ from tgdsl.rl.train.iteration import Learning
 if TYPE_CHECKING:
     from tgdsl.rl.train.learner import Learner
 
-KEPT = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "versions", "spec")
+KEPT = ("task", "overrides", "seed", "processes", "device", "module", "taxels", "sensors", "scene", "versions", "spec")
 """What a card says of what a run was made from."""
 
 

@@ -1,0 +1,88 @@
+"""What a policy was learned among: what of sensors' document and scene is otherwise is told, and nothing else."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+import small_tasks
+from small_runs import small_learner
+
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.load import load_task
+from tgdsl.rl.playing.policy import policy_for, read_policy
+from tgdsl.rl.playing.surroundings import SCENE, changes_around, surroundings
+from tgdsl.rl.train.folder import made_from
+from tgdsl.rl.train.policies import card_of, write_policy
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+IN_SCENE = [
+    ("gravity", '<option timestep="0.005"', '<option timestep="0.005" gravity="0 0 -9.8"'),
+    ("bodies", 'mass=".02"', 'mass=".021"'),
+    ("geoms", 'size=".02 .02 .02"', 'size=".02 .02 .02" friction=".9"'),
+    (
+        "joints",
+        'name="bend" type="hinge" axis="0 1 0" range="-1 1" damping=".05"',
+        'name="bend" range="-1 1" axis="0 1 0" damping=".06"',
+    ),
+    ("actuators", 'joint="bend" kp="2"', 'joint="bend" kp="2.1"'),
+]
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A policy's file, which nobody has taught anything."""
+    folder = tmp_path_factory.mktemp("learned")
+    learner, loaded = small_learner(folder)
+    write_policy(learner, card_of(learner, made_from(loaded, learner.env, 0, {}, 1), 0.0, "tgdsl train"), folder / "policy.pt")
+    return folder / "policy.pt"
+
+
+def changes(learned, folder):
+    env = TouchEnv(small_tasks.small_task(folder), 2, threads=1)
+    try:
+        return policy_for(env, read_policy(learned)).changes
+    finally:
+        env.close()
+
+
+def test_what_is_as_it_was_is_not_told(learned, tmp_path):
+    """In another folder; and of a card that says nothing of it."""
+    assert changes(learned, tmp_path) == []
+    loaded = load_task(small_tasks.small_task(tmp_path))
+    assert changes_around({}, loaded, mujoco.MjModel.from_xml_string(small_tasks.SCENE)) == []
+
+
+def test_what_of_the_sensors_is_otherwise(learned, tmp_path, monkeypatch):
+    text = small_tasks.SENSORS.replace("threshold: 0.1 mm", "rate: 20 Hz, threshold: 0.2 mm").replace("10 cm", "11 cm")
+    text += "  more: {kind: contact_depth, links: tip, feels: [item]}\n"  # which nobody had
+    monkeypatch.setattr(small_tasks, "SENSORS", text)
+    found = ["bit.rate: null, now 20.0", "bit.threshold: 0.0001, now 0.0002", "gap.max_range: 0.1, now 0.11"]
+    assert sorted(changes(learned, tmp_path)) == [f"sensors.yaml: sensors.{line}" for line in found]
+
+
+@pytest.mark.parametrize(("part", "before", "now"), IN_SCENE)
+def test_what_of_the_scene_is_otherwise(learned, tmp_path, monkeypatch, part, before, now):
+    monkeypatch.setattr(small_tasks, "SCENE", small_tasks.SCENE.replace(before, now))
+    assert small_tasks.SCENE.count(now) == 1
+    assert changes(learned, tmp_path) == [f"the scene's {part}"]
+
+
+def test_rounding_is_no_difference(tmp_path):
+    """Of each array of floats every number a few units in its last place greater; one number that is 1 % and 0.001 greater is another scene."""
+    loaded = load_task(small_tasks.small_task(tmp_path))
+    model = mujoco.MjModel.from_xml_string(small_tasks.SCENE)
+    card = json.loads(json.dumps(surroundings(loaded, model)))
+    arrays = [getattr(model, name) for names in SCENE.values() for name in names if not name.startswith("opt.")]
+    for array in arrays:
+        if array.dtype == np.float64:
+            array += 4 * np.spacing(array) * (array != 0) + 1e-17 * (array == 0)
+    assert changes_around(card, loaded, model) == []
+    for part, names in SCENE.items():
+        for name in names:
+            array = model.opt.gravity if name == "opt.gravity" else getattr(model, name)
+            if array.dtype == np.float64 and array.size:
+                kept = array.copy()
+                array.flat[0] = array.flat[0] * 1.01 + 1e-3
+                assert changes_around(card, loaded, model) == [f"the scene's {part}"], name
+                array[...] = kept
