@@ -9,12 +9,14 @@ stand further below in its file are known by then, which jaxtyping takes for any
 import functools
 import typing
 from collections.abc import Callable
+from importlib.machinery import SourceFileLoader
 from inspect import Parameter, Signature, signature
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, NoReturn
+from unittest.mock import patch
 
 import jaxtyping
-from jaxtyping import AbstractArray, _decorator, config
+from jaxtyping import AbstractArray, _decorator, _import_hook, config
 from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
 ANYTHING = (Any, NoReturn, Parameter.empty)
@@ -54,6 +56,18 @@ def prepare() -> None:
         return checked(fn, typechecker) if isinstance(fn, FunctionType) else whole(fn, typechecker=typechecker)
 
     _decorator.jaxtyped = jaxtyping.jaxtyped = jaxtyped
+
+    def exec_module(self: Any, module: ModuleType) -> None:
+        """Run a module; what it imports is taken from where Python keeps its bytecode, not from where jaxtyping keeps its own."""
+        SourceFileLoader.exec_module(self, module)
+
+    def get_code(self: Any, fullname: str) -> CodeType | None:
+        kept_at = functools.partial(_import_hook._optimized_cache_from_source, self._typechecker.get_hash())
+        with patch("importlib._bootstrap_external.cache_from_source", kept_at):
+            return SourceFileLoader.get_code(self, fullname)
+
+    _import_hook._JaxtypingLoader.exec_module = exec_module
+    _import_hook._JaxtypingLoader.get_code = get_code
 
 
 def checked(fn: FunctionType, typechecker: Callable[..., Any]) -> Callable[..., Any]:
