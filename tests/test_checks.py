@@ -24,6 +24,10 @@ def pair(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"], scale: float = 
     return scale * (one + other) if scale > 0 else one[:1]
 
 
+def either(one: Float[Tensor, "n 3"] | Float[Tensor, "m 4"], other: Float[Tensor, " n"]) -> None:
+    pass
+
+
 def later(made: Made) -> list[Made]:
     return [made]
 
@@ -59,6 +63,26 @@ def test_parameters_and_results_and_axes_of_one_name():
     assert function.__name__ == "pair" and function.__wrapped__ is pair
     with pytest.raises(TypeError, match="other"):
         function(three)
+
+
+def test_arrays_like_those_that_were_right_are_looked_at_again():
+    function, three = checked(pair, beartype), torch.zeros(3, 3)
+    for _ in range(2):
+        assert function(three, three).shape == (3, 3)
+        assert "other" in refused(function, three, torch.zeros(4, 3))
+        assert "one" in refused(function, torch.zeros(3, 4), three)
+        assert "one" in refused(function, torch.zeros(3), three)
+        assert "one" in refused(function, three.long(), three)
+        assert "one" in refused(function, three.numpy(), three)
+        assert "result" in refused(function, three, three, scale=-1.0)
+
+
+def test_lengths_of_what_an_array_is_not_are_forgotten():
+    function = checked(either, beartype)
+    for _ in range(2):
+        function(torch.zeros(2, 3), torch.zeros(2))
+        function(torch.zeros(2, 4), torch.zeros(5))
+        assert "other" in refused(function, torch.zeros(2, 3), torch.zeros(5))
 
 
 def test_names_that_stand_further_below_and_what_never_returns():

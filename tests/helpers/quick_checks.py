@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, NoReturn
 from unittest.mock import patch
 
 import jaxtyping
-from jaxtyping import AbstractArray, _decorator, _import_hook, config
+from jaxtyping import AbstractArray, _array_types, _decorator, _import_hook, _storage, config
 from jaxtyping._storage import pop_shape_memo, push_shape_memo
 
 ANYTHING = (Any, NoReturn, Parameter.empty)
@@ -56,6 +56,7 @@ def prepare() -> None:
         return checked(fn, typechecker) if isinstance(fn, FunctionType) else whole(fn, typechecker=typechecker)
 
     _decorator.jaxtyped = jaxtyping.jaxtyped = jaxtyped
+    _array_types._MetaAbstractArray.__instancecheck__ = is_instance
 
     def exec_module(self: Any, module: ModuleType) -> None:
         """Run a module; what it imports is taken from where Python keeps its bytecode, not from where jaxtyping keeps its own."""
@@ -70,6 +71,69 @@ def prepare() -> None:
     _import_hook._JaxtypingLoader.get_code = get_code
 
 
+class Shape(NamedTuple):
+    """What an array has to be like.
+
+    Attributes:
+        axes: Name of each axis that has one, and else the length that it is to have, if any; None if there are other axes.
+        seen: Types and dtypes of arrays that were found to be right.
+    """
+
+    axes: list[str | int | None] | None
+    seen: set[tuple[type, Any]]
+
+
+_shapes: dict[Any, Shape] = {}
+"""By annotation."""
+
+
+def is_instance(cls: Any, value: Any) -> bool:
+    """Return whether an array is as annotated: jaxtyping's own answer, which is not asked again for what it found right.
+
+    Lengths of axes are looked at each time; what is not right, or is written in another way than by names and numbers, is
+    jaxtyping's to judge.
+    """
+    axes, seen = _shapes.get(cls) or _shapes.setdefault(cls, Shape(_axes_of(cls), set()))
+    kind = type(value), getattr(value, "dtype", None)
+    if axes is not None and kind in seen:
+        shape = value.shape
+        if len(shape) == len(axes):
+            stack = getattr(_storage._shape_storage, "memo_stack", None)
+            lengths, added = stack[-1][0] if stack else {}, []
+            for axis, length in zip(axes, shape, strict=True):
+                if axis.__class__ is str:
+                    known = lengths.get(axis)
+                    if known is None:
+                        lengths[axis] = length
+                        added.append(axis)
+                    elif known != length:
+                        break
+                elif axis is not None and axis != length:
+                    break
+            else:
+                return True
+            for axis in added:
+                del lengths[axis]
+    is_right = cls.__instancecheck_str__(value) == ""
+    if is_right:
+        seen.add(kind)
+    return is_right
+
+
+def _axes_of(cls: Any) -> list[str | int | None] | None:
+    axes = []
+    for dim in getattr(cls, "dims", ()) or ():
+        if dim is _array_types._anonymous_dim:
+            axes.append(None)
+        elif isinstance(dim, _array_types._FixedDim) and not dim.broadcastable:
+            axes.append(dim.size)
+        elif isinstance(dim, _array_types._NamedDim) and not dim.broadcastable and not dim.treepath:
+            axes.append(dim.name)
+        else:
+            return None
+    return axes if hasattr(cls, "dims") and getattr(cls, "index_variadic", 0) is None else None
+
+
 def checked(fn: FunctionType, typechecker: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that checks its parameters and its result, unless jaxtyping is disabled."""
     if hasattr(fn, "__checked__"):  # a constructor that a class inherits
@@ -81,18 +145,18 @@ def checked(fn: FunctionType, typechecker: Callable[..., Any]) -> Callable[..., 
         __tracebackhide__ = True
         if config.jaxtyping_disable:
             return fn(*args, **kwargs)
-        checks = _made.get(id(fn.__code__)) or _make(fn, typechecker)
-        if checks.has_axes:
+        parameters, own, has_axes, _ = _made.get(id(fn.__code__)) or _make(fn, typechecker)
+        if has_axes:
             push_shape_memo({})
         try:
-            if checks.parameters is not None:
-                checks.parameters(*args, **kwargs)
+            if parameters is not None:
+                parameters(*args, **kwargs)
             result = fn(*args, **kwargs)
-            if checks.result is not None:
-                checks.result(result)
+            if own is not None:
+                own(result)
             return result
         finally:
-            if checks.has_axes:
+            if has_axes:
                 pop_shape_memo()
 
     call.__checked__ = True  # pyright: ignore[reportFunctionMemberAccess]
