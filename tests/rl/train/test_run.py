@@ -288,47 +288,6 @@ def test_the_first_rows_of_a_curve_may_have_no_episodes(tmp_path):
     assert found == [("0", "nan", True), ("4", "8", False), ("0", "nan", True)]
 
 
-def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
-    """Of header and first row any part may have been written when the run was killed; other rows than that are kept."""
-    run, learner = begun(tmp_path)
-    run.learn(2, float("inf"))
-    folder = run._folder
-    content = folder.curve.read_bytes()
-    header, first, _ = content.splitlines(keepends=True)
-    for size in range(len(content) + 1):
-        folder.curve.write_bytes(content[:size])
-        whole = (size >= len(header + first)) + (size == len(content))
-        assert [row["iteration"] for row in folder.rows()] == ["1", "2"][:whole], size
-        folder.keep_rows(1)
-        assert folder.curve.read_bytes() == (header + first if whole else b""), size
-    folder.curve.write_bytes(header[: len(header) // 2])
-    folder.check(is_resumed=True)
-    Run(learner, folder, EVERY).learn(3, float("inf"))
-    assert folder.curve.read_bytes().startswith(header) and [row["iteration"] for row in folder.rows()] == ["3"]
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("iteration,samp1,\n", "1: found 3 values, 'iteration,samp1,', expected the columns iteration, samples, seconds, …"),
-        ("\0\0\n", r"1: found 1 values, '\x00\x00', expected the columns iteration, samples, seconds, …"),
-        ("iteration,samples,seconds\n1,2,3\n\0,,\n", r"3: found 3 values, '\x00,,', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n1,2\n2,3,4\n", "2: found 2 values, '1,2', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n1,2,3,4,5\n", "2: found 5 values, '1,2,3', expected 3 values of an iteration"),
-        ("iteration,samples,seconds\n\n1,2,3\n", "2: found 0 values, '', expected 3 values of an iteration"),
-    ],
-    ids=["torn", "zeros", "zeros later", "too few", "too many", "empty"],
-)
-def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, expected):
-    folder = RunFolder(tmp_path)
-    folder.checkpoint.write_bytes(b"")
-    folder.curve.write_text(text)
-    with pytest.raises(TgdslError) as raised:
-        folder.check(is_resumed=True)
-    assert str(raised.value) == f"{folder.curve}:{expected}; move this file away, and the run goes on with a new one"
-    assert folder.curve.read_text() == text
-
-
 def test_a_task_of_ones_own_is_kept_with_its_documents(tmp_path):
     file = small_tasks.small_task(tmp_path)
     assert sorted(documents(load_task(file))) == ["sensors.yaml", "task.yaml"]

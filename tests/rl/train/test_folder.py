@@ -1,0 +1,50 @@
+"""A run's curve: what a kill has left of it, and what is none."""
+
+import pytest
+
+from tgdsl.errors import TgdslError
+from tgdsl.rl.train.folder import RunFolder
+
+
+def row_of(iteration):
+    return {"iteration": iteration, "samples": 8 * iteration, "seconds": 0.5 * iteration, "Loss/value": 0.25}
+
+
+def test_a_curve_goes_on_whatever_byte_was_its_last(tmp_path):
+    """Of header and first row any part may have been written when the run was killed; other rows than that are kept."""
+    folder = RunFolder(tmp_path)
+    for iteration in (1, 2):
+        folder.add_row(row_of(iteration))
+    content = folder.curve.read_bytes()
+    header, first, second = content.splitlines(keepends=True)
+    assert header == b"iteration,samples,seconds,Loss/value\n"
+    for size in range(len(content) + 1):
+        folder.curve.write_bytes(content[:size])
+        whole = (size >= len(header + first)) + (size == len(content))
+        assert [row["iteration"] for row in folder.rows()] == ["1", "2"][:whole], size
+        folder.keep_rows(1)
+        assert folder.curve.read_bytes() == (header + first if whole else b""), size
+        folder.add_row(row_of(2))
+        assert folder.curve.read_bytes() == (content if whole else header + second), size
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("iteration,samp1,\n", "1: found 3 values, 'iteration,samp1,', expected the columns iteration, samples, seconds, …"),
+        ("\0\0\n", r"1: found 1 values, '\x00\x00', expected the columns iteration, samples, seconds, …"),
+        ("iteration,samples,seconds\n1,2,3\n\0,,\n", r"3: found 3 values, '\x00,,', expected 3 values of an iteration"),
+        ("iteration,samples,seconds\n1,2\n2,3,4\n", "2: found 2 values, '1,2', expected 3 values of an iteration"),
+        ("iteration,samples,seconds\n1,2,3,4,5\n", "2: found 5 values, '1,2,3', expected 3 values of an iteration"),
+        ("iteration,samples,seconds\n\n1,2,3\n", "2: found 0 values, '', expected 3 values of an iteration"),
+    ],
+    ids=["torn", "zeros", "zeros later", "too few", "too many", "empty"],
+)
+def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, expected):
+    folder = RunFolder(tmp_path)
+    folder.checkpoint.write_bytes(b"")
+    folder.curve.write_text(text)
+    with pytest.raises(TgdslError) as raised:
+        folder.check(is_resumed=True)
+    assert str(raised.value) == f"{folder.curve}:{expected}; move this file away, and the run goes on with a new one"
+    assert folder.curve.read_text() == text
