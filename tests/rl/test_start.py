@@ -4,7 +4,7 @@ import pytest
 import torch
 from tiny_tasks import write_task
 
-from tgdsl.errors import SpecError
+from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl import env as env_file
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
@@ -98,3 +98,24 @@ def test_logic_has_one_thread_and_readings_of_many_taxels_have_all(tmp_path, mon
     finally:
         torch.set_num_threads(before)
     assert seen == {"read": threads, "_judged": 1, "_commanded": 1, "_begin": 1}
+
+
+@pytest.mark.parametrize("num_envs", [0, -1, True])
+def test_numbers_of_environments_that_are_none(tmp_path, num_envs):
+    with pytest.raises(SimulationError, match=f"num_envs is {num_envs!r}, expected a whole number of at least 1"):
+        TouchEnv(write_task(tmp_path), num_envs, threads=1, overrides={"touch": "none"})
+
+
+def test_seeds_have_64_bits_and_environments_are_made_in_inference_mode_too(tmp_path):
+    """Outside of it they go on."""
+    task = write_task(tmp_path)
+    with torch.inference_mode():
+        env = TouchEnv(task, 1, threads=1, seed=2**63 - 1, overrides={"touch": "none"})
+        env.step(torch.zeros(1, env.num_actions))
+    env.step(torch.zeros(1, env.num_actions))
+    assert env.num_envs == 1 and int(env.state_dict()["seed"]["seed"]) == 2**63 - 1
+    with pytest.raises(SimulationError, match="the seed is 9223372036854775808, expected a whole number of 64 bits"):
+        env.reset(2**63)
+    env.close()
+    with pytest.raises(SimulationError, match="the seed is -9223372036854775809"):
+        TouchEnv(task, 1, threads=1, seed=-(2**63) - 1, overrides={"touch": "none"})

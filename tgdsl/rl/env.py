@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from numbers import Integral
 from os import PathLike
 from typing import Any
 
@@ -100,13 +99,9 @@ class TouchEnv:
             SpecError: All mistakes of the document, at their places.
             SimulationError: If the scene cannot be simulated as the document says.
         """
-        if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
-            raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
-        num_envs = int(num_envs)
         chosen = simulator_of(device, simulator)
-        loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
-        self.loaded, self.spec = loaded, loaded.spec
-        sensed = sensed or compile_sensed(loaded, device, progress, feels=feels)
+        loaded = self.loaded = task if isinstance(task, LoadedTask) else load_task(task, overrides)
+        self.spec, sensed = loaded.spec, sensed or compile_sensed(loaded, device, progress, feels=feels)
         self.touch, self.felt, self._sensed = sensed.touch, sensed.groups, sensed
         is_cuda = self.touch.device.type == "cuda"
         is_compiled = is_cuda if compiled is None else compiled
@@ -126,8 +121,7 @@ class TouchEnv:
         random, arrays = self.spec.randomise, self.sim.arrays
         self.actuation = Actuation(setup.actuators, arrays, self.spec.action, random.drive, draws, self.sim.substeps)
         self.sim.drive = None if self.actuation.is_ideal else FusedCall(self.actuation.drive, is_compiled)
-        body = int(setup.model.body(setup.object).id)
-        self.pushes = Pushes(random.push, arrays, body, setup.control_step, draws)
+        self.pushes = Pushes(random.push, arrays, int(setup.model.body(setup.object).id), setup.control_step, draws)
         self._control_step = setup.control_step  # MuJoCo takes a while to tell
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import mujoco
@@ -74,8 +75,10 @@ def make_simulation(
         first_env: Number of the first environment among those of all processes.
 
     Raises:
-        SimulationError: If the scene cannot be simulated as the document says.
+        SimulationError: If the scene cannot be simulated as the document says, or of no whole number of environments.
     """
+    if not isinstance(num_envs, Integral) or isinstance(num_envs, bool) or num_envs < 1:
+        raise SimulationError(f"num_envs is {num_envs!r}, expected a whole number of at least 1")
     spec = loaded.spec
     own = loaded.task.watch(spec)
     watch = Watch(

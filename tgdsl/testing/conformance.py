@@ -5,10 +5,8 @@ Shapes: `env` environments, `taxel` taxels, `channel` numbers per taxel.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
-import hashlib
 import json
 import warnings
 from collections.abc import Iterator, Mapping
@@ -35,6 +33,7 @@ from tgdsl.schema.load import load
 from tgdsl.sensors.base import Kind
 from tgdsl.sensors.known import quantities_of
 from tgdsl.tensors.torch_internals import num_compiled_graphs
+from tgdsl.testing.known_reference import KnownReference, answers_of
 from tgdsl.testing.reference import assert_agrees
 
 FLOAT32_TOLERANCE = 1e-5
@@ -95,51 +94,6 @@ def _plan_of(document: str, kinds: tuple[Kind, ...]) -> Plan:
         return compile_plan(json.loads(document), kinds=kinds)
 
 
-@functools.lru_cache(maxsize=8)
-def _answers_of(suite: type[KindConformance], document: str) -> dict[bytes, Any]:
-    """Return what the reference of a suite's document has answered so far, by what it was asked."""
-    return {}
-
-
-class _KnownReference(ReferenceModule):
-    """A reference that computes each answer once for a whole suite, whose tests ask for readings of the same states."""
-
-    def __init__(self, answers: dict[bytes, Any], *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._answers = answers
-
-    def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, np.ndarray]]]:
-        if self.upstream:  # those remember too
-            return super().__call__(state, shift)
-        asked = _digest(state, shift, self.num_calls, self.memory)
-        if asked not in self._answers:
-            self._answers[asked] = super().__call__(state, shift)
-        return copy.deepcopy(self._answers[asked])
-
-
-def _digest(*values: Any) -> bytes:
-    """Return a digest of states, dictionaries, sequences, tensors, arrays and plain values: of all that is in them."""
-    found = hashlib.sha256()
-
-    def add(value: Any) -> None:
-        if isinstance(value, SceneState):
-            add([getattr(value, field.name) for field in dataclasses.fields(value)])
-        elif isinstance(value, Mapping):
-            add([part for item in value.items() for part in item])
-        elif isinstance(value, list | tuple):
-            found.update(f"{len(value)} parts:".encode())
-            for part in value:
-                add(part)
-        elif isinstance(value, Tensor | np.ndarray):
-            array = np.ascontiguousarray(value)
-            found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
-        else:
-            found.update(f"{value!r};".encode())
-
-    add(values)
-    return found.digest()
-
-
 class KindConformance:
     """Inherit this in a test class and set `kind`, and `parameters` if its defaults are not what should be tested."""
 
@@ -193,7 +147,7 @@ class KindConformance:
         """Return a document's reference."""
         specs = load(document, kinds=self._known()).spec.sensors
         others = {name: (kind, specs[name]) for name, (kind, _) in self.others.items()}
-        return _KnownReference(_answers_of(type(self), json.dumps(document)), plan, self.kind, specs["s"], others)
+        return KnownReference(answers_of(type(self), json.dumps(document)), plan, self.kind, specs["s"], others)
 
     def states(self, module: TactileModule, num_envs: int | None = None) -> Iterator[SceneState]:
         """Yield the states that tests run through: different poses, one after the other."""

@@ -10,7 +10,7 @@ from tgdsl.rl.students import losses
 from tgdsl.rl.students.encoders import Encoder, Grid, Lstm, network
 from tgdsl.rl.students.stack import Stack, made
 from tgdsl.rl.students.student import Architecture, deployed, forgotten
-from tgdsl.rl.train.checkpoint import FORMAT, read_checkpoint, write_checkpoint
+from tgdsl.rl.train.checkpoint import FORMAT, KEYS, read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # what policies are written in
 SEEDS = (3, 4, 9)
@@ -203,6 +203,8 @@ def test_a_deployed_student_acts_as_it_did_and_forgets_episode_by_episode(kind, 
             memory = forgotten(memory, ended)
             if stack.memory:
                 policy.begin(ended)
+    assert not policy(x[1]).requires_grad  # nor is there a graph in what it remembers
+    assert policy(x[1].requires_grad_()).requires_grad
 
 
 @pytest.mark.parametrize("kind", ENCODERS)
@@ -243,7 +245,7 @@ def test_a_slim_checkpoint_rounds_moments_alone(tmp_path):
     x, memory = inputs(one, 6, torch.float32)
     made = one(x, memory)
     one.descend(torch.cat([made.action, made.told], dim=2).square().mean(dim=(1, 2)))
-    state = {"format": FORMAT, "stacks": [one.state_dict()]}
+    state = dict.fromkeys(KEYS) | {"format": FORMAT, "stacks": [one.state_dict()]}
     sizes = [write_checkpoint(state, tmp_path / f"{slim}.pt", slim) for slim in (False, True)]
     assert sizes[1] < 0.9 * sizes[0]
     other.load_state_dict(read_checkpoint(tmp_path / "True.pt")["stacks"][0])

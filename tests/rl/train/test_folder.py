@@ -1,4 +1,7 @@
-"""A run's curve: what a kill has left of it, and what is none."""
+"""A run's folder: who runs in it, what a kill has left of its curve, and what is no run."""
+
+import subprocess
+import sys
 
 import pytest
 
@@ -48,3 +51,31 @@ def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, expect
         folder.check(is_resumed=True)
     assert str(raised.value) == f"{folder.curve}:{expected}; move this file away, and the run goes on with a new one"
     assert folder.curve.read_text() == text
+
+
+def test_two_processes_do_not_run_in_one_folder(tmp_path):
+    """Another one holds it; when that is killed, it is free."""
+    folder = RunFolder(tmp_path / "run")
+    code = f"import time; from pathlib import Path; from tgdsl.rl.train.folder import RunFolder\nwith RunFolder(Path({str(folder.path)!r})).held(): print(flush=True); time.sleep(600)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with (
+            pytest.raises(TgdslError, match="run: another process runs in this folder; wait until it has ended"),
+            folder.held(),
+        ):
+            pass
+        other.kill()
+        other.wait()
+        with folder.held():
+            assert list(folder.path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["[]", '{"starts": 3}', '{"starts": [{"seed": 0}]}', "{}"])
+def test_what_does_not_say_what_a_run_was_made_from_is_refused(tmp_path, text):
+    folder = RunFolder(tmp_path)
+    folder.run.write_text(text)
+    with pytest.raises(
+        TgdslError, match=r"run\.json: expected what a run was made from, as tgdsl writes it: starts with envs, "
+    ):
+        folder.last_start()

@@ -252,34 +252,6 @@ def test_what_is_not_finite_is_in_no_checkpoint(tmp_path, group, value):
         assert f"{network}_state_dict.obs_normalizer._mean, which observes {group}, is not finite" in str(raised.value)
 
 
-def test_two_processes_do_not_run_in_one_folder(tmp_path):
-    """Another one holds it; when that is killed, it is free."""
-    folder = RunFolder(tmp_path / "run")
-    code = f"import time; from pathlib import Path; from tgdsl.rl.train.folder import RunFolder\nwith RunFolder(Path({str(folder.path)!r})).held(): print(flush=True); time.sleep(600)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        other.stdout.readline()
-        with (
-            pytest.raises(TgdslError, match="run: another process runs in this folder; wait until it has ended"),
-            folder.held(),
-        ):
-            pass
-        other.kill()
-        other.wait()
-        with folder.held():
-            assert list(folder.path.iterdir()) == []
-
-
-@pytest.mark.parametrize("text", ["[]", '{"starts": 3}', '{"starts": [{"seed": 0}]}', "{}"])
-def test_what_does_not_say_what_a_run_was_made_from_is_refused(tmp_path, text):
-    folder = RunFolder(tmp_path)
-    folder.run.write_text(text)
-    with pytest.raises(
-        TgdslError, match=r"run\.json: expected what a run was made from, as tgdsl writes it: starts with envs, "
-    ):
-        folder.last_start()
-
-
 def test_the_first_rows_of_a_curve_may_have_no_episodes(tmp_path):
     """Episodes of 8 steps, iterations of 4: the second one is the first that has any."""
     run, _ = begun(tmp_path, train__desynchronise=False)

@@ -1,0 +1,62 @@
+"""A float64 reference that computes each answer once for a suite, whose tests ask for readings of the same states."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from tgdsl.module.accuracy.reference import ReferenceModule
+from tgdsl.module.state import SceneState
+
+
+@functools.lru_cache(maxsize=8)
+def answers_of(suite: type, document: str) -> dict[bytes, Any]:
+    """Return what the reference of a suite's document has answered so far, by what it was asked."""
+    return {}
+
+
+class KnownReference(ReferenceModule):
+    """A reference that computes each answer once for a whole suite, whose tests ask for readings of the same states."""
+
+    def __init__(self, answers: dict[bytes, Any], *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._answers = answers
+
+    def __call__(self, state: SceneState, shift: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, np.ndarray]]]:
+        """Return what the reference does: a copy of it where it was asked that before."""
+        if self.upstream:  # those remember too
+            return super().__call__(state, shift)
+        asked = _digest(state, shift, self.num_calls, self.memory)
+        if asked not in self._answers:
+            self._answers[asked] = super().__call__(state, shift)
+        return copy.deepcopy(self._answers[asked])
+
+
+def _digest(*values: Any) -> bytes:
+    """Return a digest of states, dictionaries, sequences, tensors, arrays and plain values: of all that is in them."""
+    found = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, SceneState):
+            add([getattr(value, field.name) for field in dataclasses.fields(value)])
+        elif isinstance(value, Mapping):
+            add([part for item in value.items() for part in item])
+        elif isinstance(value, list | tuple):
+            found.update(f"{len(value)} parts:".encode())
+            for part in value:
+                add(part)
+        elif isinstance(value, Tensor | np.ndarray):
+            array = np.ascontiguousarray(value)
+            found.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+        else:
+            found.update(f"{value!r};".encode())
+
+    add(values)
+    return found.digest()
