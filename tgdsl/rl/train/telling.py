@@ -10,6 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from tgdsl.files.write import as_file_error
+
 SAID_EVERY = 10.0
 """Time between lines where there is no terminal for a progress bar [s]."""
 
@@ -63,6 +65,7 @@ class Board:
     def __init__(self, folder: Path, done: int):
         """Begin, or go on after some iterations."""
         self._writer: Any = None
+        self._file = folder / "events.out.tfevents"
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of its own packages
@@ -77,12 +80,22 @@ class Board:
         return self._writer is not None
 
     def add(self, told: Mapping[str, float], iteration: int) -> None:
-        """Add what an iteration was."""
+        """Add what an iteration was.
+
+        Raises:
+            FileError: If what was added before could not be written.
+        """
         if self._writer is not None:
-            for name, value in told.items():
-                self._writer.add_scalar(name, value, iteration)
+            with as_file_error(self._file):
+                for name, value in told.items():
+                    self._writer.add_scalar(name, value, iteration)
 
     def close(self) -> None:
-        """Write what has not been written."""
+        """Write what has not been written.
+
+        Raises:
+            FileError: If it cannot be written.
+        """
         if self._writer is not None:
-            self._writer.close()
+            with as_file_error(self._file):
+                self._writer.close()
