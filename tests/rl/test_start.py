@@ -119,3 +119,20 @@ def test_seeds_have_64_bits_and_environments_are_made_in_inference_mode_too(tmp_
     env.close()
     with pytest.raises(SimulationError, match="the seed is -9223372036854775809"):
         TouchEnv(task, 1, threads=1, seed=-(2**63) - 1, overrides={"touch": "none"})
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_environments_are_the_same_whatever_torchs_default_dtype_is(tmp_path, dtype):
+    """To the bit: made and stepped under another one."""
+    task, made = write_task(tmp_path), []
+    for default in (torch.float32, dtype):
+        torch.set_default_dtype(default)
+        try:
+            env = TouchEnv(task, 2, threads=1, seed=3)
+            steps = [env.step(torch.full((2, env.num_actions), 0.3, dtype=torch.float32)) for _ in range(5)]
+        finally:
+            torch.set_default_dtype(torch.float32)
+        made.append([[*step.obs.values(), step.reward, step.info.episode_return] for step in steps] + [[env.sim.qpos.clone()]])
+        env.close()
+    for one, other in zip(*made, strict=True):
+        assert all(own.dtype == its.dtype and torch.equal(own, its) for own, its in zip(one, other, strict=True))

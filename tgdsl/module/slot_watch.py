@@ -52,7 +52,7 @@ class SlotWatch:
             return
         with torch.inference_mode(False), torch.no_grad():
             if self._wanted is None or self._wanted.device != whole.device:
-                self._wanted = torch.zeros(whole.shape[1], device=whole.device)
+                self._wanted = torch.zeros(whole.shape[1], dtype=torch.float32, device=whole.device)
                 self._seen, self._copied = None, None
         with torch.no_grad():
             lacking = (whole - force.sum(dim=2)).abs().amax(dim=-1)
@@ -91,7 +91,7 @@ class SlotWatch:
         shown = None if self._copied is None or self._seen is None else self._seen.clone()
         with torch.inference_mode(False):
             if self._seen is None:
-                self._seen = torch.zeros(self._wanted.shape, pin_memory=True)
+                self._seen = torch.zeros(self._wanted.shape, dtype=torch.float32, pin_memory=True)
             self._seen.copy_(self._wanted, non_blocking=True)
         self._copied = torch.cuda.Event()
         self._copied.record(torch.cuda.current_stream(self._wanted.device))

@@ -125,7 +125,7 @@ class TouchEnv:
         self._control_step = setup.control_step  # MuJoCo takes a while to tell
         self.max_steps = max(1, round(self.spec.episode / setup.control_step))
         self._episodes = Episodes(self.sim, random, self.task, self.actuation, self.pushes, draws, is_compiled)
-        self._action = torch.zeros((num_envs, self.num_actions), device=self.device)
+        self._action = torch.zeros((num_envs, self.num_actions), dtype=torch.float32, device=self.device)
         self._used, self._before = torch.zeros_like(self.actuation.target), torch.zeros_like(self.actuation.target)
         is_measured = self.spec.joint_vel == "measured"
         self._speeds = groups.MeasuredVelocity(self.actuation.target, setup.control_step) if is_measured else None

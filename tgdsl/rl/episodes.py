@@ -124,8 +124,8 @@ class Episodes:
         self._friction = sim.properties.friction(self._object).to(device, dtype).clone()
         self._mass = sim.properties.mass(self._object).to(device, dtype).clone()
         self.friction, self.mass = task.setup.friction, task.setup.mass
-        self.total = torch.zeros(sim.num_envs, device=device)
-        self.terms, self.sums = (), torch.zeros((0, sim.num_envs), device=device)
+        self.total = torch.zeros(sim.num_envs, dtype=torch.float32, device=device)
+        self.terms, self.sums = (), torch.zeros((0, sim.num_envs), dtype=torch.float32, device=device)
         self._restarted = FusedCall(self._restart, is_compiled)
 
     def begin(self, chosen: Bool[Tensor, " env"]) -> None:
@@ -149,7 +149,7 @@ class Episodes:
     def expect(self, terms: tuple[str, ...]) -> None:
         """Begin to add up terms of the reward, if that was not begun."""
         if not self.terms:
-            self.terms, self.sums = terms, torch.zeros((len(terms), len(self.total)), device=self.total.device)
+            self.terms, self.sums = terms, self.total.new_zeros((len(terms), len(self.total)))
 
     def alike(self, saved: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Return what is kept here, and what was saved, both with the sums that either has: before the first step none are."""

@@ -34,7 +34,7 @@ class ZeroActor(Actor):
 
     def __init__(self, env: TouchEnv):
         """Begin."""
-        self._action = torch.zeros((env.num_envs, env.num_actions), device=env.device)
+        self._action = torch.zeros((env.num_envs, env.num_actions), dtype=torch.float32, device=env.device)
 
     def __call__(self, obs: Mapping[str, Float[Tensor, "env feature"]]) -> Float[Tensor, "env joint"]:
         """Return zeros."""

@@ -71,7 +71,7 @@ class PairContacts:
             names.append("contact_found")  # it says which slot is free
         shapes = {name: (num_envs, len(rows), *shape_of(name, inputs)[1:]) for name in names}
         # One piece of memory, which one call clears.
-        self._memory = torch.zeros(sum(math.prod(shape) for shape in shapes.values()), device=device)
+        self._memory = torch.zeros(sum(math.prod(shape) for shape in shapes.values()), dtype=torch.float32, device=device)
         pieces = self._memory.split([math.prod(shape) for shape in shapes.values()])
         self.arrays = {name: part.view(shape) for (name, shape), part in zip(shapes.items(), pieces, strict=True)}
         self._launch, self._kernel = wp.launch, _kernel(wp, mjw)

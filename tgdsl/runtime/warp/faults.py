@@ -49,7 +49,7 @@ class Faults(EnvFaults):
         device = arrays["qpos"].device
         super().__init__(len(arrays["qpos"]), device, on_fault)
         self._arrays = arrays
-        self._peak = torch.zeros(len(arrays["qpos"]), device=device)
+        self._peak = torch.zeros(len(arrays["qpos"]), dtype=torch.float32, device=device)
         self._counts: Int[Tensor, " count"] = torch.zeros(1 + len(self.totals), dtype=torch.int64, device=device)
         self._seen = torch.zeros(self._counts.shape, dtype=torch.int64, pin_memory=device.type == "cuda")
         self._copied: torch.cuda.Event | None = None

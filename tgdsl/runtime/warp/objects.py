@@ -72,7 +72,7 @@ class WorldObjects:
         self._written: list[tuple[Choice, ...]] = []
         self.model = shared_model(scenes, inputs)
         self.variant = torch.zeros(self._chosen.variant.shape, dtype=torch.int64, device=device)
-        self.object_size = torch.zeros(self._chosen.object_size.shape, device=device)
+        self.object_size = torch.zeros(self._chosen.object_size.shape, dtype=torch.float32, device=device)
 
     def choose(self, ids: Int[Array, " n"], variants: Mapping[str, Values], sizes: Mapping[str, Values]) -> None:
         """Say what objects are like in some environments: see `Simulation.set_objects`; then `write_to` them."""
