@@ -105,7 +105,7 @@ def _task_class(source: Source, folder: Path) -> type[Task[Any]]:
 
 
 def _own_module(name: str, folder: Path) -> Any:
-    """Import a module by its name, or from a file that stands beside the document."""
+    """Import a module by its name, or from a file, relative to the document."""
     if not name.endswith(".py"):
         return importlib.import_module(name)
     file = (folder / name).resolve()

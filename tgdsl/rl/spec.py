@@ -123,7 +123,7 @@ class TaskSpec(SpecModel):
     """Version of the grammar."""
     task: str
     """A task of tgdsl by name, such as `in_palm_rotate`; one of your own as `package.module:Class`, or as `file.py:Class`
-    beside this document."""
+    with the file relative to this document."""
     document: str
     """The sensors' document, relative to this one: robot, scene, objects and sensors, of which those needed are taken."""
     object: str
