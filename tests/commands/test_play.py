@@ -156,7 +156,7 @@ def test_mistakes(base, fails):
         ("task.yaml", "--actions", "script"): 'tgdsl: the task "in_palm_rotate" brings no script of its own',
         ("task.yaml", "--seconds", "0"): "tgdsl: played for 0 s: expected more than 0 s\n",
         ("task.yaml", "--seconds", "1e12"): "tgdsl: records of 16 environments at 40000000000000 steps need about ",
-        ("task.yaml", "--envs", "0"): "tgdsl: num_envs is 0 and substeps 5, expected at least 1 of each\n",
+        ("task.yaml", "--envs", "0"): "tgdsl: num_envs is 0, expected a whole number of at least 1\n",
         ("task.yaml", "--camera", "sid"): 'tgdsl: the scene has no camera "sid"; did you mean "side"?\n',
         ("task.yaml", "--out", "file"): "tgdsl: file/played.npz: {base}/file is a file, expected a folder\n",
     }
