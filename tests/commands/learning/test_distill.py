@@ -9,9 +9,11 @@ import torch
 from felt_tasks import felt_task
 from written_teachers import teacher
 
+from tgdsl.commands.learning.distill import _warn_unlike
 from tgdsl.commands.learning.sweep_document import Trial
 from tgdsl.commands.learning.sweep_trial import run_trial
 from tgdsl.rl.load import load_task
+from tgdsl.rl.students.results import Row
 from tgdsl.rl.train.checkpoint import read_checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -198,6 +200,8 @@ def test_resolutions_are_simulations_one_after_the_other(base, here):
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
     code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "low,med", *SMALL)
     assert code == 2 and '"med"' in error and not (base / "out").exists()
+    code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "default", *SMALL)
+    assert code == 2 and "--resolutions default: that is what a run calls the document's own; leave it out" in error
     code, _, error = here(
         base, "distill", "task.yaml", *arguments, "--resolutions", "low,high", "--episodes", "2", *SMALL, "-o", "both"
     )
@@ -214,6 +218,17 @@ def test_resolutions_are_simulations_one_after_the_other(base, here):
     code, out, error = here(base, "distill", "task.yaml", "--resume", "both", "--device", "cpu", "--iterations", "2")
     assert (code, out) == (2, "") and f"both/high/checkpoint.pt: found {len(kept[file]):,} bytes that are cut off" in error
     assert kept == {file: file.read_bytes() for file in (base / "both").rglob("*") if file.is_file()}
+
+
+def test_unlike_numbers_of_control_steps_are_warned_of():
+    """Beyond a tenth."""
+    rows = [
+        Row("depth", "tips", name, "clean", 3, 0.5, 0.4, 0.6, 1.0, 9, samples, 1.0)
+        for name, samples in (("low", 1100), ("med", 1000))
+    ]
+    _warn_unlike(rows)
+    with pytest.warns(UserWarning, match="students had unlike numbers of control steps, low 1,100, med 999: `--iterations`"):
+        _warn_unlike([rows[0], rows[1]._replace(samples=999)])
 
 
 def test_mistakes_are_named_before_anything_runs(base, fails):

@@ -252,3 +252,19 @@ def test_an_evaluation_is_written_into_a_folder_that_is_made(base, here, fails):
     assert code == 0, error
     assert json.loads((base / "no" / "such" / "found.json").read_text())["episodes"] == 2
     assert "--groups are those of a policy" in fails("evaluate", "task.yaml", "--groups", "proprio")
+
+
+def test_an_evaluation_is_of_the_policy_beside_it(base, here, monkeypatch):
+    """Of a run that is interrupted while it evaluates there is none, and its policy has no score."""
+    train = ("train", "task.yaml", "--device", "cpu", "--episodes", "2", *ARGUMENTS)
+    assert here(base, *train, "--envs", "4", "--iterations", "1")[0] == 0
+    folder = base / "out" / "task"
+    assert (folder / "evaluation.json").is_file()
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tgdsl.rl.playing.evaluation.evaluate", interrupted)
+    assert here(base, *train, "--iterations", "2", "--resume", "out/task")[0] == 130
+    card = json.loads((folder / "policy.json").read_text())
+    assert (card["iterations"], card["score"]) == (2, None) and not (folder / "evaluation.json").exists()

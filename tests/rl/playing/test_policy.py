@@ -34,6 +34,18 @@ def test_it_acts_as_the_network_that_was_exported(tmp_path):
     assert not action.requires_grad
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_it_is_taken_whatever_torchs_default_dtype_is(tmp_path, dtype):
+    model, obs = network()
+    saved = read_policy(exported(model, tmp_path / "policy.pt"))
+    torch.set_default_dtype(dtype)
+    try:
+        action = Policy(saved, GROUPS, 3, 2)(dict(obs))
+    finally:
+        torch.set_default_dtype(torch.float32)
+    torch.testing.assert_close(action, model(obs).detach())
+
+
 def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):
     model, obs = network(RNNModel, num_envs=1, rnn_type="gru", rnn_hidden_dim=4, rnn_num_layers=1)
     policy = Policy(read_policy(exported(model, tmp_path / "policy.pt")), GROUPS, 1, 2)

@@ -53,3 +53,15 @@ def test_rows_are_means_over_seeds():
     assert depth[5:9] == pytest.approx((0.505, 0.255, 0.755, 0.375))
     assert none[5:9] == pytest.approx((0.1, 0.075, 0.125, 0.7))
     assert depth[9:] == (20, 1000, 2.5) and none[9:] == (30, 1000, 2.5)
+
+
+@pytest.mark.parametrize("score", [math.nan, math.inf])
+def test_a_score_that_is_not_finite_has_no_interval_and_the_others_have_theirs(score):
+    """It is shown, and ends nothing."""
+    keys = student_keys(["bool", "depth"], ["tips"], ["clean"], 2)
+    found = [evaluation(score if key.kind[0] == "bool" and key.seed == 0 else 0.5, 0.1) for key in keys]
+    rows = {row.type: row for row in rows_of(keys, found, "med", 3, 4.0)}
+    assert not math.isfinite(rows["bool"].score) and not math.isfinite(rows["bool"].low)
+    assert rows["depth"].score == 0.5 and rows["depth"].low == pytest.approx(0.5 - 0.1 / math.sqrt(2))
+    line = next(line for line in shown(list(rows.values()), "RMS").splitlines() if line.startswith("bool"))
+    assert "–" in line

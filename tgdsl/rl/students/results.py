@@ -92,7 +92,8 @@ def interval(found: Sequence[Evaluation]) -> tuple[float, float]:
     halves = [0.5 * (each.score_interval[1] - each.score_interval[0]) for each in found]
     half = math.sqrt(sum(own**2 for own in halves)) / num
     if num > 1:
-        half = max(half, float(student_t.ppf(0.975, num - 1) * np.std(scores, ddof=1)) / math.sqrt(num))
+        with np.errstate(invalid="ignore"):  # of a score that is not finite there is no interval
+            half = max(half, float(student_t.ppf(0.975, num - 1) * np.std(scores, ddof=1)) / math.sqrt(num))
     return fmean(scores) - half, fmean(scores) + half
 
 
