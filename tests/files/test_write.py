@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from hand_logs import random_readings, write_log
 
 from tgdsl.errors import FileError
-from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all
+from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all, new_folder
 
 REPOSITORY = Path(__file__).parents[2]
 SCRIPT = """
@@ -88,8 +89,16 @@ def test_files_that_belong_together_appear_together(tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.obj", "a.xml", "assets", "folder.obj"]
 
 
-def test_a_folder_made_for_files_that_failed_goes_again(tmp_path):
+@pytest.mark.parametrize("folder", ["assets", "deep/er/assets"])
+def test_a_folder_made_for_files_that_failed_goes_again(tmp_path, folder):
     (tmp_path / "a.xml").mkdir()
     with pytest.raises(FileError, match=r"a\.xml: this is a folder"):
-        atomic_write_all({tmp_path / "a.xml": b"", tmp_path / "assets" / "a.obj": b"mesh"})
+        atomic_write_all({tmp_path / "a.xml": b"", tmp_path / folder / "a.obj": b"mesh"})
     assert [path.name for path in tmp_path.iterdir()] == ["a.xml"]
+
+
+def test_a_folder_that_something_was_put_into_stays(tmp_path):
+    with suppress(ZeroDivisionError), new_folder(tmp_path / "a" / "b" / "file"):
+        (tmp_path / "a" / "other").touch()
+        raise ZeroDivisionError
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "other"]

@@ -100,7 +100,7 @@ def atomic_write_all(contents: Mapping[Path, bytes]) -> None:
     """
     with ExitStack() as stack:
         for target, content in reversed(list(contents.items())):  # what was opened last is closed first
-            stack.enter_context(_new_folder(target))
+            stack.enter_context(new_folder(target))
             stack.enter_context(atomic_path(target)).write_bytes(content)
 
 
@@ -120,16 +120,20 @@ def as_file_error(target: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _new_folder(target: Path) -> Iterator[None]:
-    """Make the folder of a file, and remove it if anything is raised meanwhile and it was not there before."""
-    is_new = not target.parent.exists()
+def new_folder(target: Path) -> Iterator[None]:
+    """Make the folder of a file; if anything is raised meanwhile, remove those folders that were not there and are empty.
+
+    Raises:
+        FileError: If it cannot be made.
+    """
+    new = [folder for folder in target.parents if not folder.exists()]
     with_folder(target)
     try:
         yield
     except BaseException:
-        if is_new:
-            with contextlib.suppress(OSError):  # another process has put something there
-                target.parent.rmdir()
+        with contextlib.suppress(OSError):  # something is in it
+            for folder in new:
+                folder.rmdir()
         raise
 
 

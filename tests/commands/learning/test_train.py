@@ -10,6 +10,7 @@ from small_tasks import small_task
 
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.checkpoint import read_checkpoint
+from tgdsl.rl.train.folder import RunFolder
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 ON = ["--device", "cpu", "--envs", "4"]
@@ -268,3 +269,19 @@ def test_an_evaluation_is_of_the_policy_beside_it(base, here, monkeypatch):
     assert here(base, *train, "--iterations", "2", "--resume", "out/task")[0] == 130
     card = json.loads((folder / "policy.json").read_text())
     assert (card["iterations"], card["score"]) == (2, None) and not (folder / "evaluation.json").exists()
+
+
+@pytest.mark.parametrize(
+    "command", [("train",), ("distill", "--teacher", "out/task/policy.pt", "--types", "none", "--envs", "3")]
+)
+def test_a_folder_in_which_another_process_runs_is_left_alone(base, here, fails, command):
+    """Before its checkpoint is read, which the other one may be about to replace; also one that holds no run yet."""
+    begun = ("train", "task.yaml", *ON, "--iterations", "1", "--episodes", "0", *ARGUMENTS)
+    assert here(base, *begun)[0] == 0
+    name, *options = command
+    with RunFolder(base / "other" / "run").held():
+        said = fails(name, "task.yaml", "--device", "cpu", *options, "--out", "other/run")
+        assert said == "tgdsl: other/run: another process runs in this folder; wait until it has ended, or give another --out\n"
+    (base / "out" / "task" / "checkpoint.pt").write_bytes(b"half written")
+    with RunFolder(base / "out" / "task").held():
+        assert "another process runs in this folder" in fails("train", "task.yaml", *ON, "--resume", "out/task")

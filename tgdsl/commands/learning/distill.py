@@ -8,7 +8,6 @@ import os
 import shlex
 import sys
 import warnings
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -77,7 +76,7 @@ class Distill:
             TgdslError: What is wrong, before anything runs.
         """
         from tgdsl.rl.load import load_task
-        from tgdsl.rl.students.results import shown, write_table
+        from tgdsl.rl.train.folder import RunFolder
 
         if self.resume is not None and self.out is not None:
             raise TgdslError(f"--out {self.out}: a run goes on in its own folder, {self.resume}")
@@ -90,8 +89,15 @@ class Distill:
         asked = self._asked(loaded, before, folder)
         prepared = [_Part(self, name, asked, overrides, folder / name) for name in asked["resolutions"]]
         asked["envs"] = prepared[0].envs
+        with RunFolder(folder).held():
+            self._teach(loaded, folder, prepared)
+
+    def _teach(self, loaded: LoadedTask, folder: Path, prepared: list[_Part]) -> None:
+        """Teach the students of each resolution, and write the table of all."""
+        from tgdsl.rl.students.results import shown, write_table
+
         if self.resume is None:
-            _check_new(folder, asked["resolutions"])
+            _check_new(folder, [part.resolution for part in prepared])
         for part in prepared:
             part.check(is_resumed=self.resume is not None)
         for line in prepared[0].teacher.changes:
@@ -133,7 +139,7 @@ class Distill:
         """
         spec = loaded.spec
         given: dict[str, Any] = {
-            "teacher": None if self.teacher is None else _same(self.teacher, before.get("teacher")),
+            "teacher": self._teacher(before, folder),
             "types": _names(self.types),
             "placements": _names(self.placements),
             "noise": _names(self.noise),
@@ -143,7 +149,7 @@ class Distill:
             "seed": self.seed,
         }
         for name, value in given.items():
-            if before and value is not None and value != before[name] and not self._is_moved(name, before, folder):
+            if before and name != "teacher" and value is not None and value != before[name]:
                 raise TgdslError(f"--{name} {_text(value)}: this run began with {_text(before[name])}; begin another one")
         default = {"types": ["all"], "placements": [spec.placement], "noise": [spec.noise], "seeds": 3, "seed": 0}
         default |= {"resolutions": [spec.resolution or "default"], "envs": None, "teacher": None}
@@ -160,17 +166,23 @@ class Distill:
             raise TgdslError(f"--resolutions {_text(names)}: one is named twice")
         return asked
 
-    def _is_moved(self, name: str, before: dict[str, Any], folder: Path) -> bool:
-        """Whether the teacher that is named is that of a run that goes on, in another place than when it began."""
+    def _teacher(self, before: dict[str, Any], folder: Path) -> str | None:
+        """Return the teacher's name; of a run that goes on the one that it began with, wherever that is now: told by its bytes.
+
+        Raises:
+            TgdslError: If another one is named.
+        """
         from tgdsl.rl.train.folder import RunFolder
 
-        if name != "teacher" or self.teacher is None or not self.teacher.is_file():
-            return False
-        starts = [
-            RunFolder(folder / own).last_start() for own in before["resolutions"] if (folder / own / "run.json").is_file()
-        ]
-        found = hashlib.sha256(self.teacher.read_bytes()).hexdigest()
-        return bool(starts) and all(start.get("teacher_sha256") == found for start in starts)
+        if self.teacher is None or not before:
+            return None if self.teacher is None else str(self.teacher)
+        if self.teacher.resolve() == Path(before["teacher"]).resolve():
+            return before["teacher"]
+        parts = [RunFolder(folder / name) for name in before["resolutions"]]
+        known = {part.last_start().get("teacher_sha256") for part in parts if part.run.is_file()}
+        if self.teacher.is_file() and known == {hashlib.sha256(self.teacher.read_bytes()).hexdigest()}:
+            return str(self.teacher)
+        raise TgdslError(f"--teacher {self.teacher}: this run began with {before['teacher']}; begin another one")
 
 
 class _Part:
@@ -188,7 +200,7 @@ class _Part:
         from tgdsl.rl.students.teacher import Teacher
         from tgdsl.rl.train.folder import RunFolder
 
-        self._command, self._resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
+        self._command, self.resolution, self._asked, self._folder = command, resolution, asked, RunFolder(folder)
         own = {} if resolution == "default" else {"resolution": resolution}
         self._given, self._overrides = overrides, overrides | own
         self._loaded = load_task(command.task, self._overrides)
@@ -235,7 +247,7 @@ class _Part:
         from tgdsl.rl.train.telling import ProgressBar
 
         command, folder, loaded, seed = self._command, self._folder, self._loaded, self._asked["seed"]
-        state, held = self._state, ExitStack()
+        state = self._state
         with StatusLine() as progress:
             env = TouchEnv(loaded, self.envs, device=command.device, seed=seed, feels=self._felt, progress=progress)
         try:
@@ -249,8 +261,6 @@ class _Part:
             taught = {"students": [key.name for key in distiller.keys], "iteration": distiller.iteration}
             for line in self._changes(origin, type(loaded.spec)) if self._goes_on else ():
                 print(f"changed since the run began: {line}")
-            held.enter_context(folder.held())
-            folder.check(is_resumed=self._goes_on)  # what was there when nobody held it
             if file is not None:
                 own = os.path.relpath(Path(self._asked["teacher"]).resolve(), file.parent.resolve())
                 _write(file, self._asked | {"overrides": self._given, "teacher_from_here": own})
@@ -266,7 +276,6 @@ class _Part:
                 bar.close()
             return self._finish(distiller, origin, run.seconds), env.task.score_unit
         finally:
-            held.close()
             env.close()
 
     def _changes(self, origin: dict[str, Any], model: type[TaskSpec]) -> list[str]:
@@ -295,7 +304,7 @@ class _Part:
             return []
         plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
         _write(self._folder.evaluation, plain)
-        return rows_of(keys, found, self._resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
+        return rows_of(keys, found, self.resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
 
 
 def _warn_unlike(rows: list[Row]) -> None:
@@ -353,10 +362,6 @@ def _read(folder: Path) -> dict[str, Any]:
     names = ("teacher", "types", "placements", "noise", "seeds", "resolutions", "envs", "seed", "overrides")
     if missing := [name for name in names if not isinstance(found, dict) or name not in found]:
         raise TgdslError(f"{file}: it has no {missing[0]}: this is not what tgdsl distill writes")
-    own = folder.resolve() / found.get("teacher_from_here", "")
-    return found | {"teacher": _same(Path(os.path.relpath(own)), found["teacher"])} if own.is_file() else found
-
-
-def _same(file: Path, name: str | None) -> str:
-    """Return the name that a file goes by, if that is one of it; else its own."""
-    return name if name is not None and file.resolve() == Path(name).resolve() else str(file)
+    own = (folder.resolve() / found.get("teacher_from_here", "")).resolve()
+    is_elsewhere = own.is_file() and own != Path(found["teacher"]).resolve()
+    return found | {"teacher": os.path.relpath(own)} if is_elsewhere else found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -77,14 +77,15 @@ class Train:
         overrides = joined_overrides(before.get("overrides", {}) if is_same else {}, parsed_overrides(self.set))
         loaded = load_task(self.task, overrides)
         self._check()
-        if ranks.is_first:
-            folder.check(is_resumed=is_same)
-        state = read_checkpoint(source.checkpoint) if source else None
-        ranks.join(device)
-        try:
-            self._learn(loaded, folder, ranks, device, overrides, before, state, is_same)
-        finally:
-            ranks.leave()
+        with folder.held() if ranks.is_first else nullcontext():
+            if ranks.is_first:
+                folder.check(is_resumed=is_same)
+            state = read_checkpoint(source.checkpoint) if source else None
+            ranks.join(device)
+            try:
+                self._learn(loaded, folder, ranks, device, overrides, before, state)
+            finally:
+                ranks.leave()
 
     def _check(self) -> None:
         """See that numbers make sense.
@@ -106,7 +107,6 @@ class Train:
         overrides: dict[str, Any],
         before: dict[str, Any],
         state: dict[str, Any] | None,
-        is_same: bool,
     ) -> None:
         from tgdsl.rl.env import TouchEnv
         from tgdsl.rl.train.checkpoint import restore
@@ -115,7 +115,6 @@ class Train:
         from tgdsl.rl.train.run import Run
         from tgdsl.rl.train.telling import ProgressBar
 
-        held = ExitStack()
         envs = self.envs or before.get("envs", ENVS)
         seed = self.seed if self.seed is not None else before.get("seed", 0)
         with StatusLine() as progress:
@@ -132,8 +131,6 @@ class Train:
                 for line in changes(before, origin, type(loaded.spec)) if before else ():
                     end = "; a run that goes on keeps its deviations" if line.startswith(INITIAL_STD) else ""
                     print(f"changed since the run began: {line}{end}")
-                held.enter_context(folder.held())
-                folder.check(is_resumed=is_same)  # what was there when nobody held it
                 folder.begin(origin, loaded, env)
             run = Run(learner, folder, loaded.spec.train.checkpoint, state["seconds"] if state else 0.0)
             if ranks.is_first and not run.has_board:
@@ -149,7 +146,6 @@ class Train:
             if ranks.is_first:
                 self._finish(learner, folder, origin, run.seconds)
         finally:
-            held.close()
             env.close()
 
     def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], seconds: float) -> None:

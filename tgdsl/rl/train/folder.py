@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import fcntl
 import hashlib
@@ -23,7 +24,6 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,7 +32,7 @@ from typing import Any
 import torch
 
 from tgdsl.errors import FileError, TgdslError
-from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, with_folder
+from tgdsl.files.write import TEMPORARY, as_file_error, atomic_write, check_writable, new_folder, with_folder
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import LoadedTask
@@ -103,26 +103,24 @@ class RunFolder:
         self.rows()
         check_writable(self.checkpoint)
 
-    @contextmanager
+    @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Hold the folder, which is made if it is not there, against other processes; it is free again if this one is killed.
+        """Hold the folder against other processes; it is free again if this one is killed.
+
+        It is made if it is not there, and not left behind empty if anything is raised.
 
         Raises:
+            FileError: If it cannot be made, or written into.
             TgdslError: If another process holds it.
         """
-        with_folder(self.run)
-        folder = os.open(self.path, os.O_RDONLY)
-        try:
+        with new_folder(check_writable(self.run)):
+            folder = os.open(self.path, os.O_RDONLY)
             try:
-                fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                what = "another process runs in this folder; wait until it has ended, or give another --out"
-                raise TgdslError(f"{self.path}: {what}") from error
-            except OSError:  # a file system that has no locks
-                pass
-            yield
-        finally:
-            os.close(folder)
+                with contextlib.suppress(OSError):  # of a file system that has no locks
+                    self._lock(folder)
+                yield
+            finally:
+                os.close(folder)
 
     def check_room(self, size: int) -> None:
         """See that checkpoints of a size find room.
@@ -216,6 +214,13 @@ class RunFolder:
         """Return the error of a file that is no curve."""
         first, hint = ",".join(found[: len(COLUMNS)]), "move this file away, and the run goes on with a new one"
         return TgdslError(f"{self.curve}:{line}: found {len(found)} values, {first!r}, expected {expected}; {hint}")
+
+    def _lock(self, folder: int) -> None:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            what = "another process runs in this folder; wait until it has ended, or give another --out"
+            raise TgdslError(f"{self.path}: {what}") from error
 
     def _read(self) -> dict[str, Any]:
         try:

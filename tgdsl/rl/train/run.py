@@ -75,13 +75,13 @@ class Run:
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
         """Learn.
 
+        Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
+        included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
+
         Args:
             iterations: Iterations of the whole run, those made before included.
             seconds: Time from now on [s]; may be infinite. Of 0 no iteration is made.
             shown: Is shown each iteration.
-
-        Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
-        included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
 
         Raises:
             DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
