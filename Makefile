@@ -9,7 +9,7 @@ TORCH_INDEX ?=
 PIP = $(BIN)/pip install $$([ -t 2 ] || echo --quiet)
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo learn test test-fast lint bench docs soak clean
+.PHONY: demo learn test test-full mutate lint bench docs soak clean
 
 demo: $(READY)
 	@echo "compiling examples/xhand1_palm.yaml"
@@ -22,13 +22,22 @@ MINUTES ?= 10
 learn: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python examples/learn.py --minutes $(MINUTES) $(LEARN)
 
-# One process per core, each with one thread of its own: most of the time goes into compiling kernels.
-test: $(READY)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+# One process per core, each with one thread.
+PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
-# Without what compiles kernels, or takes long for another reason.
-test-fast: $(READY)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal -m "not slow"
+# Every property once, in ten minutes on two cores.
+test: $(READY)
+	@$(PYTEST) -m "not slow"
+
+# The rest: each kind compiled by itself, learning, the physics of tasks, the wheel; and calls with their types and shapes checked.
+test-full: $(READY)
+	@$(PYTEST) -m slow
+	@$(PYTEST) -m "not slow" --check-types tests/geometry tests/observations tests/quantities tests/surfaces tests/tensors tests/sensors
+
+# Change one thing at a time in a room and list what no test notices: make mutate ROOM=sensors MUTATE="--count 60".
+ROOM ?= fields
+mutate: $(READY)
+	@$(BIN)/python tests/mutate.py $(ROOM) $(MUTATE)
 
 lint: $(READY)
 	@$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
     python benchmarks/gpu.py artefacts out/gpu                              # where documents can be compiled
     python benchmarks/gpu.py run out/gpu --out out/gpu.json --jobs 8        # on the machine with the GPU
+    python benchmarks/gpu.py guard out/gpu --jobs 8                         # the rows with a limit, against kept ratios
     python benchmarks/gpu.py table out/gpu.json                             # for docs/performance.md
     python benchmarks/gpu.py plot out/gpu.json --out docs/images
     python benchmarks/gpu.py bytes out/gpu                                  # memory of every case, without a GPU
@@ -36,7 +37,7 @@ import gpu_plots
 import numpy as np
 import torch
 import turns
-from gpu_plots import HEAD, Row, load_rows
+from gpu_plots import HEAD, TARGETS, Row, load_rows
 from gpu_scenes import CASES, DT, Case, artefact, bytes_of, make_artefacts, state_of
 from torch import Tensor
 
@@ -52,6 +53,9 @@ ROTATED = 160e6
 MOST_SETS = 256
 LONG = 1_000.0
 """When to stop repeating [ms]."""
+SLOWER = 0.1
+"""By how much a row's ratio to the copy may exceed the kept one."""
+KEPT = Path(__file__).parents[1] / "docs" / "measured" / "gpu_guard.json"
 CALLS = 3
 """Calls in a row whose readings are compared."""
 Tensors = dict[str, Tensor]
@@ -290,10 +294,16 @@ def measure(bench: Bench, num_envs: int, error: np.ndarray, options: argparse.Na
 # Runs -----------------------------------------------------------------------------------------------------------------------
 
 
+def nums_of_envs(case: Case, options: argparse.Namespace) -> Sequence[int]:
+    """Return the numbers of environments at which to time a case: those asked for, those with a limit, or all of its own."""
+    limited = [num_envs for name, num_envs in TARGETS if name == case.name]
+    return options.envs or (limited if options.limited else case.envs)
+
+
 def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
     """Measure a case at each number of environments; one that fails is reported, and the others go on."""
     plan, turn = load_plan(artefact(options.folder, case)), turns.Turn(options.turn)
-    first = states_of(case, plan, (options.envs or case.envs)[0], 1)[0]
+    first = states_of(case, plan, nums_of_envs(case, options)[0], 1)[0]
     checked = states_of(case, plan, options.check_envs, CALLS, seed=100)
     turn.take()
     bench, exact = Bench.of(case, plan, turn, options), TactileModule(plan, dtype=torch.float64).to(options.exact_on)
@@ -305,7 +315,7 @@ def rows_of(case: Case, options: argparse.Namespace) -> Iterator[Row]:
         touch(first)
         found = readings_of(bench.module(), [state.to(bench.device) for state in checked])
         error = full_scale_errors(exact.outputs, found, want)
-    for num_envs in options.envs or case.envs:
+    for num_envs in nums_of_envs(case, options):
         try:
             with torch.no_grad():
                 row = measure(bench, num_envs, error, options)
@@ -339,6 +349,39 @@ def run(options: argparse.Namespace) -> None:
     print(f"{time.perf_counter() - start:.0f} s" + (f"; not measured: {' '.join(left)}" if left else ""))
 
 
+def guard(options: argparse.Namespace) -> None:
+    """Time the rows that have a limit; exit 1 if one's ratio to the copy is worse than the kept one by more than a tenth."""
+    options.limited = True
+    if options.child:
+        run(options)
+    options.out.unlink(missing_ok=True)
+    run(options)
+    card = json.loads(options.out.read_text())["device"]
+    kept = json.loads(options.kept.read_text()) if options.kept.exists() else {}
+    ratios = {f"{row.case} × {row.num_envs:,}": round(row.graph / row.copy, 3) for row in load_rows([options.out])}
+    if options.keep:
+        options.kept.write_text(json.dumps({**kept, card: ratios}, indent=1, ensure_ascii=False) + "\n")
+    lines, is_met = compared(ratios, kept.get(card, {}))
+    print(f"{card}\n" + "\n".join(lines))
+    raise SystemExit(0 if is_met or options.keep else 1)
+
+
+def compared(ratios: Mapping[str, float], kept: Mapping[str, float]) -> tuple[list[str], bool]:
+    """Compare ratios to the copy with kept ones, by row.
+
+    Returns:
+        A line per row, and whether every kept row was timed and none is slower by more than `SLOWER`.
+    """
+    lines, is_met = [], bool(kept)
+    for name in kept | ratios:
+        ratio, old = ratios.get(name), kept.get(name)
+        is_slower = old is not None and (ratio is None or ratio > (1 + SLOWER) * old)
+        is_met &= not is_slower
+        change = "not timed" if ratio is None else "nothing kept" if old is None else f"{ratio / old - 1:+.0%}"
+        lines.append(f"{name:<34}{ratio or math.nan:8.3f}{old or math.nan:8.3f}  {change}{'  SLOWER' if is_slower else ''}")
+    return lines, is_met
+
+
 def write(path: Path, row: Row, versions: dict[str, Any]) -> None:
     """Add a row to a JSON file, in the place of that of the same measurement."""
     kept = [other for other in load_rows([path]) if other.key != row.key] if path.exists() else []
@@ -355,21 +398,28 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     making.add_argument("folder", type=Path)
     making.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
     making.set_defaults(call=lambda options: make_artefacts(options.folder, [CASES[name] for name in options.rows]))
-    running = commands.add_parser("run", help="measure")
-    running.add_argument("folder", type=Path)
-    running.add_argument("--out", type=Path, required=True, help="JSON file; other rows of an earlier run are kept")
-    running.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
-    running.add_argument("--envs", nargs="+", type=int, help="these instead of each case's numbers of environments")
-    running.add_argument("--device", default="cuda")
-    running.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
-    running.add_argument("--repeats", type=int, default=30)
-    running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
-    running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
-    running.add_argument(
-        "--exact-on", default="cpu", help="where the float64 module runs; on the CPU while others have the turn"
-    )
-    turns.add_options(running)
-    running.set_defaults(call=run)
+    for name, call in (("run", run), ("guard", guard)):
+        running = commands.add_parser(name, help=str(call.__doc__).partition(";")[0])
+        running.add_argument("folder", type=Path, help="artefacts")
+        running.add_argument("--rows", nargs="+", choices=CASES, default=list(CASES))
+        running.add_argument("--envs", nargs="+", type=int, help="these instead of each case's numbers of environments")
+        running.add_argument("--device", default="cuda")
+        running.add_argument("--eager", action="store_true", help="leave the modules uncompiled")
+        running.add_argument("--repeats", type=int, default=30)
+        running.add_argument("--sets", type=int, help="sets of buffers, instead of what exceeds the L2")
+        running.add_argument("--check-envs", type=int, default=64, help="environments whose readings are compared")
+        running.add_argument(
+            "--exact-on", default="cpu", help="where the float64 module runs; on the CPU while others have the turn"
+        )
+        turns.add_options(running)
+        running.set_defaults(call=call, limited=False)
+        if name == "run":
+            running.add_argument("--out", type=Path, required=True, help="JSON file; other rows of an earlier run are kept")
+        else:
+            running.add_argument("--out", type=Path, default=Path("out/gpu_guard.json"), help="JSON file of the rows")
+            running.add_argument("--kept", type=Path, default=KEPT, help="JSON file of kept ratios, by card and row")
+            running.add_argument("--keep", action="store_true", help="keep the ratios of this run")
+            running.set_defaults(rows=list(dict.fromkeys(case for case, _ in TARGETS)))
     gpu_plots.add_commands(commands)
     return parser.parse_args(arguments, argparse.Namespace(arguments=[__file__, *arguments]))
 

@@ -1,33 +1,30 @@
-"""Types and shapes are checked at run time in tests, and only there; and the command line is run as users run it."""
+"""Which tests are slow, and running the command line in the test's process.
 
-import gc
+`make test` runs what is not marked `slow`; `make test-full` runs the rest, and some of the quick ones again with
+`--check-types`: jaxtyping and beartype then check types and shapes at every call.
+"""
+
 import sys
 import warnings
-from collections.abc import Generator
 from pathlib import Path
 
-import jaxtyping
 import pytest
-import quick_checks
-import quick_compiles
-from jaxtyping import install_import_hook
 
-quick_compiles.prepare()
-quick_checks.prepare()
-install_import_hook("tgdsl", "beartype.beartype")
-
-from tgdsl.quantities.base import Gathered, Scene  # noqa: E402
-
-for traced in (Gathered, Scene):
-    # A call that torch.compile traces makes objects of these, and Dynamo cannot look into checks of such objects' methods,
-    # not even with `jaxtyping_disable`.
-    for name, method in list(vars(traced).items()):
-        if hasattr(method, "__wrapped__"):
-            setattr(traced, name, method.__wrapped__)
+MADE_UP_POSES = ("tests/sensors/", "tests/quantities/", "tests/module/", "tests/runtime/")
+"""Folders whose tests make up poses, and so have taxels that no object would reach in a simulator."""
 
 
-MADE_UP = ("tests/sensors/", "tests/quantities/", "tests/module/", "tests/runtime/")
-"""Rooms whose tests make up the poses too, and so have taxels where no object would come in a simulator."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add `--check-types`."""
+    parser.addoption("--check-types", action="store_true", help="check types and shapes of tgdsl's functions at every call")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check types, if asked to, before anything imports tgdsl."""
+    if config.getoption("--check-types"):
+        from jaxtyping import install_import_hook
+
+        install_import_hook("tgdsl", "beartype.beartype")
 
 
 @pytest.fixture
@@ -51,40 +48,11 @@ def here(monkeypatch, capsys):
     return run
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
-    """Check no types and shapes on a GPU, where torch compiles: it cannot trace run-time checks."""
-    if item.get_closest_marker("slow"):
-        quick_compiles.quicken()
-    with pytest.MonkeyPatch.context() as patch:
-        if item.get_closest_marker("gpu"):
-            patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-        made = yield
-    if item.get_closest_marker("slow") and (nextitem is None or nextitem.path != item.path):
-        quick_compiles.forget()
-    return made
-
-
-def pytest_collection_finish() -> None:
-    """By now all that tests import is imported, but for what compiles."""
-    quick_compiles.settle()
-
-
-def pytest_unconfigure() -> None:
-    """Have all freed, or else nanobind tells at the end of what was not."""
-    gc.unfreeze()
-
-
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as slow what slow.txt lists, and what is slow in the suite that kinds inherit; take taxels as they are in some rooms.
-
-    That suite has no marks: other people's pytest would not know them.
-    """
-    listed = (Path(__file__).parent / "slow.txt").read_text(encoding="utf-8").splitlines()
-    slow = {line for line in listed if not line.startswith("#")}
+    """Mark the suite that kinds inherit, which has no marks: other people's pytest would not know them."""
     for item in items:
-        if getattr(item, "originalname", "") == "test_compiled_equals_eager" or item.nodeid.split("[")[0] in slow:
+        if getattr(item, "originalname", "") == "test_compiled_equals_eager":
             item.add_marker("slow")
-        if item.nodeid.startswith(MADE_UP):
+        if item.nodeid.startswith(MADE_UP_POSES):
             item.add_marker(pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning"))

@@ -63,6 +63,7 @@ def test_dir_has_the_public_names_and_no_others():
     assert errors - inside <= set(dir(tgdsl))
 
 
+@pytest.mark.slow
 def test_testing_and_version_are_reached_by_importing_tgdsl_alone():
     said = in_python(
         "import sys, tgdsl; print('torch' in sys.modules, tgdsl.testing.KindConformance.__name__, tgdsl.__version__)"

@@ -133,6 +133,7 @@ def errors(tmp_path_factory):
     return json.loads(ran.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EXPECTED)
 def test_is_named(errors, case):
     kind, message = EXPECTED[case]

@@ -188,6 +188,7 @@ def test_placements_resolutions_and_noises(kept):
     assert max(len(axes.lines) for axes in figure.axes) == 4  # teacher and rest too
 
 
+@pytest.mark.slow
 def test_the_page_has_the_samples_of_the_paper_and_is_the_same_again(kept, tmp_path):
     assert paper_samples("in_palm_rotate") == 1_179_648_000 and paper_samples("screwdriver") == 196_608_000
     folder, page = kept(), tmp_path / "docs" / "ablations.md"
@@ -235,6 +236,7 @@ def test_sixty_students_find_room(tmp_path):
     assert collect(run, "large", into=tmp_path / "kept") < 100_000
 
 
+@pytest.mark.slow
 def test_mistakes(tmp_path, capsys, monkeypatch):
     def refused(change=lambda run: None, name="name", **options):
         shutil.rmtree(tmp_path / "run", ignore_errors=True)

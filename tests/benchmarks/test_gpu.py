@@ -156,6 +156,37 @@ class TestErrors:
             self.errors(0.0, np.nan)
 
 
+class TestGuard:
+    def test_a_row_a_tenth_slower_or_missing_is_named(self):
+        lines, is_met = gpu.compared({"depth × 16,384": 3.31, "force × 16,384": 10.9}, {"depth × 16,384": 3.0, "force × 16,384": 10.0})
+        assert not is_met
+        assert ["SLOWER" in line for line in lines] == [True, False]
+        lines, is_met = gpu.compared({}, {"depth × 16,384": 3.0})
+        assert not is_met and "not timed" in lines[0]
+
+    def test_faster_rows_and_new_ones_pass(self):
+        lines, is_met = gpu.compared({"depth × 16,384": 2.0, "new × 8": 1.0}, {"depth × 16,384": 3.0})
+        assert is_met and "-33%" in lines[0] and "nothing kept" in lines[1]
+
+    def test_nothing_kept_of_a_card_is_no_pass(self):
+        assert not gpu.compared({"depth × 16,384": 2.0}, {})[1]
+
+    def test_a_dry_run_keeps_ratios_and_compares_them(self, tmp_path, capsys):
+        make_artefacts(tmp_path / "art", [CASES["depth"]])
+        kept = tmp_path / "kept.json"
+        own = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1", "--check-envs", "2", "--envs", "3", "--rows", "depth"]
+        command = ["guard", str(tmp_path / "art"), "--out", str(tmp_path / "rows.json"), "--kept", str(kept), *own]
+        options = gpu.parsed([*command, "--keep"])
+        with pytest.raises(SystemExit, match="0"):
+            options.call(options)
+        assert list(json.loads(kept.read_text())["CPU"]) == ["depth × 3"]
+        kept.write_text('{"CPU": {"depth × 3": 1e-6}}')
+        options = gpu.parsed(command)
+        with pytest.raises(SystemExit, match="1"):
+            options.call(options)
+        assert "SLOWER" in capsys.readouterr().out
+
+
 def test_sets_exceed_the_cache():
     assert gpu.num_sets(50e6) == 4
     assert gpu.num_sets(1e9) == 2
@@ -192,6 +223,7 @@ def test_part_of_the_taxels_feels_the_lowest_cube(tmp_path):
         )  # the cube covers 4/9 of a pad, 2/3 where it goes on in one direction; probes reach 4 mm farther
 
 
+@pytest.mark.slow
 def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
     names, results = ["depth", "kinematic-noisy"], tmp_path / "gpu.json"
     make_artefacts(tmp_path / "art", [CASES[name] for name in names])
@@ -219,6 +251,7 @@ def test_a_dry_run_measures_writes_and_draws(tmp_path, capsys):
     assert sorted(path.name for path in (tmp_path / "images").iterdir()) == ["gpu_memory.png", "gpu_throughput.png"]
 
 
+@pytest.mark.slow
 def test_a_row_that_fails_is_said_and_the_others_go_on(tmp_path, capsys):
     names = ["kinematic", "depth"]
     make_artefacts(tmp_path, [CASES["depth"]])

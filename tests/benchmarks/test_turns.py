@@ -57,6 +57,7 @@ def is_free(path):
         return True
 
 
+@pytest.mark.slow
 def test_of_processes_at_once_each_has_the_turn_until_it_ends(tmp_path):
     found = ended(tmp_path, ["a", "b"], "--jobs", "2", "--turn", str(tmp_path / "turn"))
     assert sorted((case, said) for case, said, _ in found) == [("a", "a\n"), ("b", "b\n")]
@@ -65,6 +66,7 @@ def test_of_processes_at_once_each_has_the_turn_until_it_ends(tmp_path):
     assert (tmp_path / "turn").exists() and is_free(tmp_path / "turn")
 
 
+@pytest.mark.slow
 def test_one_that_fails_is_said_and_the_others_go_on(tmp_path):
     (broken, said, written), (other, _, _) = ended(tmp_path, ["broken", "a"])
     assert (broken, said, written) == ("broken", "broken\nbroken: FAILED, exit status 1\nno such thing\n", None)
@@ -79,7 +81,6 @@ def test_when_the_time_is_up_nothing_begins(tmp_path):
 
 @pytest.mark.slow
 def test_the_turn_is_given_back_to_compile_and_taken_when_code_that_is_that_of_compile_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)
     from torch._inductor import compile_fx
 
     touch, own = (tgdsl.compile(document(CASES["depth"], tmp_path)) for _ in range(2))

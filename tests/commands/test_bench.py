@@ -6,6 +6,7 @@ from benched_pads import bench_document
 FEW = ("--steps", "6", "--state-envs", "2", "--repeats", "1", "--envs", "2,3", "--sensors", "depth")
 
 
+@pytest.mark.slow
 def test_bench_prints_a_table_and_writes_three_files(here, tmp_path):
     bench_document(tmp_path)
     code, said, error = here(tmp_path, "bench", "pad.yaml", "-o", "out", "--save-states", "states.npz", *FEW)

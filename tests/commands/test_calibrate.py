@@ -50,6 +50,7 @@ def pressed(tmp_path_factory):
     return folder, loads
 
 
+@pytest.mark.slow
 def test_calibrate_with_loads(pressed, here, tmp_path):
     folder, loads = pressed
     log = str(folder / "press.npz")
@@ -88,6 +89,7 @@ def test_calibrate_with_a_file_of_loads(pressed, here, tmp_path):
     assert (tmp_path / "fit.png").exists()
 
 
+@pytest.mark.slow
 def test_calibrate_with_forces_over_time(here, tmp_path):
     """The counts follow a force that another clock, 0.3 s behind, says; the fit finds scale, axes and offset."""
 
@@ -150,6 +152,7 @@ sensors: {skin: {kind: kinematic_taxel, links: "*", feels: [cube], outputs: [for
 """
 
 
+@pytest.mark.slow
 def test_calibrate_beside_a_simulation(here, tmp_path):
     """A log of the same forces as the readings of a run, 70 ms later, as counts of a ring finger with other axes."""
     (tmp_path / "scene.xml").write_text(SCENE)

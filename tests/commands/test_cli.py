@@ -77,6 +77,7 @@ def fails(here):
 # compile
 
 
+@pytest.mark.slow
 def test_compile_says_what_it_made(base):
     lines = (base / "stdout.txt").read_text().splitlines()
     assert lines[:2] == ["6 taxels on 1 links at resolution low", "sensors: touch (kinematic_taxel, 6), bit (contact, 6)"]
@@ -141,6 +142,7 @@ def test_commands_that_do_not_exist(base, fails):
 # explain
 
 
+@pytest.mark.slow
 def test_explain_of_document_and_artefact(base, here):
     ran = tgdsl_in(base, "explain", "pad.safetensors")
     assert ran.returncode == 0, ran.stderr
@@ -160,6 +162,7 @@ def test_a_damaged_artefact(base, tmp_path, fails):
     assert fails(tmp_path, "explain", "x.safetensors").startswith("tgdsl: x.safetensors: cannot read this artefact: ")
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_gone(base):
     """`tgdsl explain … | head -1` ends without a word."""
     command = f'"{sys.executable}" -m tgdsl explain pad.safetensors | true; exit ${{PIPESTATUS[0]}}'
@@ -182,6 +185,7 @@ def test_schema_command(tmp_path, here):
     assert json.loads((tmp_path / "tgdsl.schema.json").read_text(encoding="utf-8")) == json_schema()
 
 
+@pytest.mark.slow
 def test_a_mistake_ends_without_a_traceback(base):
     ran = tgdsl_in(base, "run", "pad.safetensors", "--keyframes", "rest", "sqeeze")
     assert (ran.returncode, ran.stdout) == (2, "")
@@ -191,6 +195,7 @@ def test_a_mistake_ends_without_a_traceback(base):
 # run
 
 
+@pytest.mark.slow
 def test_run(base, tmp_path):
     ran = tgdsl_in(base, "run", "pad.safetensors", "--seconds", "0.1", "--out", str(tmp_path / "out"), filters="default")
     assert ran.returncode == 0, ran.stderr
@@ -213,6 +218,7 @@ def test_run(base, tmp_path):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_run_recorded_controls(base, tmp_path, here):
     controls = np.zeros((4, 3, 1))
     controls[:, 2] = 50.0
@@ -241,6 +247,7 @@ def test_bad_runs(base, tmp_path, fails):
     assert not (tmp_path / "out" / "readings.npz").exists()
 
 
+@pytest.mark.slow
 def test_run_closes_a_hand_without_keyframes(here, tmp_path):
     """From a robot file to touch by three commands; the artefact needs the file no more."""
     (tmp_path / "my hand.urdf").write_text(URDF)
@@ -263,6 +270,7 @@ def test_run_closes_a_hand_without_keyframes(here, tmp_path):
         assert not forces[0].any() and ((forces[-1] > 0).sum(axis=-1) >= 2).all()
 
 
+@pytest.mark.slow
 def test_run_holds_a_scene_without_keyframes(here, tmp_path):
     start, end = SCENE.index("<keyframe>"), SCENE.index("</mujoco>")
     (tmp_path / "scene.xml").write_text(SCENE[:start] + SCENE[end:])

@@ -90,6 +90,7 @@ def test_ctrl_c_ends_cleanly(base, here, monkeypatch, where):
 # A reader that goes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [("explain", "pad.yaml"), ("--help",), ("run", "--help"), ("--version",)])
 def test_a_reader_that_has_gone_before_the_first_line(base, arguments):
     reader, writer = os.pipe()
@@ -100,6 +101,7 @@ def test_a_reader_that_has_gone_before_the_first_line(base, arguments):
     assert (process.returncode, error) == (1, "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 @pytest.mark.parametrize("arguments", [("explain", "pad.yaml"), ("--version",)])
 def test_output_to_a_full_disk(base, arguments):
@@ -112,6 +114,7 @@ def test_output_to_a_full_disk(base, arguments):
 # Files that cannot be
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "file"),
     [
@@ -131,6 +134,7 @@ def test_a_file_that_grows_too_large_is_named_and_not_left(base, arguments, file
     assert files_in(base) == before
 
 
+@pytest.mark.slow
 def test_a_picture_that_grows_too_large(base):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))  # noqa: E731
     process = started(base, "run", "pad.yaml", "--seconds", "0.05", stdout=subprocess.PIPE, preexec_fn=limit)
@@ -139,6 +143,7 @@ def test_a_picture_that_grows_too_large(base):
     assert files_in(base / "out") == ["readings.npz"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

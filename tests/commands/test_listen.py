@@ -33,6 +33,7 @@ def document(tmp_path):
     return tmp_path / "sound.yaml"
 
 
+@pytest.mark.slow
 def test_a_run_is_written_as_files_and_a_picture(document, tmp_path, capsys):
     Listen(document, seconds=0.08, out=tmp_path / "out").run()
     said = capsys.readouterr().out

@@ -111,6 +111,7 @@ def test_a_script(base, here):
         np.testing.assert_allclose(found["action"][:, 1, 1], 0.1 * np.arange(STEPS))
 
 
+@pytest.mark.slow
 def test_mistakes(base, fails):
     (base / "wrong.yaml").write_text(TASK.replace("in_palm_rotate", "in_palm_rotat").replace('"*"', '"*", "nose"'))
     (base / "act.py").write_text("def up(env, obs):\n    return obs['gaol']\n")

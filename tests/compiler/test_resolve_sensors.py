@@ -196,6 +196,7 @@ observations:
 )
 
 
+@pytest.mark.slow
 def test_eight_mistakes_are_eight_lines(folder):
     text = EIGHT.replace("        index_1: ", "        index_3: ").replace("objects: {", "objects: {ball: {body: bal}, ")
     text = text.replace('tips: ["*_2"]', 'tips: ["*_22"]')

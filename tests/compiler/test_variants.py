@@ -2,7 +2,6 @@
 
 import json
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -102,6 +101,7 @@ def cache(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variants", [PAPER, ODD], ids=["the paper's", "compound"])
 def test_a_batch_of_variants_is_as_many_single_runs(tmp_path, variants):
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=variants), dtype=torch.float64)
@@ -113,6 +113,7 @@ def test_a_batch_of_variants_is_as_many_single_runs(tmp_path, variants):
         torch.testing.assert_close(readings[name], value, rtol=1e-12, atol=1e-14, msg=lambda m, n=name: f"{n}: {m}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [{"query": "sdf", "tolerance": 2e-4}, {"query": "raycast"}], ids=["sdf", "raycast"])
 def test_meshes_among_the_variants(tmp_path, target):
     variants = [
@@ -149,6 +150,7 @@ def test_variants_and_sizes_against_the_reference(tmp_path, size):
     assert_agrees(touch(state)["s"], reference, state, FLOAT64_TOLERANCE)
 
 
+@pytest.mark.slow
 def test_sizes_per_environment(tmp_path):
     """The scene's own geom, as large as the state says: what a fixed geom of that size gives, and its derivative."""
     doc = document(tmp_path, '<geom type="box" size=".01 .01 .01"/>', size="per_env")
@@ -170,8 +172,7 @@ def test_sizes_per_environment(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_compiled_graph_serves_all_variants(tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+def test_one_compiled_graph_serves_all_variants(tmp_path):
     touch = tgdsl.compile(document(tmp_path, "<geom size='.01'/>", variants=PAPER), dtype=torch.float64)
     fused = TactileModule(touch.plan, dtype=torch.float64).compile()
     torch.compiler.reset()

@@ -108,6 +108,7 @@ def test_a_status_line_is_drawn_over_itself_and_wiped(monkeypatch):
     assert quiet.getvalue() == ""
 
 
+@pytest.mark.slow
 def test_a_command_on_a_terminal(folder):
     """What is said stands on the terminal that standard error is; what is printed stays as it is."""
     master, terminal = pty.openpty()

@@ -23,10 +23,31 @@ def test_millimetres_are_thousandths(x):
     assert math.isclose(units.parse(f"{x} mm", "length"), x * 1e-3, rel_tol=RTOL, abs_tol=5e-324)
 
 
-@pytest.mark.parametrize(("dimension", "unit"), [(d, u) for d, known in units.UNITS.items() for u in known])
-def test_every_unit_has_its_factor(dimension, unit):
-    for text in (f"2.5{unit}", f"+2.5 {unit}", f"  25e-1  {unit} "):
-        assert units.parse(text, dimension) == 2.5 * units.UNITS[dimension][unit] + (-273.15 if unit == "K" else 0.0)
+PREFIXES = {"G": 9, "M": 6, "k": 3, "c": -2, "m": -3, "u": -6, "µ": -6}
+SYMBOLS = {"m": 0, "g": -3, "s": 0, "N": 0, "Pa": 0, "Hz": 0, "W": 0, "J": 0, "K": 0, "rad": 0}
+"""Power of ten from a symbol to its SI unit: the gram is the one that is not coherent."""
+
+
+def si_factor(unit):
+    """Return a unit's factor to SI by the rules of SI: prefixes, products, quotients and powers of symbols."""
+    exponent, sign = 0, 1
+    for separator, symbol, power in re.findall(r"([/*]?)\(?([A-Za-zµ]+)(\d?)\)?", unit):
+        sign = -1 if separator == "/" or (sign == -1 and "(" in unit) else 1
+        prefix, base = (0, symbol) if symbol in SYMBOLS else (PREFIXES[symbol[0]], symbol[1:])
+        exponent += sign * (prefix + SYMBOLS[base]) * int(power or 1)
+    return float(f"1e{exponent}")
+
+
+def test_every_unit_has_the_factor_of_si():
+    assert si_factor("kW/m2") == 1e3 and si_factor("/cm2") == 1e4 and si_factor("kJ/(kg*K)") == 1e3 == si_factor("J/(g*K)")
+    for dimension, known in units.UNITS.items():
+        for unit in known:
+            factor, zero = {"deg": (math.pi / 180, 0.0), "degC": (1.0, 0.0), "K": (1.0, -273.15)}.get(unit) or (
+                si_factor(unit),
+                0.0,
+            )
+            for text in (f"2.5{unit}", f"+2.5 {unit}", f"  25e-1  {unit} "):
+                assert units.parse(text, dimension) == pytest.approx(2.5 * factor + zero, rel=RTOL), (dimension, unit)
 
 
 def test_units_agree_with_each_other():

@@ -33,6 +33,7 @@ export_model(out / "scene.xml", out / "a.usda")
 WRITTEN = ("a.safetensors", "a.npz", "log.npz", "a.usda")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
 def test_permissions_are_those_of_a_new_file(tmp_path, umask):
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}

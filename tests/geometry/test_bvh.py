@@ -6,7 +6,6 @@ import pickle
 import sys
 import time
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -223,6 +222,7 @@ def test_freed_meshes_are_refused():
         torch.ops.tgdsl.mesh_distance(point, which, [key], 1.0)
 
 
+@pytest.mark.slow
 def test_operator_contract():
     meshes = [TriangleMesh(*cube()), TriangleMesh(*cube())]
     point = 0.1 * torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -270,6 +270,7 @@ def test_quiet(capfd):
     assert capfd.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_many_points():
     vertices, faces = icosphere(5)
     mesh = TriangleMesh(vertices, faces)
@@ -282,8 +283,7 @@ def test_many_points():
 
 
 @pytest.mark.slow
-def test_compiled(monkeypatch):
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+def test_compiled():
     mesh = TriangleMesh(*icosphere())
 
     def depth(x, y, z):

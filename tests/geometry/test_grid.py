@@ -1,6 +1,5 @@
 import itertools
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -99,6 +98,7 @@ def test_where_the_gradient_vanishes_it_is_a_fixed_unit_vector(method):
     np.testing.assert_array_equal(np.linalg.norm(gradient, axis=1), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_gradient_is_the_derivative(method, rough):
     """Inside, across the border and outside; trilinear not at faces of cells, where its gradient jumps."""
@@ -205,8 +205,7 @@ def test_each_point_asks_its_own_of_several_grids(method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_compiles_whole_for_any_size(method, monkeypatch):
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+def test_compiles_whole_for_any_size(method):
     torch.manual_seed(0)
     grid = one_grid(torch.rand(6, 7, 8).double(), torch.zeros(3).double(), torch.tensor(0.15).double())
     compiled = torch.compile(METHODS[method], fullgraph=True, dynamic=True)

@@ -99,6 +99,7 @@ def test_gains_of_modes_that_symmetry_makes_equal():
     assert (np.diff(found.frequency) > 0).all()
 
 
+@pytest.mark.slow
 def test_a_box_of_slabs_is_a_box_with_a_cavity():
     """Geoms that touch are one solid: the same modes, frequency by frequency, and gain by gain."""
     one = analysed("box", surface_of(thin_box(0.1, 0.004)), STEEL, 1e9)
@@ -161,6 +162,7 @@ def test_a_mesh_that_is_open_is_an_error_that_names_the_body():
         analysed("cup", surface_of(mesh), STEEL, 1e9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("material", ["steel", "wood", "glass"])
 def test_thin_walled_boxes_ring(material, monkeypatch):
     """At the default resolution: 10 cm, walls of 2 mm, at least four modes below 0.45 of 16 kHz, and within 2 % of finer ones.

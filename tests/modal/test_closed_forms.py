@@ -59,6 +59,7 @@ def test_all_modes_of_a_ball(poissons_ratio):
     assert_holds(oracles.modes_of_a_ball(poissons_ratio))
 
 
+@pytest.mark.slow
 def test_modes_of_one_frequency_are_one():
     """Of a ball, at the default resolution: spheroidal modes of degree 2, 1 and 3; torsion, 2.5011 c_s/a, is not heard."""
     shear = 1 / np.sqrt(2.6)
@@ -77,6 +78,7 @@ def test_a_thin_square_plate():
     assert_holds(found)
 
 
+@pytest.mark.slow
 def test_a_body_that_is_turned_and_moved():
     """Frequencies do not depend on where a body is in its frame, nor on how it is turned."""
     found, _, _ = spectrum(surface_of(box(0.05, 0.03, 0.02)), 0.3, 6, 4000)

@@ -35,6 +35,7 @@ def share(found: Modes, *pos: tuple[float, float, float], along: np.ndarray = UP
     return found.shapes.share(np.array(pos), np.broadcast_to(along, (len(pos), 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_beam_is_not_struck_at_a_node_and_most_at_its_ends(number):
     """Along the beam's upper side, the way that it is thin: shares are in the ratios of the closed form, zero where that is."""
@@ -49,6 +50,7 @@ def test_the_first_node_of_a_beam_is_where_the_textbook_has_it():
     assert 0.5 - node == pytest.approx(0.2242, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_other_side_is_struck_from_the_other_side():
     """Through a thin plate, displacement is that of both of its sides: shares differ by their sign alone."""
     found = modes(box(SIDE, SIDE, THICKNESS))
@@ -60,6 +62,7 @@ def test_the_other_side_is_struck_from_the_other_side():
     assert top[:, ~single] == pytest.approx(bottom[:, ~single], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_centre_of_a_square_plate_excites_even_modes_alone():
     """Of the first four: xy, x² − y² and a pair have a node there; x² + y² has not."""
     assert_holds(oracles.struck_at_the_centre())
@@ -67,6 +70,7 @@ def test_the_centre_of_a_square_plate_excites_even_modes_alone():
     assert abs(share(found, (0.0, 0.0, THICKNESS / 2))[0, 2]) > 0.7
 
 
+@pytest.mark.slow
 def test_points_that_symmetry_makes_equal_are_struck_alike():
     """The four quadrants of a square plate, and the diagonal's mirror, for pairs of modes too."""
     found = modes(box(SIDE, SIDE, THICKNESS), 6)
@@ -76,6 +80,7 @@ def test_points_that_symmetry_makes_equal_are_struck_alike():
     assert (got[0] > 0.05).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mesh", [box(LENGTH, WIDTH, HEIGHT), box(SIDE, SIDE, THICKNESS), ball(0.05)], ids=["beam", "plate", "ball"]
 )
@@ -89,6 +94,7 @@ def test_interpolation_is_as_exact_as_is_said(mesh):
     assert off.max() < max(3 * found.shapes.error.max(), 0.01)
 
 
+@pytest.mark.slow
 def test_shares_are_one_in_the_mean_over_the_surface():
     """The energy of an impulse somewhere on the surface is that of the mean gain."""
     found, mesh = modes(box(SIDE, SIDE, THICKNESS), 6), box(SIDE, SIDE, THICKNESS)
@@ -100,6 +106,7 @@ def test_shares_are_one_in_the_mean_over_the_surface():
     assert np.sqrt((got**2).mean(axis=0)) == pytest.approx(np.ones(got.shape[1]), abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_body_that_is_moved_and_scaled():
     """Places are in the body's frame, in metres: points that correspond are struck alike."""
     first = modes(box(LENGTH, WIDTH, HEIGHT), 4)

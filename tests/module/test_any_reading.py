@@ -114,8 +114,7 @@ def test_the_table_is_what_is_observed(tmp_path):
         (lambda r: {**r, "joint_pos": r["joint_pos"][:1]}, r'^reading "joint_pos" is of 1 environments, "dist" of 2$'),
     ],
 )  # fmt: skip
-def test_readings_that_do_not_fit_are_named(tmp_path, monkeypatch, change, message):
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # as where types are not checked at run time
+def test_readings_that_do_not_fit_are_named(tmp_path, change, message):
     touch = joint_module(tmp_path, {"policy": [{"type": "reading", "of": "dist"}, {"type": "joint_pos"}]})
     with pytest.raises(ObservationError, match=message):
         touch.observe(change(touch(touch.example_state(2))))
@@ -137,9 +136,8 @@ def test_an_observation_of_reading_is_the_old_types(tmp_path):
     assert (found["new"] == found["old"]).all()
 
 
-def test_observing_is_one_graph(tmp_path, monkeypatch):
+def test_observing_is_one_graph(tmp_path):
     """No graph breaks, whatever stands in a group."""
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     terms = [
         {"type": "reading", "of": "dist", "channels": ["nearest_item_z", "distance_item"]},
         {"type": "joint_pos", "joints": ["curl"]},

@@ -67,6 +67,7 @@ def test_the_same_bytes_twice(document, artifact, tmp_path):
     assert size == len(content)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_from_other_processes(document, artifact, tmp_path):
     program = "import sys; from tgdsl.module.artifact import *; from tgdsl.compiler.pipeline import *; save_plan(compile_plan(sys.argv[1]), sys.argv[2])"
     for seed in ("1", "4242"):

@@ -298,8 +298,8 @@ def test_blocks_are_tiles_where_a_taxel_asks_for_little(document, name):
     assert options == {"assert_indirect_indexing": False, "triton.prefer_nd_tiling": is_tiled}
 
 
-def test_as_many_modules_as_one_likes_are_compiled(document, monkeypatch):
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+@pytest.mark.slow
+def test_as_many_modules_as_one_likes_are_compiled(document):
     sensor = {"kind": "contact_depth", "links": "pad", "feels": ["item"]}
     for count in (1, 2, 3):
         document["sensors"] = {f"depth{i}": sensor for i in range(count)}
@@ -340,6 +340,7 @@ def test_a_module_is_cast_between_its_dtypes(touch):
     torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5 * float(double.abs().max()))
 
 
+@pytest.mark.slow
 def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'

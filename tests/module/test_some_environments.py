@@ -3,7 +3,6 @@
 import copy
 import pickle
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -61,6 +60,7 @@ def with_grad(request):
         yield request.param
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_each_environment_is_as_if_it_were_alone(touch, seed, with_grad):
     """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""
@@ -123,9 +123,8 @@ def test_a_look_before_the_first_call_fixes_nothing(touch):
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(folder, monkeypatch, with_grad):
+def test_compiled_equals_eager(folder, with_grad):
     """Rings, filters, walks, windows, held samples, bits: three graphs, of calls, of masked ones and of looks."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     noise = {"read_delay": 0.013, "hysteresis": {"strength": 0.5, "time_constant": 0.05}, "drift": 1e-5}
     sensors = {
         "s": {"kind": "contact_depth", "noise": noise, "rate": 60, "history": {"length": 3, "reduce": "mean"}},
@@ -147,9 +146,8 @@ def test_compiled_equals_eager(folder, monkeypatch, with_grad):
 
 
 @pytest.mark.parametrize(("keeps_last", "num_graphs"), [(False, 3), (True, 2)])
-def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder, monkeypatch, keeps_last, num_graphs):
+def test_who_keeps_what_is_handed_out_from_the_start_compiles_calls_once(folder, keeps_last, num_graphs):
     """One graph of calls and one of masked ones; else calls before the first masked one have a graph of their own."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     touch = tgdsl.compile(document(folder, {"d": {"kind": "contact_depth"}, "c": {"kind": "contact", "history": 3}}))
     eager, compiled = copy.deepcopy(touch), []
     touch.memory.keeps_last = keeps_last
@@ -232,9 +230,9 @@ def test_what_was_handed_out_by_another_state_is_forgotten(touch, change):
         touch(felt_state(touch, NUM_ENVS), env_ids=[0])
 
 
-def test_a_copy_of_a_compiled_module_computes_by_itself(folder, monkeypatch):
+@pytest.mark.slow
+def test_a_copy_of_a_compiled_module_computes_by_itself(folder):
     """Its own constants, dtype and memory; the original goes on with its own."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     touch = tgdsl.compile(document(folder, {"d": {"kind": "kinematic_taxel", "noise": {"white_noise": 0.1}}}))
     touch.compile(backend="eager", fullgraph=False)
     state = felt_state(touch, 3)

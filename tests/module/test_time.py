@@ -55,6 +55,7 @@ def test_a_sensor_at_50_hz_called_at_200_hz_holds_for_four_calls(build, dtype):
 SLOW_RATES = [(50, 0.005, 4), (30, 1 / 240, 8), (100, 0.002, 5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "dt", "every"), [(50, 0.001, 20), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW_RATES)]
 )
@@ -81,6 +82,7 @@ def test_a_rate_above_that_of_the_calls_samples_at_every_call(build, rate):
     assert [f'"s" has a rate of {rate:g} Hz' in str(warning.message) for warning in caught] == [True] * (rate > 200)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [37, 60, 120])
 def test_a_rate_that_does_not_divide_that_of_the_calls(build, rate):
     """Samples are taken at the nearest call, so their mean rate is the sensor's own."""
@@ -91,6 +93,7 @@ def test_a_rate_that_does_not_divide_that_of_the_calls(build, rate):
     np.testing.assert_allclose(run(touch, depths, [float(dt) for dt in dts])[:, 0], depths[read, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_uneven_steps_that_grow_and_shrink_little(build, seed):
     rng = np.random.default_rng(seed)

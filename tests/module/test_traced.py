@@ -11,13 +11,13 @@ import tgdsl
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["every_sensor", "noisy_hand"])
-def test_no_number_of_the_code_or_the_plan_is_an_input(name, monkeypatch):
+def test_no_number_of_the_code_or_the_plan_is_an_input(name):
     """A float that is read is one for `torch.compile(dynamic=True)`.
 
     It costs microseconds a call, and double precision on a GPU; or all is traced anew, and compiling takes twice as long.
     """
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)
     touch = tgdsl.compile(EXAMPLES / f"{name}.yaml")
     numbers, traced = [], []
     behind = aot_autograd(fw_compiler=lambda graph, _inputs: graph.forward)

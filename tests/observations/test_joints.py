@@ -153,8 +153,8 @@ def test_saved_and_loaded_and_explained(tmp_path):
     assert "policy: joint_pos (3), joint_vel (3), joint_effort (3), last_action (3), joint_pos (1)" in text
 
 
-def test_compiled_is_eager(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+@pytest.mark.slow
+def test_compiled_is_eager(tmp_path):
     touch = joint_module(tmp_path, {"policy": ALL}, torch.float32)
     state = touch.example_state(3)
     eager = touch.observe(touch(state))["policy"]

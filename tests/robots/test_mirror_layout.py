@@ -86,6 +86,7 @@ def test_the_text_of_a_layout_stays(tmp_path):
     assert (tmp_path / "probes_left.csv").read_text().splitlines()[1] == "0.1,-0.2,0.3,0,-1,1,1e-3"
 
 
+@pytest.mark.slow
 def test_mirrored_twice_a_layout_places_the_same_taxels(tmp_path):
     mirrored_layout(tmp_path, 1)
     there = mirror.LayoutMirror.of(tmp_path / "layout_left.yaml", reflection.Mirror(1, "left", "right"))

@@ -41,6 +41,7 @@ def half_counts(axes: str) -> torch.Tensor:
     return torch.from_numpy(along_link[:, ["xyz".index(axis) for axis in axes]].T.reshape(-1))
 
 
+@pytest.mark.slow
 def test_emulator_and_simulation_agree_within_half_a_count(touch):
     """Fingers press, are released by a reset, and press again; then nothing but rounding lies between both."""
     controls = ramp(30)

@@ -34,6 +34,7 @@ def test_the_emulator_runs_in_real_time(touch):
         assert (env.observe()["policy"] == unloaded).all()
 
 
+@pytest.mark.slow
 def test_a_passive_body_holds_where_it_is(touch):
     with tgdsl.connect(touch, "emulator", calibration=NEWTON, motion=instant(touch), lockstep=True) as env:
         assert isinstance(env.source, EmulatedSource)
@@ -96,6 +97,7 @@ def test_a_reset_does_not_hide_that_the_simulation_ended(touch, monkeypatch):
             env.reset()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, lockstep):
     """A mistake in what the fingertips feel ends its thread: the step that waits for a reading says so, and so does close."""
@@ -117,6 +119,7 @@ def test_an_emulator_that_ends_is_told_to_who_waits_for_it(touch, monkeypatch, l
         env.close()
 
 
+@pytest.mark.slow
 def test_in_lockstep_a_policy_may_think_for_as_long_as_it_likes(touch):
     """The watchdog's time passes on the wall, where nothing runs: what is observed does not know of it."""
     model, runs = tgdsl.simulate(touch, 1).model, []

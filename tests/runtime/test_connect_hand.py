@@ -98,6 +98,7 @@ def test_reading_alone_moves_nothing_and_says_once_that_controls_go_nowhere(touc
     assert set(written.writes) == {PASSIVE_READ, VERSION}
 
 
+@pytest.mark.slow
 def test_after_a_failed_step_nothing_old_is_observed(touch):
     timing = SerialTiming(reply_timeout_s=2.0, silence_s=1.0)
     with Emulator() as emulator, tgdsl.connect(touch, f"xhand1:{emulator.device}", timing=timing) as env:

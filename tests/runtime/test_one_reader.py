@@ -26,6 +26,7 @@ def with_state(folder) -> tgdsl.TactileModule:
     return module(folder, PRESSED, links=("table",), **BIT)
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_second_simulation_is_refused_and_the_first_goes_on(tmp_path, simulator):
     touch = with_state(tmp_path)
@@ -58,6 +59,7 @@ def test_a_simulation_that_is_closed_lets_go_and_can_no_longer_be_used(tmp_path,
     assert next(iter(rollout(touch, second, np.zeros((1, 2))))).readings["touch"].all()
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_simulation_that_nobody_holds_lets_go(tmp_path, simulator):
     touch = with_state(tmp_path)

@@ -124,6 +124,7 @@ def changed(model: mujoco.MjModel, name: str) -> mujoco.MjModel | None:
     return other
 
 
+@pytest.mark.slow
 def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(rich):
     model = rich.compiled
     tried = []

@@ -37,6 +37,7 @@ def test_a_model_s_are_told_once(tmp_path, monkeypatch, capfd, name, text, what)
     assert capfd.readouterr() == ("", "") and [p.name for p in tmp_path.iterdir()] == [name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filters", ["error", "always"])
 def test_they_end_no_process(tmp_path, filters):
     """A Python exception inside MuJoCo's callback would."""

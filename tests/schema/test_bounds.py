@@ -92,6 +92,7 @@ def test_long_texts():
     assert yaml.parse(f"a: {long[1:]}", "f").value == {"a": long[1:]}
 
 
+@pytest.mark.slow
 def test_documents_built_in_python():
     laugh: list = [1] * 10
     for _ in range(8):

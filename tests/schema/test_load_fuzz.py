@@ -53,6 +53,7 @@ def test_the_fuzzed_document_is_valid():
     assert load(valid()).problems == []
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.data())
 def test_one_or_two_parts_replaced(data):
@@ -70,6 +71,7 @@ def test_one_or_two_parts_replaced(data):
     never_another_error(document)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.dictionaries(KEYS_OR_TEXT, VALUES, max_size=8))
 def test_arbitrary_mappings(document):
@@ -91,6 +93,7 @@ def test_arbitrary_text(tmp_path: Path, text):
     never_another_error(write(tmp_path, text))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_a_document_with_pieces_put_in(tmp_path: Path, data):
@@ -101,6 +104,7 @@ def test_a_document_with_pieces_put_in(tmp_path: Path, data):
     never_another_error(write(tmp_path, text))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_arbitrary_overrides(tmp_path: Path, data):

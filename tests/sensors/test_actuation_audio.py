@@ -137,6 +137,7 @@ def test_partials_that_the_rate_does_not_hold_fade_out():
     assert_holds(oracles.fading())
 
 
+@pytest.mark.slow
 def test_friction_has_its_spectral_density_at_every_rate():
     """(β ω)² Pa²/Hz from 20 and from 40 samples per step: mean square over half the rate, white, independent of one another."""
     assert_holds(oracles.friction())
@@ -155,6 +156,7 @@ def test_hum_is_there_at_rest():
     assert_holds(oracles.hum())
 
 
+@pytest.mark.slow
 def test_single_precision_keeps_the_phase(build):
     """After 5,000 steps at a varying speed samples are off by less than 1e-3 of the amplitude."""
     velocities = 5.0 + 2.0 * np.sin(np.arange(5000) * 0.01)

@@ -267,6 +267,7 @@ def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_pat
     assert (force[sizes > 1e-6, 0] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5])
 def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(alpha):
     """Force against depth δ of a ball: a power of α + 1 where Hertz has 1.5."""

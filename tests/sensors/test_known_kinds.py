@@ -205,6 +205,7 @@ class TestInverse(KindConformance):
 """
 
 
+@pytest.mark.slow
 def test_the_suite_brings_no_marks_into_other_peoples_pytest(tmp_path):
     (tmp_path / "touchy.py").write_text(MODULE)
     (tmp_path / "test_mine.py").write_text(INHERITED)

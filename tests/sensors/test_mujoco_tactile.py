@@ -23,6 +23,7 @@ OURS, THEIRS, FACETS = 5e-5, 5e-4, 3e-5
 takes the ball for smaller), and how far the ball's facets are from it."""
 
 
+@pytest.mark.slow
 def test_depth_of_a_mesh_is_that_of_mujocos_octree(tmp_path, monkeypatch):
     """MuJoCo's tactile sensor finds distances to a mesh on an octree, we on a grid: both within their errors of the ball."""
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))

@@ -64,6 +64,7 @@ def test_the_papers_model_pulls():
     assert paper[2] > 0
 
 
+@pytest.mark.slow
 def test_slip_drags_the_sensor_along_with_the_object():
     """A cube that slides: f_t = k_s ρ S0 v_t, and the velocity along the normal does nothing."""
     assert_holds(proximity.slip())
@@ -105,6 +106,7 @@ def test_the_whole_area_is_the_default_reference():
     np.testing.assert_allclose(own, read(CUBE, pos=[0, 0, -0.026]), rtol=1e-6, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_points_and_field_agree_to_sampling_noise(tmp_path):
     """200,000 points, some 6,500 of them within reach, err by √(1.5 / 6500) = 1.5 %; the field by less."""
     line = np.linspace(-0.02, 0.02, 6)
@@ -136,6 +138,7 @@ def test_stiffness_is_a_constant_that_gradients_reach(tmp_path):
     assert slope.item() * stiffness.item() == pytest.approx(force.item(), rel=1e-12)  # the force at rest is linear in it
 
 
+@pytest.mark.slow
 def test_each_radius_has_its_own_field(tmp_path):
     """Two radii in one layout read what each reads alone."""
     touch, alone = [], []
@@ -169,6 +172,7 @@ def document(folder, probes, feels=("item",), target=None, **sensor):
 POINT = {"pos": [0, 0, 0], "normal": [0, 0, 1], "radius": R}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["field", "points"])
 def test_variants_are_as_many_single_runs(tmp_path, backend):
     variants = [{"type": "box", "size": [0.02] * 3}, {"type": "sphere", "size": [0.02]}]
@@ -234,6 +238,7 @@ def test_density_is_shared_out_over_the_points(tmp_path, shape):
     assert float(found) == pytest.approx(-100 * mean, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_explain_counts_the_bytes_of_all_channels(tmp_path):
     """With noise of the radius a field holds derivatives too: 8 numbers of 4 bytes at each node."""
     cases: list[tuple[dict[str, Any], int]] = [({}, 4), ({"noise": {"radius_noise": 1e-3}}, 8)]

@@ -72,6 +72,7 @@ def found() -> dict:
     return json.loads(interpreted(__file__))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_is_the_product(found, name):
     assert found[name] < 1

@@ -60,6 +60,7 @@ def rms(found, exact):
     return float(np.sqrt(((found - exact) ** 2).sum() / (exact != 0).sum()) / exact.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("accuracy", "bound"), [("10 %", 0.1), ("1 %", 0.01), ("0.01 %", 1e-4)])
 def test_the_accuracy_is_held_on_states_that_took_no_part(tmp_path, others, accuracy, bound):
     """And the next coarser grid, which takes fewer operations or bytes, does not hold it there."""
@@ -74,11 +75,13 @@ def test_the_accuracy_is_held_on_states_that_took_no_part(tmp_path, others, accu
         assert rms(read(tgdsl.compile(made, overrides=bare), states), exact) > bound
 
 
+@pytest.mark.slow
 def test_each_accuracy_has_a_variant_of_its_own(tmp_path):
     found = [str(choose(chosen_document(tmp_path, depth_at(own))).changes) for own in ("10 %", "1 %", "0.01 %")]
     assert len(set(found)) == 3
 
 
+@pytest.mark.slow
 def test_an_amount_is_held_in_its_unit(tmp_path, others):
     """0.3 % of a depth of some 3 mm are 10 µm."""
     states, exact = others
@@ -88,6 +91,7 @@ def test_an_amount_is_held_in_its_unit(tmp_path, others):
     assert choose(made).changes == relative
 
 
+@pytest.mark.slow
 def test_the_stricter_of_two_sensors_decides_on_their_object(tmp_path):
     made = chosen_document(tmp_path, depth_at("10 %"), depth_at("0.01 %").replace("depth:", "fine:"))
     plan = compile_plan(made)
@@ -96,6 +100,7 @@ def test_the_stricter_of_two_sensors_decides_on_their_object(tmp_path):
     assert len(plan.quantities["contact_depth"].queries) == 1
 
 
+@pytest.mark.slow
 def test_sensors_without_an_accuracy_keep_what_they_have(tmp_path):
     """What nobody wrote is 0.05 mm."""
     plain = "plain: {kind: contact_depth, gate: geometric}"
@@ -105,6 +110,7 @@ def test_sensors_without_an_accuracy_keep_what_they_have(tmp_path):
     assert alone.changes[KEYS[1]] == 1e-3
 
 
+@pytest.mark.slow
 def test_what_is_written_stays(tmp_path):
     made = chosen_document(tmp_path, depth_at("10 %"), object=", tolerance: 0.02 mm")
     assert choose(made).changes == {}
@@ -115,6 +121,7 @@ def test_what_is_written_stays(tmp_path):
     assert choose(made, {KEYS[0]: "raycast"}).changes == {KEYS[0]: "raycast"}
 
 
+@pytest.mark.slow
 def test_imperfections_change_nothing_of_it(tmp_path):
     bare = choose(chosen_document(tmp_path, depth_at("1 %"))).changes
     more = ", noise: noisy, rate: 50 Hz, history: 3, readout: both"
@@ -125,6 +132,7 @@ def test_imperfections_change_nothing_of_it(tmp_path):
     assert sum("accuracy 1 %" in line for sensor in touch.plan.sensors for line in sensor.notes) == 1
 
 
+@pytest.mark.slow
 def test_fields_and_distances_are_chosen_together(tmp_path):
     """Newton steps, 4 if nobody writes them, and how the mesh is asked."""
     choice = choose(chosen_document(tmp_path, "force: {kind: force_taxel, gate: geometric, accuracy: 5 %}"))
@@ -141,6 +149,7 @@ def forget_choices():
             entry.file.unlink()
 
 
+@pytest.mark.slow
 def test_the_same_document_gives_the_same_bytes(tmp_path, monkeypatch):
     """With what is kept, and without."""
     made, found = chosen_document(tmp_path, depth_at("1 %")), []
@@ -155,12 +164,14 @@ def test_the_same_document_gives_the_same_bytes(tmp_path, monkeypatch):
     assert "accuracy 1 %: grid" in tgdsl.load(tmp_path / "one.safetensors").explain()
 
 
+@pytest.mark.slow
 def test_the_origin_is_the_document_as_written(tmp_path):
     made = chosen_document(tmp_path, depth_at("10 %"))
     unchosen = pipeline.compile_plan(made, choice=Choice(notes={"depth": ()}))
     assert compile_plan(made).origin == unchosen.origin
 
 
+@pytest.mark.slow
 def test_a_choice_follows_from_what_the_document_says(tmp_path):
     """Another mass changes the motion, not what is computed of it; still it is looked at anew."""
     made = chosen_document(tmp_path, depth_at("1 %"))
@@ -235,6 +246,7 @@ def test_what_is_wrong_is_told_where_it_stands(tmp_path, sensor, at, message):
     assert str(problem).startswith(f"{place_of(made, at)}: ") and message.split("; did")[0] in str(problem)
 
 
+@pytest.mark.slow
 def test_what_nothing_holds_names_the_best(tmp_path):
     made = chosen_document(tmp_path, depth_at("0.01 %"), object=", query: sdf")
     with pytest.raises(SpecError) as caught:
@@ -266,6 +278,7 @@ def test_a_scene_that_cannot_be_run_has_no_states(tmp_path):
         tgdsl.compile(made)
 
 
+@pytest.mark.slow
 def test_without_anything_finer_nothing_is_known_of_an_error(tmp_path, monkeypatch):
     """Without Warp a grid of 0.01 mm is the finest: others are measured against it, itself it cannot be chosen."""
 
@@ -283,6 +296,7 @@ def test_without_anything_finer_nothing_is_known_of_an_error(tmp_path, monkeypat
         choose(chosen_document(tmp_path, depth_at("0.01 %"), object=", tolerance: 0.01 mm"))
 
 
+@pytest.mark.slow
 def test_the_document_is_warned_of_once(tmp_path):
     made = chosen_document(tmp_path, depth_at("10 %").replace(", accuracy", ", rate: 0.05, accuracy"))
     with warnings.catch_warnings(record=True) as found:

@@ -209,6 +209,7 @@ def test_table_and_picture_sum_alike(tmp_path):
     assert small.summary().startswith(f"|Σ| {0.1 * expected:.3g} mN")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", ["top", "-60,25"])
 def test_run_draws_from_where_it_is_told(tmp_path, here, view):
     touch, sim = pad(tmp_path, noise=NOISE)

@@ -204,6 +204,7 @@ def test_short_names_drop_what_all_share() -> None:
 # The file ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("env", "reading"), [(0, None), (1, None), (0, "depth")])
 def test_writes_a_png(touch, sim, readings, tmp_path: Path, env: int, reading: str | None) -> None:
     path = picture(touch, sim, readings, tmp_path / "new" / "touch.png", env=env, reading=reading, title="A pad")
@@ -213,6 +214,7 @@ def test_writes_a_png(touch, sim, readings, tmp_path: Path, env: int, reading: s
     assert struct.unpack(">II", header[16:]) == (1600, 900)
 
 
+@pytest.mark.slow
 def test_default_is_the_kinematic_taxel(touch, sim, readings, tmp_path: Path) -> None:
     chosen = picture(touch, sim, readings, tmp_path / "chosen.png", reading="touch").read_bytes()
     assert picture(touch, sim, readings, tmp_path / "default.png").read_bytes() == chosen

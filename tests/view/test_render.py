@@ -112,6 +112,7 @@ def test_discs_are_where_the_taxels_are(hand: Drawn, view: str, keyframe: str | 
         np.testing.assert_allclose(found[order], expected[other], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS)
 def test_what_is_in_view_is_what_a_ray_to_the_camera_leaves(hand: Drawn, view: str) -> None:
     """MuJoCo's rays know neither pixels nor triangles."""
@@ -239,6 +240,7 @@ def test_titles(hand: Drawn) -> None:
 # The file ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_bytes_twice(hand: Drawn, tmp_path: Path) -> None:
     model, layouts = hand
     first = render(model, layouts, tmp_path / "new" / "first.png")
@@ -332,6 +334,7 @@ def command(here, folder: Path):
     return lambda *arguments: here(folder, "render", *arguments)
 
 
+@pytest.mark.slow
 def test_command_draws_a_robot_a_document_and_an_artefact(command, folder: Path, tmp_path: Path) -> None:
     out = str(tmp_path / "x.png")
     assert command("hand.xml", "--out", out) == (0, f"few: 10 taxels, many: 39 taxels\npicture: {out}\n", "")
@@ -345,6 +348,7 @@ def test_command_draws_a_robot_a_document_and_an_artefact(command, folder: Path,
     assert Path(out).read_bytes() == drawn
 
 
+@pytest.mark.slow
 def test_command_draws_a_robot_by_name(command, tmp_path: Path) -> None:
     out = str(tmp_path / "x.png")
     assert command("xhand1", "--resolutions", "low", "-o", out) == (0, f"low: 90 taxels\npicture: {out}\n", "")

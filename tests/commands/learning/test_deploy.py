@@ -17,6 +17,7 @@ def base(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_on_a_simulation_and_behind_the_line(base, here):
     """The same score; what was written is what was done."""
     scores = []
@@ -48,6 +49,7 @@ def test_what_of_the_task_is_otherwise_is_told(base, here):
     assert second.startswith("score ")
 
 
+@pytest.mark.slow
 def test_on_a_log(base, here):
     write_log(base / "press.npz", random_readings(1.0 + 0.02 * np.arange(8)))
     arguments = ("--policy", "student.pt", "--source", "press.npz", "--lockstep", "--goal", "1", "--calibration", "hand.yaml")
@@ -57,6 +59,7 @@ def test_on_a_log(base, here):
     assert "press.npz was not moved: actions were computed, and went nowhere\n" in out
 
 
+@pytest.mark.slow
 def test_mistakes(base, here):
     card = json.loads((base / "student.json").read_text())
     assert card["spec"]["touch"] == "agg_force"

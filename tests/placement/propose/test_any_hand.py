@@ -34,6 +34,7 @@ def touch(odd):
     return compiled(folder, {group: gates.get(group, "geometric") for group in groups})
 
 
+@pytest.mark.slow
 def test_from_the_file_to_readings(odd, touch):
     """A ball pressed into the middle of each tip is felt as deep as its pose says; nothing else reads anything."""
     hand, _ = odd
@@ -102,6 +103,7 @@ def test_what_a_hand_is_taken_for(odd, touch):
         assert [part.facing for part in region] == ([] if facing is None else [facing]), name
 
 
+@pytest.mark.slow
 def test_the_same_command_writes_the_same_file(odd):
     _, folder = odd
     assert command(folder, "layout", "new", "hand.xml", "--density", "2e4/m2", "-o", "new/again.yaml") == 0
@@ -110,6 +112,7 @@ def test_the_same_command_writes_the_same_file(odd):
     assert str(folder) not in text
 
 
+@pytest.mark.slow
 def test_counts_follow_the_density(odd):
     """Each count is the link's area times the density, rounded, and at least 1: four times the density, four times the count."""
     _, folder = odd

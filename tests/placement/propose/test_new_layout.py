@@ -10,6 +10,7 @@ from tgdsl.schema.load import load_layout
 from tgdsl.schema.placement import LayoutSpec
 
 
+@pytest.mark.slow
 def test_the_file_says_what_was_left_out_and_what_is_a_guess(tmp_path, here):
     (tmp_path / "hand.xml").write_text(VISUAL)
     code, said, _ = here(tmp_path, "layout", "new", "hand.xml")
@@ -96,6 +97,7 @@ def test_a_density_that_is_none(tmp_path, here, density, message):
     assert not (tmp_path / "layout.yaml").exists()
 
 
+@pytest.mark.slow
 def test_densities_in_other_units_are_the_same(tmp_path, here):
     (tmp_path / "hand.xml").write_text(FOUR_BAR)
     texts = []
@@ -114,6 +116,7 @@ def test_a_robot_without_surface_and_one_that_is_not_there(tmp_path, here):
         assert code == 2 and error.startswith('tgdsl: there is no file or robot "xhand2"; did you mean "xhand1')
 
 
+@pytest.mark.slow
 def test_names_that_yaml_and_selections_could_misread(tmp_path, here):
     names = ["no", "1e3", "a: b", "#c", "[d]", "*", "e?", 'f"g\\h', "i\u2028j", "😀", "- k", "hand", "{l}", "&m", "!n", "~"]
     parts = "".join(
@@ -135,6 +138,7 @@ def test_a_shared_name_is_told(tmp_path, here):
     assert line in (tmp_path / "layout.yaml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "stem"), [("xhand1", "right_hand"), ("xhand1_left", "left_hand")])
 def test_the_xhand1_is_taken_for_what_its_own_layout_says(robot, stem):
     proposal = propose(open_robot(robot), 1e4)

@@ -85,6 +85,7 @@ def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, 
     assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
 
 
+@pytest.mark.slow
 def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
     inner, outer = ball(0.008), ball(0.01)
     inner.faces = inner.faces[:, ::-1]

@@ -1,5 +1,6 @@
 """The Triton kernel of the deepest geom, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
+import pytest
 import torch
 from kernels import interpreted, needs_triton, use_kernels
 from searches import CASES, SHAPES, made, paired
@@ -123,6 +124,7 @@ def compare() -> None:
     check_ties()
 
 
+@pytest.mark.slow
 @needs_triton
 def test_the_kernel_is_the_torch_code():
     interpreted(__file__)

@@ -51,11 +51,13 @@ def compiled(folder, mesh, probes, *, kind="contact_depth", dtype=torch.float64,
     return touch, SceneState(body_pos=rest, body_quat=quat, body_linvel=rest, body_angvel=rest)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", geometry.WAYS)
 def test_a_4_cm_cube_at_every_clearance_of_a_10_mm_probe(way):
     assert_holds(geometry.cube_of_any_making(way))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 @pytest.mark.parametrize("scale", [1.0, 0.001])
 def test_distance_to_a_ball_inside_and_out(query, scale):
@@ -93,6 +95,7 @@ def test_a_named_geom_is_felt_as_it_is(tmp_path):
         assert touch(scene)["s"].item() == pytest.approx(depth, abs=1e-6), surface
 
 
+@pytest.mark.slow
 def test_an_open_mesh_has_a_side_and_a_warning(tmp_path):
     cube = trimesh.creation.box((0.04, 0.04, 0.04))
     cube.update_faces(np.arange(len(cube.faces)) != 3)

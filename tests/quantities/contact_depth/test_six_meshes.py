@@ -128,6 +128,7 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.filterwarnings("ignore:object item. .* is not closed:UserWarning")
 def test_a_grid_holds_its_tolerance_at_points_it_never_saw(tmp_path, name):
@@ -141,6 +142,7 @@ def test_a_grid_holds_its_tolerance_at_points_it_never_saw(tmp_path, name):
     assert not is_edge.any() or np.percentile(error[is_edge], 99) <= EDGE_FACTOR * TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_raycast_is_brute_force(tmp_path, name):
     make, scale, _ = MESHES[name]

@@ -86,6 +86,7 @@ def test_a_sphere_holds_the_tolerance():
     assert baked.errors.edge_count == 0 and baked.errors.edge_max == 0
 
 
+@pytest.mark.slow
 def test_a_rounded_cube_holds_the_tolerance():
     surface = surface_of(rounded_cube())
     baked = bake(surface, MARGIN, TOLERANCE)
@@ -179,6 +180,7 @@ def test_far_points_read_far():
     assert (ask(baked, pos)[0] >= np.where(true > MARGIN, MARGIN, true - TOLERANCE)).all()
 
 
+@pytest.mark.slow
 def test_a_finer_tolerance_takes_more_bytes_and_has_smaller_errors():
     surface = surface_of(rounded_cube())
     coarse, fine = bake(surface, MARGIN, 4e-4), bake(surface, MARGIN, 8e-5)
@@ -234,6 +236,7 @@ def test_where_the_cache_is(monkeypatch):
     assert where.folder() == Path("/home/someone/.cache/tgdsl")
 
 
+@pytest.mark.slow
 def test_the_same_every_time(monkeypatch, tmp_path):
     found = []
     for name in "ab":

@@ -55,6 +55,7 @@ def test_areas(geom, area):
     assert surface_area([geom]) == pytest.approx(area, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_sphere_inside_and_outside():
     pos = places()
     true = sphere_moments(pos)
@@ -62,10 +63,12 @@ def test_a_sphere_inside_and_outside():
     assert_holds(proximity.solid_moments("ball"))
 
 
+@pytest.mark.slow
 def test_a_box_against_a_sum_of_its_faces():
     assert_holds(proximity.solid_moments("box"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("geoms", [[CAN], [felt("box", [0.02, 0.015, 0.01]), felt("sphere", [0.012], (0.015, 0, 0.01))]])
 def test_fields_hold_the_tolerance_against_a_fine_surface(geoms):
     baked, pos = bake_field(geoms, R, TOLERANCE), places()
@@ -73,6 +76,7 @@ def test_fields_hold_the_tolerance_against_a_fine_surface(geoms):
     assert max(found) < LIMIT and baked.errors.mass_rms < TOLERANCE and baked.errors.first_rms < TOLERANCE
 
 
+@pytest.mark.slow
 def test_the_mesh_of_a_cube_is_the_cube():
     mesh, pos = felt("", [0], surface=surface_of(box((0.04, 0.04, 0.04)))), places(150)
     np.testing.assert_allclose(sums([mesh], pos), sums([CUBE], pos), atol=1e-3 * sums([CUBE], pos)[:, 0].max())
@@ -81,6 +85,7 @@ def test_the_mesh_of_a_cube_is_the_cube():
     assert max(rms(asked(bake_field([mesh], R, TOLERANCE), pos), true)) < LIMIT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts",
     [
@@ -104,6 +109,7 @@ def test_a_ball_in_a_face_leaves_its_disc_out():
     assert area == pytest.approx(6 * 0.04**2 + np.pi * 0.01**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_with_respect_to_the_radius():
     """The sums' slopes are the differences of the sums at R ± δ, and the field's are within a few percent of them."""
     pos, step = places(200), 2e-4
@@ -128,6 +134,7 @@ def test_lists_hold_every_point_within_reach():
     assert cloud.weight * 3000 == pytest.approx(6 * 0.04**2, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_papers_points_err_more_than_the_field():
     """Sampling noise: 20 times as many points err √20 times less, and both more than a field of half a percent."""
     pos = places(200)
@@ -139,6 +146,7 @@ def test_the_papers_points_err_more_than_the_field():
     assert field[0] < 0.2 * few[0] and field[1] < 0.4 * few[1]
 
 
+@pytest.mark.slow
 def test_the_cache_gives_the_same_without_the_work(monkeypatch, tmp_path):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     calls, real = [], moments.outer_surface
@@ -184,6 +192,7 @@ def test_a_field_that_no_budget_holds_is_refused_before_anything_is_summed(monke
         bake_field([felt("box", [1.0, 1.0, 1.0])], 0.004)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_computed():
     with pytest.raises(BakeError, match=r"at a radius of 10 mm needs about .* MiB \(\d+ bytes\), and the budget is 0.0954 MiB"):
         bake_field([BALL], R, TOLERANCE, budget=100_000)
@@ -231,6 +240,7 @@ def gradients(baked, pos):
     return torch.stack([found.mass, *found.first], dim=1).detach().numpy(), slope
 
 
+@pytest.mark.slow
 def test_gradients_hold_their_own_tolerance():
     """Around a ball, by the closed form: 99.9 % within it and the rest near, tangential parts too; a trilinear field's do not."""
     pos, asked_for = places(1500), 0.04
@@ -262,6 +272,7 @@ def test_gradients_of_sums_are_differences_of_closed_forms():
             assert np.linalg.norm(found[:, part, axis] - expected[:, part], axis=1).max() < 0.01 * scale
 
 
+@pytest.mark.slow
 def test_a_gradient_tolerance_over_the_budget_is_refused_by_name():
     with pytest.raises(BakeError, match=r"a tolerance of 0.05, and of 0.01 of its gradients, at a radius of 10 mm needs about"):
         bake_field([BALL], R, 0.05, 0.01, budget=100_000)

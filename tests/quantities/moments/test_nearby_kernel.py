@@ -1,5 +1,6 @@
 """The Triton kernel of moments from fields, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
+import pytest
 import torch
 from kernels import interpreted, needs_triton, use_kernels
 from moment_fields import CASES, made
@@ -44,6 +45,7 @@ def compare() -> None:
         assert (moments(pairs, pos, source, True) == 0).all()
 
 
+@pytest.mark.slow
 @needs_triton
 def test_the_kernel_is_the_torch_code():
     interpreted(__file__)

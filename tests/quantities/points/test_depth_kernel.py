@@ -1,5 +1,6 @@
 """The Triton kernel that has points meet links, run on the CPU by Triton's interpreter, against the torch code in float64."""
 
+import pytest
 import torch
 from kernels import interpreted, needs_triton, use_kernels
 from meetings import CASES, made, nums_of
@@ -76,6 +77,7 @@ def compare() -> None:
     check_strange_poses()
 
 
+@pytest.mark.slow
 @needs_triton
 def test_the_kernel_is_the_torch_code():
     interpreted(__file__)

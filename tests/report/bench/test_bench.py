@@ -37,6 +37,7 @@ def report(work):
     return bench(work)
 
 
+@pytest.mark.slow
 def test_every_subject_has_three_points_and_one_is_taken_now(report):
     assert [subject.name for subject in report.subjects] == ["depth", "skin", "physics"]
     for subject in report.subjects:
@@ -44,6 +45,7 @@ def test_every_subject_has_three_points_and_one_is_taken_now(report):
         assert any(point.is_on_front for point in subject.points)
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_readings_themselves(report, folder):
     """Float32 against float64, and bfloat16, from the recorded states with nothing but compiled modules."""
     recording = load_recording(folder / "states.npz")
@@ -66,10 +68,12 @@ def test_errors_are_those_of_the_readings_themselves(report, folder):
     assert 1e-9 < depth.own.chosen.largest.value < 1e-5 < rounded.chosen.largest.value < 2**-8
 
 
+@pytest.mark.slow
 def test_the_definition_agrees_with_what_errors_are_measured_against(report):
     assert float(report.subjects[0].check.split(" by ")[1].split()[0]) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_truncated_operator_is_off_by_about_its_tolerance(report):
     """Relative errors of the matrix bound those of what it makes, up to the loads' conditioning."""
     errors = {point.label: point.chosen.rms.value for point in report.subjects[1].points if point.precision == "float32"}
@@ -78,10 +82,12 @@ def test_a_truncated_operator_is_off_by_about_its_tolerance(report):
     assert report.subjects[1].reference.startswith("dense")
 
 
+@pytest.mark.slow
 def test_times_are_of_all_numbers_of_environments(report):
     assert all(set(point.times) == {3, 5} for subject in report.subjects[:2] for point in subject.points)
 
 
+@pytest.mark.slow
 def test_counted_bytes_are_those_of_the_tensors(report):
     """16 taxels of a number each: 64 bytes in float32; a sensor without imperfections and shear remembers nothing."""
     own, exact, short = report.subjects[0].points
@@ -89,6 +95,7 @@ def test_counted_bytes_are_those_of_the_tensors(report):
     assert own.cost.state == report.subjects[1].own.cost.state == 0
 
 
+@pytest.mark.slow
 def test_two_runs_agree_on_errors_exactly(work, report):
     again = bench(Bench(work.document, states=work.kept, sensors=("skin",), options=FEW))
     for one, two in zip(report.subjects[1].points, again.subjects[0].points, strict=True):
@@ -110,6 +117,7 @@ class Links(HTMLParser):
         self.links += [decl] if "http" in decl else []
 
 
+@pytest.mark.slow
 def test_the_page_opens_offline(report, folder):
     files = {file.suffix: file for file in write_files(report, folder / "out")}
     text = files[".html"].read_text()
@@ -127,6 +135,7 @@ def test_the_page_opens_offline(report, folder):
     assert float(rows[0]["rms"]) == told["rows"][0]["rms"] == report.subjects[0].points[0].chosen.rms.value
 
 
+@pytest.mark.slow
 def test_states_that_are_saved_are_those_that_are_loaded(folder, work, report, tmp_path):
     touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
     recording = record(touch, 3, steps=6)
@@ -138,6 +147,7 @@ def test_states_that_are_saved_are_those_that_are_loaded(folder, work, report, t
         assert one.dt == two.dt
 
 
+@pytest.mark.slow
 def test_narrowed_states_read_the_same(work):
     """A module of one sensor reads of states of all what the module of all reads."""
     everything = tgdsl.compile(work.document, overrides={"observations": "{}"}, dtype="float64")
@@ -157,6 +167,7 @@ def test_controls_differ_between_environments_and_stay_within_their_range():
     np.testing.assert_array_equal(found, varied(controls, ranges, 6, seed=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -173,6 +184,7 @@ def test_what_cannot_be_measured_is_refused(work, wrong, message):
     assert str(caught.value) == message
 
 
+@pytest.mark.slow
 def test_states_of_another_document_are_refused(work, report, tmp_path):
     arrays = dict(np.load(work.kept))
     arrays["names:body"] = np.array(["pad", "ball"])
@@ -192,6 +204,7 @@ def test_files_that_are_no_states_are_refused(tmp_path, content):
         load_recording(path)
 
 
+@pytest.mark.slow
 def test_a_field_that_is_missing_is_told(work, report):
     touch = tgdsl.compile(work.document, overrides={"observations": "{}"})
     recording = load_recording(work.kept)

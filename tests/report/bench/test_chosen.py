@@ -23,6 +23,7 @@ def report(tmp_path_factory):
         yield bench(work)
 
 
+@pytest.mark.slow
 def test_what_accuracy_chose_is_what_the_compiler_takes_now(report):
     (depth,) = report.subjects
     assert depth.own.label == "grid, 1 mm" and depth.reference == "raycast, float64"
@@ -31,6 +32,7 @@ def test_what_accuracy_chose_is_what_the_compiler_takes_now(report):
     assert labels == ["grid, 1 mm", "grid, 0.2 mm", "grid, 0.05 mm", "grid, 0.01 mm", "raycast"]
 
 
+@pytest.mark.slow
 def test_files_say_why(report, tmp_path):
     files = {file.suffix: file.read_text() for file in write_files(report, tmp_path)}
     assert "accuracy 10 %: grid, 1 mm<br>" in files[".html"]

@@ -17,6 +17,7 @@ def found():
     return every.run()
 
 
+@pytest.mark.slow
 def test_all_comparisons_hold(found):
     comparisons = [own for own, left_out in found.values() for own in own]
     assert len(comparisons) == sum(map(len, every.FIELDS.values()))
@@ -25,11 +26,13 @@ def test_all_comparisons_hold(found):
     assert len({comparison.name for comparison in comparisons}) == len(comparisons)
 
 
+@pytest.mark.slow
 def test_each_kind_is_compared_with_something(found):
     kinds = {kind for comparisons, _ in found.values() for own in comparisons for kind in own.kinds}
     assert kinds == {"noise", "geometry", *(kind.name for kind in KINDS)}
 
 
+@pytest.mark.slow
 def test_each_finding_for_the_oracles_has_its_line(found):
     numbers = {number for comparisons, _ in found.values() for own in comparisons for number in own.defects}
     assert {defect.number for defect in DEFECTS if defect.answered_in == "oracles"} <= numbers

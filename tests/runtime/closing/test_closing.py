@@ -87,6 +87,7 @@ def forces_on(sim: BatchSimulation, body: str, env: int = 0) -> dict[str, float]
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HANDS)
 def test_at_least_two_links_are_pressed(tmp_path, name):
     # A ball that the hand can hold between fingers and palm: of 12 mm the tendon hand presses it 3 mm into its palm.
@@ -107,6 +108,7 @@ def _contacts(sim: BatchSimulation):
     return list(data.contact)
 
 
+@pytest.mark.slow
 def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
     """By virtual work a servo that both jaws follow gives each half its force; the arm's motor, at zero, bears nothing."""
     touch = module(tmp_path, "gripper.xml", GRIPPER)
@@ -123,22 +125,26 @@ def test_a_gripper_presses_with_the_object_s_weight_and_its_arm_stays(tmp_path):
     assert closing.resting == (0, 1) and not sim.ctrl[0, :2].any()
 
 
+@pytest.mark.slow
 def test_forces_are_bounded_on_a_heavy_object(tmp_path):
     text = scene("<body name='ball' pos='1 0 0'><freejoint/><geom size='.012' mass='5'/></body>")
     _, sim, _ = closed(module(tmp_path, "gripper.xml", GRIPPER, {"ball": {"body": "ball"}}, text))
     assert 0 < max(forces_on(sim, "ball").values()) < MOST
 
 
+@pytest.mark.slow
 def test_the_same_scene_closes_alike(tmp_path):
     first, second = (closed(module(tmp_path, "gripper.xml", GRIPPER))[1].qpos for _ in range(2))
     assert torch.equal(first, second)
 
 
+@pytest.mark.slow
 def test_a_floating_hand_stays_where_it_is(tmp_path):
     _, sim, _ = closed(module(tmp_path, "tendon.xml", TENDON))
     np.testing.assert_allclose(sim.qpos[0, :3], [0, 0, 0.3], atol=HELD_ATOL)
 
 
+@pytest.mark.slow
 def test_a_urdf_s_second_joints_follow_the_first(tmp_path):
     closing, sim, _ = closed(module(tmp_path, "three fingers.urdf", URDF))
     assert [servo.joint for servo in closing.servos] == ["a_1", "b_1", "thumb_1"] and closing.num_joints == 3
@@ -154,6 +160,7 @@ def scene(bodies: str, rest: str = "") -> str:
     return SCENE.format(bodies=bodies, rest=rest)
 
 
+@pytest.mark.slow
 def test_what_is_between_the_fingers_stays_there(tmp_path):
     text = scene(
         "<body name='egg' pos='.002 .003 .435'><freejoint/><geom type='ellipsoid' size='.01 .012 .014' mass='.02'/></body>"
@@ -165,6 +172,7 @@ def test_what_is_between_the_fingers_stays_there(tmp_path):
     assert (load[0] > 0).sum() == 2
 
 
+@pytest.mark.slow
 def test_the_first_object_that_fits_is_taken(tmp_path):
     bodies = "<body name='table' pos='0 0 -1'><geom type='box' size='.3 .3 .01'/></body>"
     bodies += "<body name='crate' pos='1 0 .3'><freejoint/><geom type='box' size='.3 .3 .3' mass='5'/></body>"
@@ -175,6 +183,7 @@ def test_the_first_object_that_fits_is_taken(tmp_path):
     assert isinstance(closing, Closing) and closing.target == "pen"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("bodies", "name", "why"),
     [
@@ -194,12 +203,14 @@ def test_why_it_does_not_close_on_an_object(tmp_path, bodies, name, why):
     assert closing_of(module(tmp_path, "gripper.xml", GRIPPER, {name: {"body": name}}, scene(bodies))) == why
 
 
+@pytest.mark.slow
 def test_a_fixed_object_within_reach_is_pressed(tmp_path):
     text = scene("<body name='post' pos='0 0 .44'><geom type='cylinder' size='.01 .02'/></body>")
     closing, _, load = closed(module(tmp_path, "gripper.xml", GRIPPER, {"post": {"body": "post"}}, text))
     assert closing.place is None and closing.body is None and (load[0] > 0).sum() == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("joint", "why"),
     [
@@ -235,6 +246,7 @@ def test_limits_that_look_like_radians_read_as_degrees_are_warned_of(tmp_path):
         closing_of(module(tmp_path, "hand.xml", text, ball))
 
 
+@pytest.mark.slow
 def test_objects_that_differ_between_environments(tmp_path):
     variants = [{"type": "sphere", "size": [0.012]}, {"type": "box", "size": [0.01, 0.011, 0.012]}]
     touch = module(tmp_path, "gripper.xml", GRIPPER, {"thing": {"variants": variants}})
@@ -243,6 +255,7 @@ def test_objects_that_differ_between_environments(tmp_path):
     assert [set(forces_on(sim, "thing", env)) for env in range(2)] == [{"left", "right"}] * 2
 
 
+@pytest.mark.slow
 def test_others_keep_their_actuators_and_groups_that_rest_stay_at_rest(tmp_path):
     bodies = (
         "<body name='fan' pos='1 0 0'><joint name='spin' axis='0 0 1' damping='.01'/><geom type='box' size='.1 .1 .01'/></body>"
@@ -266,6 +279,7 @@ def fan(groups) -> str:
     return scene(body, f"<actuator>{motors}</actuator>")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("disabled", ["30", "7"])
 def test_one_group_that_is_free_or_disabled_is_enough(tmp_path, disabled):
     """The hand's actuators rest in it, and the servos act in one that MuJoCo cannot disable."""
@@ -294,6 +308,7 @@ CHAINED = world(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [(2, 3), (3, 2)])
 def test_a_joint_that_follows_a_follower_closes_too(tmp_path, order):
     equalities = "".join(
@@ -313,6 +328,7 @@ def test_a_joint_that_follows_a_follower_closes_too(tmp_path, order):
         assert two == pytest.approx(0.5 * one) and three == pytest.approx(0.1 + two)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["xhand1", "sharpa"])
 def test_hands_with_many_fingers(robot):
     document = {

@@ -34,6 +34,7 @@ def assert_same(sim, env, other, env_there, fields) -> None:
             assert torch.equal(getattr(state, name)[env], getattr(expected, name)[env_there]), name
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_an_environment_that_diverges_is_started_anew_and_the_others_go_on(tmp_path, simulator, substeps):

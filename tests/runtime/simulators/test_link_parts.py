@@ -33,6 +33,7 @@ from tgdsl.runtime.batch.simulation import BatchSimulation
 # What a link is
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 @pytest.mark.parametrize("name", ['name="skin"', ""], ids=["named", "unnamed"])
 def test_what_rests_on_a_welded_child_presses_the_link(tmp_path, which, name):
@@ -98,6 +99,7 @@ def test_a_jointed_child_is_none_of_it(tmp_path):
     np.testing.assert_allclose(touch(sim.state())["s"][0, 0], force, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_a_child_with_taxels_is_a_link_of_its_own(tmp_path, which):
     """And what is welded to the child is the child's: each sensor reads its own link's force, wherever the other one is."""
@@ -174,6 +176,7 @@ def test_geoms_that_cannot_be_named_are_asked_for_names(tmp_path):
 # Parts of links and of objects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_parts_of_both_share_the_slots(tmp_path, which):
     """Three parts of the link, two of the object: all contacts are counted, each once, and their force is exact."""
@@ -237,6 +240,7 @@ def test_two_fingers_that_touch_each_other(tmp_path, which):
 # Seams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_a_gap_of_a_welded_geom_is_no_contact(tmp_path, which):
     """2 mm above a skin with a gap of 5 mm, MuJoCo reports contacts that carry nothing: gates stay shut."""
@@ -256,6 +260,7 @@ def test_a_stage_with_fixed_joints_is_welded_as_well(tmp_path):
     assert pressed(touch, "mujoco") == {name: pytest.approx(LOAD, rel=RESTING) for name in of_kinds([])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_variants_press_a_welded_child(tmp_path, which):
     """Of boxes of 0.1 and 0.2 kg each environment reads its own."""

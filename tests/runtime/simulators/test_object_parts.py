@@ -38,6 +38,7 @@ MUG = """
 GAPPED = '<body name="item" pos="0 0 {z}"><freejoint/><geom name="item" type="box" size=".02 .02 .02" mass=".3" {more}/></body>'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_geoms_of_one_body_press_once(tmp_path, which):
     """Two objects of one body: together its weight, the one it rests on its weight, the other nothing."""
@@ -54,6 +55,7 @@ def test_geoms_of_one_body_press_once(tmp_path, which):
         assert found[f"{kind}_3"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_surfaces_that_are_only_seen_share_the_bodys_force(tmp_path, which):
     """Whoever feels one of them, or both, is pressed by the weight: in two sensors as in one."""
@@ -66,6 +68,7 @@ def test_surfaces_that_are_only_seen_share_the_bodys_force(tmp_path, which):
         assert load == pytest.approx(LOAD, rel=RESTING), name
 
 
+@pytest.mark.slow
 def test_two_objects_of_one_body_share_what_warp_finds_of_it_only_where_they_are_one(tmp_path):
     """A part, another one and the whole: a contact is in the rows of the part that it acts on and of the whole, in no other."""
     objects = {name: {"body": "item", "surface": name} for name in ("low", "high")} | {"whole": {"body": "item"}}
@@ -128,6 +131,7 @@ def test_a_geom_without_a_name_is_asked_for_one(tmp_path):
     compiled(tmp_path, body, objects, {"above": sensor}, extra=asset)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 @pytest.mark.parametrize("slots", [False, True], ids=["bit", "slots"])
 def test_a_gap_is_no_contact(tmp_path, which, slots):
@@ -197,6 +201,7 @@ def test_a_sensor_that_does_not_say_how_far_is_refused(tmp_path):
 # Bodies welded of bodies
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 @pytest.mark.parametrize("name", ['name="handle"', ""], ids=["named", "unnamed"])
 def test_what_is_welded_to_an_objects_body_is_part_of_it(tmp_path, which, name):
@@ -230,6 +235,7 @@ def test_a_stage_with_fixed_joints_is_welded_as_well(tmp_path):
     assert pressed(touch, "mujoco") == {name: pytest.approx(LOAD, rel=RESTING) for name in of_kinds([])}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_a_welded_body_that_is_an_object_is_that_object(tmp_path, which):
     objects = {"mug": {"body": "mug"}, "handle": {"body": "handle"}}
@@ -296,6 +302,7 @@ def test_a_link_that_is_welded_to_an_object_does_not_feel_itself(tmp_path):
         tgdsl.compile(document)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", MODELS)
 def test_variants_stand_for_welded_geoms_too(tmp_path, which):
     """Each variant of the mug rests on its own geom and has its own weight; the handle is gone, and the clip, an object, is not."""

@@ -26,6 +26,7 @@ def cube(folder, looks: str) -> tgdsl.TactileModule:
     return module(folder, text, links=("table",), target={"variants": VARIANTS})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulator", [BatchSimulation, warp], ids=["batch", "warp"])
 def test_what_is_transparent_lies_on_the_table_as_what_is_seen(tmp_path, simulator):
     ends = []

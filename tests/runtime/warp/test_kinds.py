@@ -57,6 +57,7 @@ def errors(found, expected) -> dict[str, float]:
     return result
 
 
+@pytest.mark.slow
 def test_every_kind_reads_the_same_from_both(plan):
     """The cube rocks on the table: both simulators, then both modules, are given the float32 state of the one."""
     touch, exact = TactileModule(plan), TactileModule(plan, dtype=torch.float64)
@@ -84,6 +85,7 @@ def test_every_kind_reads_the_same_from_both(plan):
         assert error <= tolerance, f"simulators: {name} differs by {error:.1e}"
 
 
+@pytest.mark.slow
 def test_two_hundred_steps_of_a_cube_at_rest(plan):
     """The taxels of `force_taxel` carry its weight, and every reading is the CPU's to 0.1 %."""
     readings = []

@@ -1,5 +1,6 @@
 """Sound from MuJoCo Warp and from MuJoCo: joints and places at each physics step of a control step."""
 
+import pytest
 import torch
 from warp_cases import SCENE, warp
 
@@ -9,6 +10,7 @@ from tgdsl.module.module import TactileModule
 from tgdsl.runtime.batch.simulation import BatchSimulation
 
 
+@pytest.mark.slow
 def test_motors_and_a_microphone_in_both_simulators(tmp_path):
     """Two arms in motion, heard on one of them and in the room, to a thousandth of the loudest after 30 control steps."""
     (tmp_path / "scene.xml").write_text(SCENE)
@@ -37,6 +39,7 @@ def test_motors_and_a_microphone_in_both_simulators(tmp_path):
         assert error < 1e-3, f"{name} differs by {error:.1e}"
 
 
+@pytest.mark.slow
 def test_a_table_rings_by_where_a_cube_meets_it_in_both_simulators(tmp_path, monkeypatch):
     """A cube falls 2 mm onto a table, beside its middle: gains at the contact, to a hundredth of the loudest.
 

@@ -160,6 +160,7 @@ def test_under_inference_mode(tmp_path):
 # rollouts and pictures
 
 
+@pytest.mark.slow
 def test_rollouts_tables_and_pictures(tmp_path):
     touch = module(tmp_path, PRESSED)
     sims = warp(touch, 2, keyframe="home"), BatchSimulation(touch, 2, keyframe="home")
@@ -214,6 +215,7 @@ def weighed(sim, touch) -> tuple[float, float]:
     return float(np.mean(forces)), float(np.mean(heights))
 
 
+@pytest.mark.slow
 def test_two_hundred_steps_of_a_resting_cube(tmp_path):
     """Newton: it presses with its weight; and it lies as deep as on the CPU."""
     touch = module(tmp_path, PRESSED, links=("table",), kind="link_contact")

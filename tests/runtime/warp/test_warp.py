@@ -52,6 +52,7 @@ class PretendedGpu(WarpStream):
 # the same readings as on the CPU
 
 
+@pytest.mark.slow
 def test_one_state_gives_the_readings_of_the_cpu(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim, cpu = warp(touch, 6, model=model, keyframe="home"), BatchSimulation(touch, 6, model=model, keyframe="home")
@@ -108,6 +109,7 @@ def test_sensors_are_evaluated_where_they_are_read(tmp_path, monkeypatch, sensor
     assert (sim.state().contact_found > 0).any()
 
 
+@pytest.mark.slow
 def test_a_resting_cube_weighs_what_it_weighs(tmp_path):
     touch, model = wanting_contacts(tmp_path)
     sim = warp(touch, 2, model=model, substeps=200)

@@ -25,6 +25,7 @@ def dropped(tmp_path):
     return build
 
 
+@pytest.mark.slow
 def test_amplitude_grows_with_impulse():
     """Six heights, a factor of 32: the slope of log amplitude over log impulse is 1, and the amplitude is the impulse."""
     found = impact()
@@ -34,6 +35,7 @@ def test_amplitude_grows_with_impulse():
     assert abs(slope - 1) < 0.05
 
 
+@pytest.mark.slow
 def test_a_collision_sounds_the_same_at_any_time_step(dropped):
     """Contacts of one stiffness that take some 4 to 14 steps: amplitudes within 10 %, impulses likewise."""
     found = []
@@ -43,6 +45,7 @@ def test_a_collision_sounds_the_same_at_any_time_step(dropped):
     assert np.ptp(found, axis=0).max() < 0.1 * np.max(found)
 
 
+@pytest.mark.slow
 def test_a_ball_at_rest_is_silent(dropped):
     """It is heard when it lands, and no more once it lies: neither as it goes on, nor in an episode that begins so."""
     sim, touch = dropped(heights=np.array([0.002]), stiffness="0.01 1")
@@ -55,6 +58,7 @@ def test_a_ball_at_rest_is_silent(dropped):
     assert resting < 1e-6 * landing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulator", [BatchSimulation, WarpSimulation])
 def test_blocks_of_all_substeps_come_together(dropped, simulator):
     """What is read of each physics step alone, one after the other, is what is read of all ten at once."""
@@ -76,6 +80,7 @@ def _stepped(sim, touch):
     return touch(sim.state())["s"].clone()
 
 
+@pytest.mark.slow
 def test_both_simulators_sound_alike(dropped):
     """The impulse of a drop is the momentum that it changes, whoever solves the contact: amplitudes within 3 %."""
     heights = np.array([0.004, 0.008])

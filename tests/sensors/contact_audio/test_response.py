@@ -25,6 +25,7 @@ def test_an_impulse_rings_as_damped_sines(dtype):
     assert_holds(oracles.ring_down(dtype))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_million_samples(dtype):
     """Two modes that ring for all of it, by blocks of 2500 samples through the module."""
@@ -41,6 +42,7 @@ def test_a_mode_is_as_loud_as_the_impulse_at_every_frequency_and_rate():
     np.testing.assert_allclose(found.paper, 1 / np.sin(theta), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_roundings_do_not_add_up():
     """20,000 blocks of a mode that hardly decays, in float32: one rounded factor would be off by 5e-4 by then."""
     frequency, decay, step, samples = 3333.3, 1e-3, 1e-3, 20
@@ -60,6 +62,7 @@ def test_roundings_do_not_add_up():
     assert abs(heard - np.exp(-decay * time) * np.sin(2 * math.pi * frequency * time)).max() < 3e-5
 
 
+@pytest.mark.slow
 def test_energy_never_grows_unless_struck(tmp_path):
     """Of float32 phasors too, down to where they are flushed to zero."""
     modes = [{"frequency": f, "decay": d} for f, d in ((50.0, 40.0), (499.9, 50.0), (500.0, 80.0), (3000.0, 400.0))]

@@ -104,10 +104,10 @@ def test_not_a_number_comes_out_of_its_own_environment():
     assert not found.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_threads", [1, 2])
-def test_one_graph_serves_all_numbers_of_active_points(monkeypatch, num_threads):
+def test_one_graph_serves_all_numbers_of_active_points(num_threads):
     """Compiled without a break, and not anew when other points are active."""
-    monkeypatch.setattr("jaxtyping.config.jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     torch.compiler.reset()
     compiled = torch.compile(summed, fullgraph=True, dynamic=True)
     load, markers = given("few", torch.float32)

@@ -77,6 +77,7 @@ def found() -> dict:
     return json.loads(interpreted(__file__))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_is_the_sum(found, name):
     assert max(found[name]) < TOLERANCE  # of strengths, and of how many there are

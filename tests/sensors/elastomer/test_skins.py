@@ -40,6 +40,7 @@ WIDE = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skin", ["soft_gel", "firm_rubber"])
 @pytest.mark.parametrize("poissons_ratio", [0.0, 0.3, 0.48])
 def test_a_layer_that_is_dragged_all_over_follows_the_drag(tmp_path, skin, poissons_ratio):

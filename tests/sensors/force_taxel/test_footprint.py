@@ -141,6 +141,7 @@ def test_a_small_correction_is_the_least_norm_one():
         np.testing.assert_allclose(share[0], linear, atol=10 * size**2)
 
 
+@pytest.mark.slow
 def test_four_steps_suffice_where_the_moment_is_in_reach():
     """Contacts anywhere in the middle of the pad: four steps leave little of force times footprint, and twelve leave less.
 
@@ -160,6 +161,7 @@ def test_four_steps_suffice_where_the_moment_is_in_reach():
     assert (twelve <= 1.01 * four + 1e-15).all()
 
 
+@pytest.mark.slow
 def test_more_steps_never_leave_more():
     """Also where the moment is out of reach, and with depths that span three decades: no step makes the residual grow for good."""
     rng = np.random.default_rng(8)
@@ -232,6 +234,7 @@ def test_taxels_that_face_a_contact_more_carry_more():
         np.testing.assert_allclose(share[0], expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
     """A ball rolls around a round finger of 8 mm whose front has taxels: to the back all is handed over, without a jump.
 

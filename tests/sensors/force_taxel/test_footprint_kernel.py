@@ -24,6 +24,7 @@ def found(tmp_path_factory):
     return torch.load(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", cases())
 def test_the_kernel_is_the_torch_code(found, name):
     case = cases()[name]

@@ -1,6 +1,5 @@
 """Noise in compiled modules."""
 
-import jaxtyping
 import pytest
 import torch
 from noisy_modules import EVERY_KNOB, FLOAT32_TOLERANCE, RANGES, read
@@ -9,9 +8,8 @@ from tgdsl.testing.reference import full_scale_error
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(build, monkeypatch):
+def test_compiled_equals_eager(build):
     """At two numbers of environments: the second takes over the state of another module."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     sensors = {
         "s": {"noise": EVERY_KNOB, "rate": 60, "history": 3, "readout": "both"},
         "r": {"noise": RANGES, "history": {"length": 3, "reduce": "mean"}},

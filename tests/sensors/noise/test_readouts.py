@@ -22,6 +22,7 @@ def example_of(kind: str, **changes) -> dict:
     return {**made, "resolution": "low", "sensors": {"s": {**own, **changes}}, "observations": {}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind.name for kind in KINDS if kind.knobs])
 @pytest.mark.filterwarnings("ignore:sensor .* the profile .noisy. has no knobs:UserWarning")
 def test_both_readouts(kind):

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -27,6 +26,7 @@ def test_a_million_samples(compare):
     assert_holds(compare())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [0.1, 1.0, 2.0, 10.0])
 def test_ages_are_uniform(parts):
     assert_holds(noise_oracles.ages(parts))
@@ -55,6 +55,7 @@ def test_white_noise_is_white():
     assert max(map(abs, found.values())) < 5, found
 
 
+@pytest.mark.slow
 def test_drift_is_a_random_walk():
     """Its steps are independent of one another, and of the white noise; a reset starts some anew."""
     sigma = 1e-3
@@ -158,6 +159,7 @@ def test_an_age_never_reaches_before_the_first_call():
         noise.reset()
 
 
+@pytest.mark.slow
 def test_ranges_are_uniform_over_environments():
     knobs = {
         "bias": [-1, 1], "white_noise": [0, 2], "drift": [3, 4], "quantization": [0.1, 0.2], "read_delay": [0, 0.1], "jitter": [0, 1],
@@ -202,9 +204,8 @@ def advanced(
 
 
 @pytest.mark.slow
-def test_a_million_steps_in_float32_stay_near_those_in_float64(monkeypatch):
+def test_a_million_steps_in_float32_stay_near_those_in_float64():
     """Drift, hysteresis and delay of an input, and at a dt, that vary; four calls in one graph, for speed."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     knobs = {
         "drift": 1e-3, "hysteresis": {"strength": 0.8, "time_constant": 0.05}, "read_delay": 9e-3, "jitter": 4e-3,
     }  # fmt: skip

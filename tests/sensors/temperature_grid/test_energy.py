@@ -2,7 +2,6 @@
 
 import itertools
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -124,8 +123,7 @@ def test_without_a_way_out_energy_stays(tmp_path):
 
 
 @pytest.mark.slow
-def test_energy_over_ten_thousand_steps(tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+def test_energy_over_ten_thousand_steps(tmp_path):
     module = module_of(tmp_path, tuple(ALL), torch.float32)
     states = states_of(module, 4, 7)
     module.compile()

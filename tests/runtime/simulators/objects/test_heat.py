@@ -1,6 +1,5 @@
 """Temperatures and materials of objects as fields of a state: whose they are, what they may hold, and both simulators."""
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -270,8 +269,7 @@ def test_variants_and_heat_in_one_call(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_compiled_graph_serves_all_materials(tmp_path, monkeypatch):
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
+def test_one_compiled_graph_serves_all_materials(tmp_path):
     touch = compiled(tmp_path)
     fused = TactileModule(touch.plan, (*KINDS, THERMOMETER), dtype=torch.float64).compile()
     torch.compiler.reset()

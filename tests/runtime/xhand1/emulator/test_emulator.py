@@ -140,6 +140,7 @@ def test_a_minute_at_the_highest_rate_loses_nothing(capsys):
         print(f"\n{found.text()}")
 
 
+@pytest.mark.slow
 def test_a_thread_that_ends_says_so_to_who_waits(monkeypatch):
     """A field of forces with a mistake: the port goes away, and whoever calls is told what happened, at once and again."""
 
