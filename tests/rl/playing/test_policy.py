@@ -5,6 +5,7 @@ import torch
 from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 
+from tgdsl.rl.playing.differences import is_close
 from tgdsl.rl.playing.policy import Policy, PolicyError, actor_groups, read_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
@@ -44,6 +45,34 @@ def test_it_is_taken_whatever_torchs_default_dtype_is(tmp_path, dtype):
     finally:
         torch.set_default_dtype(torch.float32)
     torch.testing.assert_close(action, model(obs).detach())
+
+
+def test_how_close_plain_values_are():
+    """All of their parts, numbers but for rounding."""
+    one = {"a": [1.0, {"b": 0.7 * 0.01}], "c": "x"}
+    assert is_close(one, {"c": "x", "a": (1.0, {"b": 7 * 0.001})})
+    for other in (
+        {"a": [1.0, {"b": 0.007}], "c": "y"},
+        {"a": [1.0, {"b": 0.0071}], "c": "x"},
+        {"a": [1.0], "c": "x"},
+        {"c": "x"},
+    ):
+        assert not is_close(one, other) and not is_close(other, one)
+
+
+def test_weights_that_are_stored_in_half_precision_are_float32(tmp_path):
+    """As rounded; what normalises is not rounded."""
+    model, obs = network(obs_normalization=True)
+    model.obs_normalizer._mean.fill_(0.3)
+    module = torch.jit.load(exported(model, tmp_path / "policy.pt"))
+    for weight in module.parameters():
+        weight.data = weight.data.half()
+    torch.jit.save(module, tmp_path / "policy.pt")
+    for weight in model.parameters():
+        weight.data = weight.data.half().float()
+    saved = read_policy(tmp_path / "policy.pt")
+    assert {weight.dtype for weight in saved.module("cpu").parameters()} == {torch.float32}
+    torch.testing.assert_close(Policy(saved, GROUPS, 3, 2)(dict(obs)), model(obs).detach())
 
 
 def test_a_recurrent_one_forgets_at_the_end_of_its_episode(tmp_path):

@@ -4,6 +4,8 @@ Such a file takes groups of observations side by side, (env, feature), and retur
 are, and in which order, rsl_rl does not write: they are those of the actor, in the order of the runner's `obs_groups`. What
 `tgdsl train` writes has a card in it that names them, and the joints and taxels that the policy was learned with.
 
+Weights may be stored in float16, which makes a file half as large: they are float32 in the module that is read.
+
 Shapes: `env` environments, `joint` joints that the policy moves, `feature` numbers of a group.
 """
 
@@ -259,10 +261,14 @@ def check_card(card: Mapping[str, Any], file: Path, joints: Sequence[str], taxel
 
 
 def _module(content: bytes, device: torch.device | str, extra_files: dict[str, Any] | None = None) -> torch.jit.ScriptModule:
-    """Return the module that a TorchScript file holds; `extra_files` are filled in."""
+    """Return the module that a TorchScript file holds, float16 weights as float32; `extra_files` are filled in."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript itself, which rsl_rl writes
-        return torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra_files).eval()
+        module = torch.jit.load(io.BytesIO(content), map_location=device, _extra_files=extra_files).eval()
+    for weight in module.parameters():
+        if weight.dtype == torch.float16:
+            weight.data = weight.data.float()
+    return module
 
 
 def _check_fields(card: Any, file: Path) -> None:
