@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
@@ -18,7 +19,10 @@ def task_schema() -> dict[str, Any]:
     definitions: dict[str, Any] = {}
     for model in (TaskSpec, *dict.fromkeys(specs.values())):
         schema = model.model_json_schema(ref_template="#/$defs/{model}")
-        definitions |= schema.pop("$defs", {})
+        own = schema.pop("$defs", {})
+        others = {name: f"{model.__name__}.{name}" for name, made in own.items() if definitions.get(name, made) != made}
+        schema, own = _renamed(schema, others), _renamed({others.get(name, name): made for name, made in own.items()}, others)
+        definitions |= own
         schema.pop("title", None)
         definitions[model.__name__] = schema
     own = definitions["TaskSpec"]
@@ -37,3 +41,15 @@ def task_schema() -> dict[str, Any]:
         **chain,
         "$defs": dict(sorted(definitions.items())),
     }
+
+
+def _renamed(schema: Any, others: Mapping[str, str]) -> Any:
+    """Return a schema whose references to some definitions are to those of another name."""
+    if isinstance(schema, dict):
+        return {name: _reference(part, others) if name == "$ref" else _renamed(part, others) for name, part in schema.items()}
+    return [_renamed(part, others) for part in schema] if isinstance(schema, list) else schema
+
+
+def _reference(place: str, others: Mapping[str, str]) -> str:
+    folder, _, name = place.rpartition("/")
+    return f"{folder}/{others.get(name, name)}"

@@ -286,6 +286,13 @@ class Task(ABC, Generic[S]):
         """Return privileged numbers that `distill.decoders` may name, which students learn to tell; by default none."""
         return {}
 
+    def step_progress(self) -> Float[Tensor, " env"] | None:
+        """Return what this control step has brought the object, such as an angle, less than 0 for the wrong way; None: nothing.
+
+        Of it `tgdsl evaluate` says which share was made while no finger touched the object.
+        """
+        return None
+
     @classmethod
     def asked_for(cls, spec: S, goal: tuple[float, ...]) -> S:
         """Return the document in which just this goal is asked for, of as many numbers as there are `goal_units`.

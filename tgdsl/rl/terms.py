@@ -5,12 +5,15 @@
     work              Σ_j |τ_j q̇_j|                                                         [W]
     contact_force     Σ_l max(0, |f_l| − f_max) / f_max                                     [1]
     near              mean_p exp(−max(0, d_p) / λ)                                          [1]
+    effort            Σ_j (τ_j/τ_max,j)²                                                    [1]
+    object_speed      max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1)                       [1]
 
 with a the action, q, q̇ and τ positions, velocities and torques of the joints that the policy moves, m and h middle and half
 width of their ranges, s the share of these that is free, f_l the object's force on link l, d_p the distance from probe p to the
-object.
+object, τ_max the largest torques of the drives, v and ω the object's velocity and angular velocity.
 
 Source of the names: Chung et al., *Tactile Genesis*, appendix, "Reward terms", which prints no formulas: these are ours.
+`effort` and `object_speed` are ours altogether.
 
 Shapes: `env` environments, `joint` joints, `link` links, `probe` probes.
 """
@@ -52,3 +55,15 @@ def contact_force(now: Now, most: float) -> Float[Tensor, " env"]:
 def near(now: Now, width: float) -> Float[Tensor, " env"]:
     """Return how near the probes are to the object's surface, from 0 to 1, which is touch; `width` λ [m]."""
     return torch.exp(-now.distance.clamp(min=0.0) / width).mean(dim=1)
+
+
+def effort(now: Now, limit: Float[Tensor, " joint"]) -> Float[Tensor, " env"]:
+    """Return the squares of the torques as shares of the largest ones, summed; a drive without a limit makes none."""
+    return (now.torque / limit).square().sum(dim=1)
+
+
+def object_speed(now: Now, free_speed: float, free_spin: float) -> Float[Tensor, " env"]:
+    """Return by how much the object is faster than what costs nothing [m/s, rad/s], as shares of that, summed."""
+    own, free = (now.object.linvel, now.object.angvel), (free_speed, free_spin)
+    speed, spin = ((vector_norm(value, dim=1) / most - 1.0).clamp(min=0.0) for value, most in zip(own, free, strict=True))
+    return speed + spin

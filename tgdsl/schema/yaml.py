@@ -130,7 +130,6 @@ class _TooManyError(Exception):
 
     def __init__(self, line: int, column: int, path: Path):
         self.line, self.column, self.path = line, column, path
-        super().__init__(_TOO_MANY)
 
 
 class _BoundedComposer(Composer):

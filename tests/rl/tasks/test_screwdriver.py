@@ -13,13 +13,14 @@ from task_records import Recorder, assert_reference
 
 from tgdsl.errors import SimulationError
 from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.links import are_fingers
 from tgdsl.rl.tasks.screwdriver import Rewards, reference
 
 DOCUMENT = Path(__file__).parents[3] / "examples" / "tasks" / "screwdriver.yaml"
 ODD = {
     "episode": "0.6 s", "max_spin": 1.0, "near_width": "3 mm", "free_distance": "2 mm", "drop_tilt": 0.3, "engagement": "8 mm",
     "action.scale": 0.01, "randomise.push": {"x": ["-3 N", "3 N"], "y": ["-3 N", "3 N"], "interval": ["0.1 s", "0.2 s"]},
-    "rewards": {name: 1.5 * value for name, value in Rewards()},
+    "rewards": {name: 1.5 * value or -0.5 for name, value in Rewards()}, "max_force": "0.1 N", "hold": {"coasting_pay": 0.25},
 }  # fmt: skip
 """Other numbers than the document's, and enough going on that every term is seen."""
 FREE = slice(3, 10)
@@ -43,13 +44,15 @@ def rotation(quat):
     )
 
 
-def by_tip(upright, length):
-    """Return the reference, told where the tip is: so far below the body's origin, which was upright at a place."""
+def by_tip(env, upright, length):
+    """Return the reference, given where the tip is: so far below the body's origin, which was upright at a place."""
+    setup = env.task.setup
+    own = {"limit": setup.actuators.limit, "fingers": are_fingers(setup.model, setup.links)}
 
     def told(spec, record, dt):
         down = np.array([0, 0, -length])
         tip = record["pos"] + np.stack([rotation(quat) @ down for quat in record["quat"]])
-        return reference(spec, {**record, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
+        return reference(spec, {**record, **own, "tip": tip, "upright_pos": upright, "upright_tip": upright + down}, dt)
 
     return told
 
@@ -72,7 +75,7 @@ def test_rewards_ends_and_scores_equal_the_reference(tmp_path):
             env.sim.qvel[1:3, 8] = torch.tensor([-8.0, 3.0], dtype=torch.float64)  # spun by hand
         recorder.step(action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 18
-    found = assert_reference(recorder, by_tip(np.array([0, 0, 0.1]), LENGTH))
+    found = assert_reference(recorder, by_tip(env, np.array([0, 0, 0.1]), LENGTH))
     assert found == {*Rewards.model_fields, "is_over", "score"}
     env.close()
 
@@ -83,8 +86,8 @@ def test_the_hand_too():
     recorder = Recorder(env)
     for action in random_actions(env, 80):
         recorder.step(action)
-    found = assert_reference(recorder, by_tip(np.array([0.09, 0.08, 0.215]), 0.19))
-    assert {*Rewards.model_fields, "is_over", "score"} - {"joint_limit"} <= found
+    found = assert_reference(recorder, by_tip(env, np.array([0.09, 0.08, 0.215]), 0.19))
+    assert {*Rewards.model_fields, "is_over", "score"} - {"joint_limit", "contact_force", "effort"} <= found
     env.close()
 
 

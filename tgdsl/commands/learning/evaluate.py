@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +19,7 @@ Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play episodes without exploration, the same for all policies; print the mean of the score, and its 95 % interval."""
+    """Play episodes without exploration, the same for all policies; print the score with its 95 % interval, and the gait."""
 
     task: Task
     policy: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -35,6 +36,9 @@ class Evaluate:
     """What is random in the episodes follows from it; default: one that is the same for all policies."""
     out: Annotated[Path | None, OUT] = None
     """A JSON file to write."""
+    require: Annotated[str | None, tyro.conf.arg(metavar="BOUNDS")] = None
+    """What score, held and gait have to be, such as "coasting<0.1, penetration<2 mm, held>=95 %"; if they are not, the exit
+    code is 1."""
     set: Overrides = ()
 
     def run(self) -> None:
@@ -44,11 +48,13 @@ class Evaluate:
         from tgdsl.rl.playing.actions import ZeroActor
         from tgdsl.rl.playing.evaluation import SEED, evaluate
         from tgdsl.rl.playing.policy import policy_for, read_policy
+        from tgdsl.rl.playing.requirements import parse_requirements
 
         if self.episodes < 1 or self.envs < 1:
             raise TgdslError(f"--episodes {self.episodes} --envs {self.envs}: expected at least 1 of each")
         if self.groups and self.policy is None:
             raise TgdslError("--groups are those of a policy; give one with --policy")
+        required = [] if self.require is None else parse_requirements(self.require)
         if self.out is not None:
             check_writable(self.out)
         policy = None if self.policy is None else read_policy(self.policy)
@@ -70,5 +76,10 @@ class Evaluate:
         finally:
             env.close()
         print(found)
+        print(f"\n{found.gait or 'the gait is measured on a CPU alone: --device cpu'}")
         if self.out is not None:
             atomic_write(with_folder(self.out), (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
+        failures = [failure for one in required if (failure := one.failure(found)) is not None]
+        if failures:
+            print("\n".join(failures), file=sys.stderr)
+            sys.exit(1)

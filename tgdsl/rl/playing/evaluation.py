@@ -16,6 +16,7 @@ from tgdsl.console.progress import Progress, silent
 from tgdsl.errors import TgdslError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.playing.actor import Actor
+from tgdsl.rl.playing.gait import Gait, GaitMeter
 
 SEED = 1_000_003
 """What is random in the episodes follows from it, whatever a policy was learned with."""
@@ -41,6 +42,7 @@ class Evaluation:
         episode_return: Mean of the sum of rewards.
         seconds: Mean of the duration [s].
         faults: How many a fault ended.
+        gait: How the object was moved; None on a GPU, where it is not measured.
     """
 
     task: str
@@ -55,6 +57,7 @@ class Evaluation:
     episode_return: float
     seconds: float
     faults: int
+    gait: Gait | None = None
 
     def plain(self) -> dict[str, Any]:
         """Return plain values as JSON has them: None for what is not finite, such as the interval of one episode."""
@@ -68,6 +71,8 @@ class Evaluation:
 
 
 def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, tuple):
         return tuple(_finite(part) for part in value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -104,24 +109,29 @@ def evaluate_each(
     quota = quota.flatten()
     done, sums = torch.zeros_like(quota), torch.zeros((6, env.num_envs), dtype=torch.float64, device=env.device)
     obs, index = env.reset(seed), 0
+    meter = None if env.sim.qpos.is_cuda else GaitMeter(env, blocks)  # a captured step leaves `env.now` as it was captured
     actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
     while index % CHECKED_EVERY or (left := int((quota - done).sum())):
         if index % CHECKED_EVERY == 0:
             progress(f"evaluating: {blocks * episodes - left:,} of {blocks * episodes:,} episodes")
         step = env.step(actor(obs))
         info, obs, index = step.info, step.obs, index + 1
-        counts = info.ended & (done < quota)
+        is_asked = done < quota
+        if meter is not None:
+            meter.add(is_asked & ~info.ended)
+        counts = info.ended & is_asked
         score = info.score.double()
         told = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
         sums += torch.where(counts, torch.stack([value.double() for value in told]), 0.0)
         done += counts
         actor.begin(info.ended)
     each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
-    return [_evaluation(env, own, episodes, min(size, episodes), seed) for own in each]
+    gaits = meter.gaits() if meter is not None else [None] * blocks
+    return [_evaluation(env, own, episodes, min(size, episodes), seed, gait) for own, gait in zip(each, gaits, strict=True)]
 
 
-def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int) -> Evaluation:
-    """Return what episodes were, by sums over them."""
+def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int, gait: Gait | None) -> Evaluation:
+    """Return what episodes were, by sums over them, and how the object was moved in them."""
     total, squares, held, paid, steps, faults = sums
     mean = total / episodes
     share = held / episodes
@@ -138,6 +148,7 @@ def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed
         episode_return=paid / episodes,
         seconds=steps / episodes * env.control_step,
         faults=round(faults),
+        gait=gait,
     )
 
 

@@ -292,6 +292,10 @@ class InHandRepose(Task[InHandReposeSpec]):
             "priv_obj_props": groups.object_props(now),
         }
 
+    def step_progress(self) -> Float[Tensor, " env"]:
+        """Return by how much the object has come closer to its goal in this control step [rad]."""
+        return self.rate * self.setup.control_step
+
     def score(self) -> Float[Tensor, " env"]:
         """Return how many goals were reached."""
         return self.reached.to(self.setup.dtype)

@@ -13,8 +13,8 @@ and `priv_obj_props` as in `groups`.
 
 The reward is the sum of these terms times Δt; weights are the paper's.
 
-    success            w · (goal reached in this step)                           150 1/s
-    spin               w · min(Δψ/Δt, ω_max)                                     2 1/rad
+    success            w · s (goal reached in this step)                         150 1/s
+    spin               w · c min(Δψ/Δt, ω_max); w · Δψ/Δt where Δψ < 0           2 1/rad
     near               w · mean_p exp(−max(0, d_p)/λ)                            0.1 1/s
     tilt               w · θ                                                     −1 1/(rad s)
     object_distance    w · max(0, |p − p_0| − r)                                 −100 1/(m s)
@@ -23,12 +23,18 @@ The reward is the sum of these terms times Δt; weights are the paper's.
     action_rate        w · |a_t − a_{t−1}|²                                      −5e-4 1/s
     joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)                    −40 1/(rad s)
     work               w · Σ_j |τ_j q̇_j|                                         −5e-3 1/J
+    effort             w · Σ_j (τ_j/τ_max,j)²                                    0 1/s
+    object_speed       w · (max(0, |v|/v_free − 1) + max(0, |ω|/ω_free − 1))     0 1/s
+
+with c = 1 where the object is held, else `hold.coasting_pay`: see `holding`; and s the share of Σ max(0, Δψ) since the goal
+before that was paid, Σ c max(0, Δψ) over it. By default c = s = 1: whether an object is held or coasts makes no difference.
 
 An episode ends for good where the object is further than `drop_distance` from p_0. Score: quarter turns, k.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours. Turning back
-costs what turning forth has paid, however fast, as `spin` is bounded above alone; goals that were reached stay reached.
+formulas, Δt as a factor of all terms, goal, ε, θ_max, ω_max, λ, r and f_max are ours, and so are `effort`, `object_speed`, c
+and s. Turning back costs what turning forth has paid, however fast, as `spin` is bounded above alone, and no less for an object
+that coasts; goals that were reached stay reached.
 """
 
 from __future__ import annotations
@@ -48,6 +54,8 @@ from tgdsl.rl import groups, rotations, terms
 from tgdsl.rl.spec import PlacedRandomSpec, TaskSpec, Weight
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec
 from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks import holding
+from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.tasks.placing import placed
 
 QUARTER = 0.5 * math.pi
@@ -76,6 +84,10 @@ class Rewards(SpecModel):
     """Joints near the ends of their ranges [1/(rad s)]."""
     work: Weight = -5e-3
     """Power of the drives [1/J]."""
+    effort: Weight = 0.0
+    """Squares of the torques, as shares of the largest ones [1/s]."""
+    object_speed: Weight = 0.0
+    """Speed and spin of the object beyond `free_speed` and `free_spin`, as shares of these [1/s]."""
 
 
 class Distill(DistillSpec):
@@ -111,6 +123,12 @@ class InPalmRotateSpec(TaskSpec):
     """Further from where it started, the object is lost [m]."""
     max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
     """f_max: less force on a link costs nothing [N]."""
+    hold: HoldSpec = HoldSpec()
+    """What progress pays while the object coasts; by default as much as while it is held."""
+    free_speed: Annotated[float, Quantity("speed", gt=0.0)] = 0.2
+    """v_free: a slower object costs nothing [m/s]."""
+    free_spin: Annotated[float, Quantity("number", gt=0.0)] = 4.0
+    """ω_free: likewise of its angular velocity, about whatever axis [rad/s]."""
 
 
 def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: float) -> dict[str, np.ndarray]:
@@ -119,12 +137,14 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
     Args:
         spec: The task's document.
         record: One row per instant, the first that at the start: `pos` [m], `quat`, `joint_pos` [rad], `joint_vel` [rad/s],
-            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m]; and `low`, `high`, limits [rad].
+            `torque` [N·m], `action`, `link_force` (step, link, 3) [N], `distance` [m], `linvel` [m/s], `angvel` [rad/s]; and
+            `low`, `high`, limits [rad], `limit`, largest torques [N·m], `fingers`, which links are fingers.
         dt: Δt [s].
     """
     weights, way = spec.rewards, _way(spec)
     pos, quat, low, high = record["pos"], record["quat"], record["low"], record["high"]
-    angle, reached, rows = 0.0, 0, []
+    angle, reached, forth, paid, rows = 0.0, 0, 0.0, 0.0, []
+    limit, fingers = record["limit"], record["fingers"]
     for t in range(1, len(pos)):
         w, x, y, z = _quat_product(quat[t], quat[t - 1] * [1, -1, -1, -1])
         step = 2.0 * way * math.atan2(z if w >= 0 else -z, abs(w))
@@ -133,12 +153,17 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
         tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (x * x + y * y))))
         is_reached = (reached + 1) * QUARTER - angle < spec.goal_tolerance and tilt < spec.max_tilt
         reached += is_reached
+        pay = holding.reference(spec.hold, record["link_force"][t], fingers)
+        forth, paid = forth + max(0.0, step), paid + pay * max(0.0, step)
+        share = paid / forth if forth else 1.0
+        forth, paid = (0.0, 0.0) if is_reached else (forth, paid)
+        speed, spin = (np.linalg.norm(record[name][t]) for name in ("linvel", "angvel"))
         distance, force = np.linalg.norm(pos[t] - pos[0]), np.linalg.norm(record["link_force"][t], axis=1)
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         is_over = distance > spec.drop_distance
         row = {
-            "success": weights.success * is_reached,
-            "spin": weights.spin * min(step / dt, spec.max_spin),
+            "success": weights.success * is_reached * share,
+            "spin": weights.spin * min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
             "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
             "tilt": weights.tilt * tilt,
             "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
@@ -147,6 +172,9 @@ def reference(spec: InPalmRotateSpec, record: Mapping[str, np.ndarray], dt: floa
             "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
             "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(record["joint_pos"][t] - middle) - 0.95 * half, 0.0)),
             "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+            "effort": weights.effort * np.sum((record["torque"][t] / limit) ** 2),
+            "object_speed": weights.object_speed
+            * (max(0.0, speed / spec.free_speed - 1) + max(0.0, spin / spec.free_spin - 1)),
         }
         rows.append(row | {"is_over": is_over, "score": reached})
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -172,18 +200,22 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         """Begin with all objects where the keyframe has them."""
         super().__init__(spec, setup)
         self.axis = torch.tensor([0.0, 0.0, _way(spec)], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
-        limits = (setup.actuators.low, setup.actuators.high)
-        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.holding, own = Holding(spec.hold, setup), setup.actuators
+        self.low, self.high, self.limit = (
+            torch.from_numpy(end).to(setup.device, setup.dtype) for end in (own.low, own.high, own.limit)
+        )
         self.start_pos, self.start_quat = self.keep("start_pos", 3), self.keep("start_quat", 4)
         self.quat = self.keep("quat", 4)
         self.angle, self.rate, self.tilt = self.keep("angle"), self.keep("rate"), self.keep("tilt")
         self.reached, self.is_reached = self.keep("reached"), self.keep("is_reached", dtype=torch.bool)
+        self.pay, self.share = self.keep("pay"), self.keep("share")  # c of this step, and s of the goal that is under way
+        self.forth, self.paid = self.keep("forth"), self.keep("paid")  # Σ max(0, Δψ) and Σ c max(0, Δψ) since the goal before
 
     def reset(self, chosen: Bool[Tensor, " env"], episode: Int[Tensor, " env"]) -> Start:
         """Put objects upright on the palm, moved and turned at random."""
         qpos, pos, quat = placed(self.setup, self.spec.randomise, chosen, episode)
         self.begin(chosen, start_pos=pos, start_quat=quat, quat=quat, angle=0.0, rate=0.0, tilt=0.0, reached=0.0)
-        self.begin(chosen, is_reached=0.0)
+        self.begin(chosen, is_reached=0.0, pay=1.0, share=1.0, forth=0.0, paid=0.0)
         return Start({"qpos": qpos})
 
     def advance(self, now: Now) -> None:
@@ -197,6 +229,18 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         self.is_reached.copy_((self._goal() - self.angle < self.spec.goal_tolerance) & (self.tilt < self.spec.max_tilt))
         self.reached += self.is_reached
         self.quat.copy_(quat)
+        if self.spec.hold.coasting_pay < 1.0:
+            self._note_pay(now, step)
+
+    def _note_pay(self, now: Now, step: Float[Tensor, " env"]) -> None:
+        """Note what progress pays now, and which share of it was paid since the goal before."""
+        forth = step.clamp(min=0.0)
+        self.pay.copy_(self.holding.pay(now))
+        self.forth += forth
+        self.paid += self.pay * forth
+        self.share.copy_(torch.where(self.forth > 0, self.paid / self.forth, 1.0))
+        for total in (self.forth, self.paid):
+            total.masked_fill_(self.is_reached, 0.0)
 
     def is_over(self, now: Now) -> Bool[Tensor, " env"]:
         """Return where the object was dropped."""
@@ -207,8 +251,8 @@ class InPalmRotate(Task[InPalmRotateSpec]):
         spec, weights = self.spec, self.spec.rewards
         distance = vector_norm(now.object.pos - self.start_pos, dim=1)
         return {
-            "success": weights.success * self.is_reached,
-            "spin": weights.spin * self.rate.clamp(max=spec.max_spin),
+            "success": weights.success * self.is_reached * self.share,
+            "spin": weights.spin * self.rate.clamp(max=spec.max_spin) * torch.where(self.rate > 0, self.pay, 1.0),
             "near": weights.near * terms.near(now, spec.near_width),
             "tilt": weights.tilt * self.tilt,
             "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
@@ -217,7 +261,13 @@ class InPalmRotate(Task[InPalmRotateSpec]):
             "action_rate": weights.action_rate * terms.action_rate(now),
             "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
             "work": weights.work * terms.work(now),
+            "effort": weights.effort * terms.effort(now, self.limit),
+            "object_speed": weights.object_speed * terms.object_speed(now, spec.free_speed, spec.free_spin),
         }
+
+    def step_progress(self) -> Float[Tensor, " env"]:
+        """Return the angle that the object has turned in this control step [rad]."""
+        return self.rate * self.setup.control_step
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return the goal, and what is privileged of the object."""

@@ -14,7 +14,7 @@ and mass [kg] alone. There is no goal.
 The reward is the sum of these terms times Δt; weights are the paper's. On the right what each is worth beside `spin` at 2
 rad/s, which is 20 1/s.
 
-    spin               w · min(Δψ/Δt, ω_max)                     10 1/rad
+    spin               w · c min(Δψ/Δt, ω_max)                   10 1/rad           w · Δψ/Δt where Δψ < 0
     near               w · mean_p exp(−max(0, d_p)/λ)            1 1/s              1 1/s if all probes touch
     alignment          w · (1 − cos θ)                           −400 1/s           −1.5 at 5°, −6 at 10°, −24 at 20°
     object_distance    w · max(0, |p − p_0| − r)                 −300 1/(m s)       0 up to 6°, −4 at 10°, −14 at 20°
@@ -23,6 +23,10 @@ rad/s, which is 20 1/s.
     action_rate        w · |a_t − a_{t−1}|²                      −1e-2 1/s          −0.05 for random actions of eight joints
     joint_limit        w · Σ_j max(0, |q_j − m_j| − 0.95 h_j)    −40 1/(rad s)      −1.9 for a finger stretched out
     work               w · Σ_j |τ_j q̇_j|                         −1e-3 1/J          −0.002 at 2 W
+    contact_force      w · Σ_l max(0, |f_l| − f_max)/f_max       0 1/s
+    effort             w · Σ_j (τ_j/τ_max,j)²                    0 1/s
+
+with c = 1 where the object is held, else `hold.coasting_pay`, 1 by default: see `holding`.
 
 So a spin of 2 rad/s pays up to a tilt of 15°. An episode ends for good where θ > `drop_tilt` or the tip is out of the screw,
 |s − s_0| > `engagement`. Score: what was turned at a tilt of less than 20°, over the duration of a whole episode [rad/s]: after
@@ -33,8 +37,9 @@ Newton steps (`geometry.shapes`), which take minutes to compile on a GPU, and ag
 point of two convex shapes runs out of room.
 
 Source: Chung et al., *Tactile Genesis*, appendix, "Tasks and Hands", "Reward terms". The paper prints weights and names;
-formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r and the ends of episodes are ours. Turning back costs what
-turning forth has paid, however fast: `spin` is bounded above alone.
+formulas, Δt as a factor of all terms, the way to turn, ω_max, λ, r, c, the last two terms and the ends of episodes are ours.
+Turning back costs what turning forth has paid, however fast, and no less while the object coasts: `spin` is bounded above
+alone.
 """
 
 from __future__ import annotations
@@ -56,6 +61,8 @@ from tgdsl.rl.grasps.spec import GraspSpec
 from tgdsl.rl.spec import TaskSpec, Weight
 from tgdsl.rl.students.spec import DecoderSpec, DistillSpec, Loss
 from tgdsl.rl.task import Now, Setup, Start, Task
+from tgdsl.rl.tasks import holding
+from tgdsl.rl.tasks.holding import Holding, HoldSpec
 from tgdsl.rl.train.spec import Share, TrainSpec, Whole
 from tgdsl.runtime.simulators.watch import Watch
 
@@ -84,6 +91,10 @@ class Rewards(SpecModel):
     """Joints near the ends of their ranges [1/(rad s)]."""
     work: Weight = -1e-3
     """Power of the drives [1/J]."""
+    contact_force: Weight = 0.0
+    """Force on links beyond `max_force` [1/s]."""
+    effort: Weight = 0.0
+    """Squares of the torques, as shares of the largest ones [1/s]."""
 
 
 class Train(TrainSpec):
@@ -140,6 +151,10 @@ class ScrewdriverSpec(TaskSpec):
     """The scene's site at the tip."""
     max_spin: Annotated[float, Quantity("number", gt=0.0)] = 6.0
     """ω_max: what is faster pays no more [rad/s]."""
+    max_force: Annotated[float, Quantity("force", gt=0.0)] = 10.0
+    """f_max: less force on a link costs nothing [N]."""
+    hold: HoldSpec = HoldSpec()
+    """What progress pays while the object coasts; by default as much as while it is held."""
     near_width: PositiveLength = 0.02
     """λ, decay length of `near` [m]."""
     free_distance: PositiveLength = 0.02
@@ -156,8 +171,9 @@ def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float
     Args:
         spec: The task's document.
         record: One row per instant, the first that at the start: `pos` [m], `quat`, `tip` [m], `joint_pos` [rad], `joint_vel`
-            [rad/s], `torque` [N·m], `action`, `distance` [m]; `low`, `high`, limits [rad]; `upright_pos`, `upright_tip` [m],
-            where body and tip are in the keyframe.
+            [rad/s], `torque` [N·m], `action`, `distance` [m], `link_force` (step, link, 3) [N]; `low`, `high`, limits [rad];
+            `upright_pos`, `upright_tip` [m], where body and tip are in the keyframe; `limit`, largest torques [N·m], `fingers`,
+            which links are fingers.
         dt: Δt [s].
     """
     weights, low, high, quat = spec.rewards, record["low"], record["high"], record["quat"]
@@ -170,9 +186,10 @@ def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float
         distance = np.linalg.norm(record["pos"][t] - record["upright_pos"])
         away = np.linalg.norm(record["tip"][t] - record["upright_tip"])
         is_over = tilt > spec.drop_tilt or away > spec.engagement
-        joints = record["joint_pos"][t]
+        joints, force = record["joint_pos"][t], np.linalg.norm(record["link_force"][t], axis=1)
+        pay = holding.reference(spec.hold, record["link_force"][t], record["fingers"])
         row = {
-            "spin": weights.spin * min(step / dt, spec.max_spin),
+            "spin": weights.spin * min(step / dt, spec.max_spin) * (pay if step > 0 else 1.0),
             "near": weights.near * np.mean(np.exp(-np.maximum(record["distance"][t], 0.0) / spec.near_width)),
             "alignment": weights.alignment * (1.0 - math.cos(tilt)),
             "object_distance": weights.object_distance * max(0.0, distance - spec.free_distance),
@@ -181,6 +198,8 @@ def reference(spec: ScrewdriverSpec, record: Mapping[str, np.ndarray], dt: float
             "action_rate": weights.action_rate * np.sum((record["action"][t] - record["action"][t - 1]) ** 2),
             "joint_limit": weights.joint_limit * np.sum(np.maximum(abs(joints - middle) - 0.95 * half, 0.0)),
             "work": weights.work * np.sum(np.abs(record["torque"][t] * record["joint_vel"][t])),
+            "contact_force": weights.contact_force * sum(max(0.0, f - spec.max_force) / spec.max_force for f in force),
+            "effort": weights.effort * np.sum((record["torque"][t] / record["limit"]) ** 2),
         }
         rows.append(row | {"is_over": is_over, "score": turned / spec.episode})
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -211,8 +230,10 @@ class Screwdriver(Task[ScrewdriverSpec]):
             raise SimulationError("this task begins with grasps, and there are none")
         self.grasps = setup.grasps
         self.axis = torch.tensor([0.0, 0.0, 1.0], dtype=setup.dtype, device=setup.device).expand(setup.num_envs, 3)
-        limits = (setup.actuators.low, setup.actuators.high)
-        self.low, self.high = (torch.from_numpy(end).to(setup.device, setup.dtype) for end in limits)
+        self.holding, own = Holding(spec.hold, setup), setup.actuators
+        self.low, self.high, self.limit = (
+            torch.from_numpy(end).to(setup.device, setup.dtype) for end in (own.low, own.high, own.limit)
+        )
         self.joints = torch.from_numpy(setup.actuators.qpos).to(setup.device, torch.int64)
         self.upright_pos, self.upright_tip = (own.to(setup.device, setup.dtype) for own in _upright(setup, spec.tip))
         self.quat, self.start_joints = self.keep("quat", 4), self.keep("start_joints", len(setup.actuators.names))
@@ -250,7 +271,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
         spec, weights = self.spec, self.spec.rewards
         distance = (now.object.pos - self.upright_pos).norm(dim=1)
         return {
-            "spin": weights.spin * self.rate.clamp(max=spec.max_spin),
+            "spin": weights.spin * self.rate.clamp(max=spec.max_spin) * self._pay(now),
             "near": weights.near * terms.near(now, spec.near_width),
             "alignment": weights.alignment * 2.0 * (0.5 * self.tilt).sin().square(),
             "object_distance": weights.object_distance * (distance - spec.free_distance).clamp(min=0.0),
@@ -259,7 +280,13 @@ class Screwdriver(Task[ScrewdriverSpec]):
             "action_rate": weights.action_rate * terms.action_rate(now),
             "joint_limit": weights.joint_limit * terms.joint_limit(now, self.low, self.high),
             "work": weights.work * terms.work(now),
+            "contact_force": weights.contact_force * terms.contact_force(now, spec.max_force),
+            "effort": weights.effort * terms.effort(now, self.limit),
         }
+
+    def step_progress(self) -> Float[Tensor, " env"]:
+        """Return the angle that the screwdriver has turned in this control step [rad]."""
+        return self.rate * self.setup.control_step
 
     def observe(self, now: Now) -> dict[str, Float[Tensor, "env feature"]]:
         """Return what is privileged of the object."""
@@ -275,6 +302,12 @@ class Screwdriver(Task[ScrewdriverSpec]):
     def score(self) -> Float[Tensor, " env"]:
         """Return what was turned while upright, over the duration of a whole episode [rad/s]."""
         return self.turned / self.spec.episode
+
+    def _pay(self, now: Now) -> Float[Tensor, " env"]:
+        """Return what turning pays: c; turning back costs the same whether the object is held or not."""
+        if self.spec.hold.coasting_pay == 1.0:
+            return torch.ones_like(self.rate)
+        return torch.where(self.rate > 0, self.holding.pay(now), 1.0)
 
     def _tip_distance(self, now: Now) -> Float[Tensor, " env"]:
         """Return how far the tip is from where it was [m]."""

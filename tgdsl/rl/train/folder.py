@@ -29,6 +29,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from tgdsl.errors import FileError, TgdslError
@@ -320,4 +321,4 @@ def _columns(name: str, values: Any) -> list[str]:
 
 
 def _cells(value: Any) -> list[str]:
-    return [repr(part) for part in value.tolist()] if hasattr(value, "tolist") and getattr(value, "ndim", 0) else [str(value)]
+    return [repr(part) for part in value.tolist()] if isinstance(value, np.ndarray) else [str(value)]

@@ -1,0 +1,38 @@
+"""Which links of a hand are fingers.
+
+Shapes: `link` links of `Setup.links`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool
+
+from tgdsl.runtime.simulators.model_ids import body_id
+
+
+def are_fingers(model: mujoco.MjModel, links: Sequence[str]) -> Bool[np.ndarray, " link"]:
+    """Return which links are fingers: a hinge moves them, or a slide that does not move all links, as one of a whole hand does.
+
+    Args:
+        model: The scene.
+        links: Bodies.
+    """
+    joints = [_joints_above(model, body_id(model, link)) for link in links]
+    of_all = set.intersection(*joints) if joints else set()
+    slides = {joint for joint in of_all if int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    return np.array([bool(own - slides) for own in joints], dtype=bool)
+
+
+def _joints_above(model: mujoco.MjModel, body: int) -> set[int]:
+    """Return the hinges and slides that move a body."""
+    found: set[int] = set()
+    while body:
+        first = int(model.body_jntadr[body])
+        found |= set(range(first, first + int(model.body_jntnum[body])))
+        body = int(model.body_parentid[body])
+    kinds = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    return {joint for joint in found if int(model.jnt_type[joint]) in kinds}

@@ -1,0 +1,267 @@
+"""How a policy moves an object: whether it holds it or flicks it, and what hand and object bear.
+
+Of each control step one instant counts, that of the readings; the last one of an episode does not, as it begins the next one.
+With f_l the object's force on link l, Δψ what the step has brought (`Task.step_progress`), τ and q̇ torques and velocities of
+the joints that the policy moves, d_p the distance from probe p to the object, v and ω the object's velocity and angular
+velocity:
+
+    coasting         Σ max(0, Δψ) over instants at which no finger touches, as a share of Σ max(0, Δψ) over all
+    untouched        share of instants at which no finger touches: |f_l| ≤ 0.01 N for each finger's link l
+    saturation       share of instants at which |τ_j| ≥ (0.98 S_j − ν) τ_max,j: of that joint with the largest
+    any_saturation   share of instants at which that is so for any joint
+    penetration      99th percentile of max_p (−d_p), where it is more than 0 [m]
+    force            99th percentile of |f_l| over links and instants where it is more than 0.01 N [N]
+    speed, spin      99th percentiles of |v| [m/s] and |ω| [rad/s]; max_speed, max_spin: the largest
+    joint_speed      99th percentile of |q̇_j| over its rated speed: of that joint with the largest [1]
+
+with τ_max the largest torque, S the factor on it that was drawn, and ν the noise of torques: see `tgdsl.rl.actuation`.
+
+Percentiles are those of histograms whose bins are 1 % wide. What a task does not have is None: progress, probes, links, limits
+of torques or speeds. The rated speed is that at which a joint's damping takes all of its largest torque.
+
+Shapes: `env` environments, `link` links of `Setup.links`, `joint` joints that the policy moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from tgdsl.console.tables import text_table
+from tgdsl.rl.env import TouchEnv
+from tgdsl.rl.links import are_fingers
+from tgdsl.rl.task import Now
+
+TOUCH = 0.01
+"""Force above which a link touches the object [N]."""
+SATURATED = 0.98
+"""Share of the largest torque from which on a joint is at its torque limit."""
+LEAST, WIDTH, NUM_BINS = 1e-6, math.log(1.01), 2800
+"""Lower end of the first bin, width of the bins of the logarithm, and their number: up to 1.3e6."""
+PERCENTILE = 0.99
+
+
+@dataclass(frozen=True)
+class Gait:
+    """How a policy moves an object: see the top of this page.
+
+    Attributes:
+        coasting: Share of the progress that was made while no finger touched the object.
+        untouched: Share of time without a finger at the object.
+        saturation: Share of time at its largest torque, of the joint with the largest share.
+        any_saturation: Share of time in which any joint is.
+        penetration: Depth of the deepest probe in the object, 99th percentile [m].
+        force: Force on links, 99th percentile [N].
+        speed: Object's speed, 99th percentile [m/s].
+        spin: Object's angular speed, 99th percentile [rad/s].
+        max_speed: Largest speed of the object [m/s].
+        max_spin: Largest angular speed of the object [rad/s].
+        joint_speed: Joint speed as a share of the rated one, 99th percentile of the joint with the largest.
+        saturations: Share of time at its largest torque of each joint.
+        link_forces: 99th percentile of the force on each link that was touched [N].
+        joint_speeds: 99th percentile of each joint's speed [rad/s].
+        rated_speeds: Rated speeds of joints, where they are known [rad/s].
+    """
+
+    coasting: float | None
+    untouched: float | None
+    saturation: float | None
+    any_saturation: float | None
+    penetration: float | None
+    force: float | None
+    speed: float | None
+    spin: float | None
+    max_speed: float
+    max_spin: float
+    joint_speed: float | None
+    saturations: dict[str, float]
+    link_forces: dict[str, float]
+    joint_speeds: dict[str, float]
+    rated_speeds: dict[str, float]
+
+    def __str__(self) -> str:
+        rows = [
+            ("progress while no finger touches the object", _percent(self.coasting)),
+            ("time without a finger at the object", _percent(self.untouched)),
+            ("time at the torque limit, joint with the most", _percent(self.saturation)),
+            ("time with any joint at its torque limit", _percent(self.any_saturation)),
+            ("penetration, 99 % below", _number(self.penetration, 1e3, "mm")),
+            ("force on links, 99 % below", _number(self.force, 1.0, "N")),
+            ("object's speed, 99 % below", _number(self.speed, 1.0, "m/s")),
+            ("object's speed, largest", _number(self.max_speed, 1.0, "m/s")),
+            ("object's spin, 99 % below", _number(self.spin, 1.0, "rad/s")),
+            ("object's spin, largest", _number(self.max_spin, 1.0, "rad/s")),
+            ("joint speed over rated speed, 99 % below", _percent(self.joint_speed)),
+        ]
+        parts = [text_table(("gait", ""), rows)]
+        if self.link_forces:
+            parts.append(text_table(("link", "force, 99 % below [N]"), _cells(self.link_forces)))
+        joints = [
+            (name, _percent(self.saturations.get(name)), f"{speed:.3g}", _number(self.rated_speeds.get(name), 1.0, ""))
+            for name, speed in self.joint_speeds.items()
+        ]
+        parts.append(text_table(("joint", "at its torque limit", "speed, 99 % below [rad/s]", "rated speed [rad/s]"), joints))
+        return "\n\n".join(parts)
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{share:.1%}"
+
+
+def _number(value: float | None, factor: float, unit: str) -> str:
+    return "–" if value is None else f"{factor * value:.3g} {unit}".rstrip()
+
+
+def _cells(values: dict[str, float]) -> list[tuple[str, str]]:
+    return [(name, f"{value:.3g}") for name, value in values.items()]
+
+
+class GaitMeter:
+    """Adds up how policies move objects, each in a block of environments."""
+
+    def __init__(self, env: TouchEnv, blocks: int = 1):
+        """Begin.
+
+        Args:
+            env: The environments.
+            blocks: How many blocks they are: as many environments each, one block after the other.
+        """
+        setup, num, device = env.task.setup, env.num_envs, env.sim.qpos.device
+        self._env, self._blocks, own = env, blocks, setup.actuators
+        self._links, self._joints = setup.links, own.names
+        self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(device)
+        self._limit, self._rated = (torch.from_numpy(value).to(device) for value in (own.limit, own.top_speed))
+        sizes = {"penetration": 1, "force": len(setup.links), "speed": 1, "spin": 1, "joint_speed": len(own.names)}
+        ends = [0]
+        for size in sizes.values():
+            ends.append(ends[-1] + size)
+        self._rows = {name: slice(*pair) for name, pair in zip(sizes, pairwise(ends), strict=True)}
+        self._counts = torch.zeros((blocks, ends[-1], NUM_BINS), dtype=torch.int64, device=device)
+        block = torch.arange(num, device=device) // (num // blocks)
+        self._first = ((block[:, None] * ends[-1] + torch.arange(ends[-1], device=device)) * NUM_BINS).flatten()
+        names = ("steps", "untouched", "any_saturation", "forth", "coasted")
+        self._sums = {name: torch.zeros(num, dtype=torch.float64, device=device) for name in names}
+        self._saturated = torch.zeros((num, len(own.names)), dtype=torch.float64, device=device)
+        self._most = torch.zeros((num, 2), dtype=torch.float64, device=device)
+
+    def add(self, counts: Bool[Tensor, " env"]) -> None:
+        """Add the instant after a step of the environments.
+
+        Args:
+            counts: Environments whose instant counts: not those whose episode has just ended.
+        """
+        actuation = self._env.actuation
+        strength = SATURATED * actuation.drawn["strength"] - actuation.spec.torque_noise
+        self.add_instant(self._env.now, self._env.task.step_progress(), strength, counts)
+
+    def add_instant(
+        self,
+        now: Now,
+        progress: Float[Tensor, " env"] | None,
+        strength: Float[Tensor, "env joint"],
+        counts: Bool[Tensor, " env"],
+    ) -> None:
+        """Add an instant.
+
+        Args:
+            now: The instant.
+            progress: What the step before it has brought; None: the task has no progress.
+            strength: Share of its largest torque from which on each joint is at its torque limit.
+            counts: Environments that count.
+        """
+        counts = counts.to(now.joint_pos.device)
+        force, torque = vector_norm(now.link_force, dim=2).double(), now.torque.double().abs()
+        is_untouched = ~((force > TOUCH) & self._fingers).any(dim=1)
+        is_saturated = torque >= strength * self._limit
+        found = {"steps": torch.ones_like(is_untouched), "untouched": is_untouched, "any_saturation": is_saturated.any(dim=1)}
+        if progress is not None:
+            forth = progress.double().clamp(min=0.0)
+            found |= {"forth": forth, "coasted": torch.where(is_untouched, forth, 0.0)}
+        for name, value in found.items():
+            self._sums[name] += torch.where(counts, value.double(), 0.0)
+        self._saturated += torch.where(counts[:, None], is_saturated.double(), 0.0)
+        motion = torch.stack([vector_norm(own.double(), dim=1) for own in (now.object.linvel, now.object.angvel)], dim=1)
+        self._most = torch.where(counts[:, None], torch.maximum(self._most, motion), self._most)
+        depth = -now.distance.double()
+        deepest = depth.amax(dim=1, keepdim=True) if depth.shape[1] else torch.zeros_like(motion[:, :1])
+        loads = torch.where(force > TOUCH, force, 0.0)
+        self._count(torch.cat([deepest, loads, motion, now.joint_vel.double().abs()], dim=1), counts)
+
+    def _count(self, values: Float[Tensor, "env row"], counts: Bool[Tensor, " env"]) -> None:
+        """Add values above 0 to the histograms; those of forces and depths that are 0 are of no contact."""
+        always = torch.zeros(values.shape[1], dtype=torch.bool, device=values.device)
+        for name in ("speed", "spin", "joint_speed"):
+            always[self._rows[name]] = True
+        is_counted = counts[:, None] & ((values > 0) | always) & values.isfinite()
+        place = (values.clamp(min=LEAST) / LEAST).log().div(WIDTH).nan_to_num(0.0).clamp(max=NUM_BINS - 1).to(torch.int64)
+        self._counts.view(-1).scatter_add_(0, self._first + place.flatten(), is_counted.flatten().to(torch.int64))
+
+    def gaits(self) -> list[Gait]:
+        """Return how the policy of each block moves its object."""
+        size = self._env.num_envs // self._blocks
+        sums = {name: value.view(self._blocks, size).sum(dim=1).tolist() for name, value in self._sums.items()}
+        saturated = self._saturated.view(self._blocks, size, -1).sum(dim=1).tolist()
+        most, counts = self._most.view(self._blocks, size, 2).amax(dim=1).tolist(), self._counts.cpu()
+        found = []
+        for block in range(self._blocks):
+            own = {name: value[block] for name, value in sums.items()}
+            found.append(self._gait(own, saturated[block], most[block], counts[block]))
+        return found
+
+    def _gait(self, sums: dict[str, float], saturated: list[float], most: list[float], counts: Tensor) -> Gait:
+        """Return the gait of one block, by its sums."""
+        steps, limits, rated = sums["steps"], self._limit.tolist(), self._rated.tolist()
+        parts = {name: counts[rows] for name, rows in self._rows.items()}
+        has_limits, has_fingers = any(map(math.isfinite, limits)) and steps > 0, bool(self._fingers.any()) and steps > 0
+        shares = {
+            name: share / steps
+            for name, share, limit in zip(self._joints, saturated, limits, strict=True)
+            if steps and math.isfinite(limit)
+        }
+        rates = {name: speed for name, speed in zip(self._joints, rated, strict=True) if math.isfinite(speed)}
+        speeds = _percentiles(self._joints, parts["joint_speed"])
+        ratios = [speeds[name] / speed for name, speed in rates.items() if name in speeds]
+        return Gait(
+            coasting=sums["coasted"] / sums["forth"] if sums["forth"] and has_fingers else None,
+            untouched=sums["untouched"] / steps if has_fingers else None,
+            saturation=max(shares.values(), default=None),
+            any_saturation=sums["any_saturation"] / steps if has_limits else None,
+            penetration=percentile(parts["penetration"][0]),
+            force=percentile(parts["force"].sum(dim=0)),
+            speed=percentile(parts["speed"][0]),
+            spin=percentile(parts["spin"][0]),
+            max_speed=most[0],
+            max_spin=most[1],
+            joint_speed=max(ratios, default=None),
+            saturations=shares,
+            link_forces=_percentiles(self._links, parts["force"]),
+            joint_speeds=speeds,
+            rated_speeds=rates,
+        )
+
+
+def percentile(counts: Tensor, share: float = PERCENTILE) -> float | None:
+    """Return the middle of the bin below whose upper end a share of all values lies; None if there are none.
+
+    Args:
+        counts: Values in each bin, (bin,).
+        share: The share.
+    """
+    total = int(counts.sum())
+    if not total:
+        return None
+    place = int(torch.searchsorted(counts.cumsum(dim=0), math.ceil(share * total)))
+    return LEAST * math.exp((place + 0.5) * WIDTH) if place else 0.0
+
+
+def _percentiles(names: Sequence[str], counts: Tensor) -> dict[str, float]:
+    """Return the percentile of each row that has values, by its name."""
+    found = {name: percentile(row) for name, row in zip(names, counts, strict=True)}
+    return {name: value for name, value in found.items() if value is not None}

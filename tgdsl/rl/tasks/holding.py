@@ -1,0 +1,65 @@
+"""Whether a hand holds the object that it turns, or lets it coast.
+
+Fingers that flick an object make more progress than fingers that hold it. With f_l the object's force on link l, the object is
+held where at least `links` links carry load, |f_l| ≥ `load`, and one of them is a finger's: two fingers, or one and the palm.
+Elsewhere it coasts, and its progress pays the share c = `coasting_pay`.
+
+Shapes: `env` environments.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from pydantic import Field, StrictInt
+from torch import Tensor
+from torch.linalg import vector_norm
+
+from tgdsl.fields.models import Quantity, SpecModel
+from tgdsl.rl.links import are_fingers
+from tgdsl.rl.task import Now, Setup
+
+
+class HoldSpec(SpecModel):
+    """What progress pays while the object is not held."""
+
+    coasting_pay: Annotated[float, Quantity("number", ge=0.0, le=1.0)] = 1.0
+    """c, what progress pays while the object coasts, as a share of what it pays while the object is held."""
+    links: Annotated[StrictInt, Field(ge=1)] = 2
+    """The object is held where so many links carry load, at least one of them a finger's."""
+    load: Annotated[float, Quantity("force", gt=0.0)] = 0.05
+    """The object's force from which on a link carries load [N]."""
+
+
+class Holding:
+    """Says where the object is held, and what its progress pays."""
+
+    def __init__(self, spec: HoldSpec, setup: Setup):
+        """Note which links are fingers."""
+        self.spec = spec
+        self._fingers = torch.from_numpy(are_fingers(setup.model, setup.links)).to(setup.device)
+
+    def is_held(self, now: Now) -> Bool[Tensor, " env"]:
+        """Return where the object is held."""
+        is_loaded = vector_norm(now.link_force, dim=2) >= self.spec.load
+        return (is_loaded.sum(dim=1) >= self.spec.links) & (is_loaded & self._fingers).any(dim=1)
+
+    def pay(self, now: Now) -> Float[Tensor, " env"]:
+        """Return what progress pays: 1 where the object is held, else c."""
+        held = self.is_held(now).to(now.joint_pos.dtype)
+        return held + (1.0 - held) * self.spec.coasting_pay
+
+
+def reference(spec: HoldSpec, link_force: np.ndarray, fingers: np.ndarray) -> float:
+    """Return what progress pays at one instant of one environment.
+
+    Args:
+        spec: What progress pays.
+        link_force: The object's force on each link, (link, 3) [N].
+        fingers: Which links are fingers, (link,).
+    """
+    is_loaded = np.linalg.norm(link_force, axis=1) >= spec.load
+    return 1.0 if is_loaded.sum() >= spec.links and (is_loaded & fingers).any() else spec.coasting_pay
