@@ -373,7 +373,7 @@ def compared(ratios: Mapping[str, float], kept: Mapping[str, float]) -> tuple[li
         A line per row, and whether every kept row was timed and none is slower by more than `SLOWER`.
     """
     lines, is_met = [], bool(kept)
-    for name in kept | ratios:
+    for name in {**kept, **ratios}:
         ratio, old = ratios.get(name), kept.get(name)
         is_slower = old is not None and (ratio is None or ratio > (1 + SLOWER) * old)
         is_met &= not is_slower

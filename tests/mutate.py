@@ -224,6 +224,7 @@ class Reached:
             for case in ElementTree.parse(RECORDS / "times.xml").iter("testcase")
         }
         self._lines: dict[Path, dict[int, list[str]]] = {}
+        self._tests = {context.rsplit("|", 1)[0] for context in self._data.measured_contexts() if context}
 
     def tests(self, mutant: Mutant, limit: float) -> list[str]:
         """Return the tests that reach a change, near ones first, then short ones, as many as fit into a time [s]."""
@@ -231,10 +232,11 @@ class Reached:
             self._lines[mutant.file] = self._data.contexts_by_lineno(str(mutant.file))
         lines = self._lines[mutant.file]
         tests = {context.rsplit("|", 1)[0] for context in lines.get(mutant.line, []) if context}
-        if not tests:  # a statement of the module, run at import
+        near = str("tests" / mutant.file.relative_to(REPOSITORY / "tgdsl").parent)
+        if not tests:  # a statement of the module, run at import: tests of the folder may only read a table
             tests = {context.rsplit("|", 1)[0] for contexts in lines.values() for context in contexts if context}
-        near = "tests" / mutant.file.relative_to(REPOSITORY / "tgdsl").parent
-        ordered = sorted(tests, key=lambda test: (not test.startswith(str(near)), self._time(test)))
+            tests |= {test for test in self._tests if test.startswith(f"{near}/")}
+        ordered = sorted(tests, key=lambda test: (not test.startswith(near), self._time(test)))
         total, kept = 0.0, []
         for test in ordered:
             total += self._time(test)

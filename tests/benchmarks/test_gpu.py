@@ -158,7 +158,9 @@ class TestErrors:
 
 class TestGuard:
     def test_a_row_a_tenth_slower_or_missing_is_named(self):
-        lines, is_met = gpu.compared({"depth × 16,384": 3.31, "force × 16,384": 10.9}, {"depth × 16,384": 3.0, "force × 16,384": 10.0})
+        lines, is_met = gpu.compared(
+            {"depth × 16,384": 3.31, "force × 16,384": 10.9}, {"depth × 16,384": 3.0, "force × 16,384": 10.0}
+        )
         assert not is_met
         assert ["SLOWER" in line for line in lines] == [True, False]
         lines, is_met = gpu.compared({}, {"depth × 16,384": 3.0})
@@ -174,7 +176,21 @@ class TestGuard:
     def test_a_dry_run_keeps_ratios_and_compares_them(self, tmp_path, capsys):
         make_artefacts(tmp_path / "art", [CASES["depth"]])
         kept = tmp_path / "kept.json"
-        own = ["--device", "cpu", "--eager", "--sets", "2", "--repeats", "1", "--check-envs", "2", "--envs", "3", "--rows", "depth"]
+        own = [
+            "--device",
+            "cpu",
+            "--eager",
+            "--sets",
+            "2",
+            "--repeats",
+            "1",
+            "--check-envs",
+            "2",
+            "--envs",
+            "3",
+            "--rows",
+            "depth",
+        ]
         command = ["guard", str(tmp_path / "art"), "--out", str(tmp_path / "rows.json"), "--kept", str(kept), *own]
         options = gpu.parsed([*command, "--keep"])
         with pytest.raises(SystemExit, match="0"):
