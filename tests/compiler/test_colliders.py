@@ -58,7 +58,6 @@ def document(folder, collision="primitive", placement=TAXELS, **ball):
     }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["mesh", "collision"])
 def test_taxels_stay_and_contacts_count_for_the_same_link(folder, surface):
     """A ball on the pad rests on the box, 2 mm higher above the pad than on the mesh, with its weight on the pad's only row."""
@@ -96,7 +95,6 @@ def test_the_same_document_without_them_has_the_scene_that_it_had(folder):
     assert scene_digest(touch.plan.scene) != scene_digest(tgdsl.compile(document(folder)).plan.scene)
 
 
-@pytest.mark.slow
 def test_objects_may_vary_beside_them(folder):
     """Of two balls in two environments each rests with its own radius above the box."""
     variants = [{"type": "sphere", "size": [r], "density": 500} for r in (0.02, 0.03)]

@@ -1,7 +1,5 @@
 """What sensors, objects and scenes mean on a robot; and each mistake, told once and at its place."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -196,17 +194,14 @@ observations:
 )
 
 
-@pytest.mark.slow
-def test_eight_mistakes_are_eight_lines(folder):
+def test_eight_mistakes_are_eight_lines(folder, here):
     text = EIGHT.replace("        index_1: ", "        index_3: ").replace("objects: {", "objects: {ball: {body: bal}, ")
     text = text.replace('tips: ["*_2"]', 'tips: ["*_22"]')
     (folder / "bad.yaml").write_text(text)
-    ran = subprocess.run(
-        [sys.executable, "-m", "tgdsl", "compile", "bad.yaml"], cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert ran.returncode == 2
-    assert ran.stdout == ""
-    lines = ran.stderr.splitlines()
+    code, said, error = here(folder, "compile", "bad.yaml")
+    assert code == 2
+    assert said == ""
+    lines = error.splitlines()
     assert lines[-1] == f"{len(lines) - 1} mistakes"
     assert [tuple(line.split(": ")[:2]) for line in lines[:-1]] == [
         ("bad.yaml:6:14", "robot.layout.groups.tips[0]"),
@@ -217,4 +212,4 @@ def test_eight_mistakes_are_eight_lines(folder):
         ("bad.yaml:24:45", "sensors.hit.feels[0]"),
         ("bad.yaml:25:63", "sensors.hat.threshold"),
         ("bad.yaml:27:30", "observations.policy[0].of"),
-    ], ran.stderr
+    ], error

@@ -361,7 +361,6 @@ def test_urdf_scenes(tmp_path, monkeypatch):
     assert str(tmp_path) not in kept.mjcf
 
 
-@pytest.mark.slow
 def test_the_palm_scene_is_found_by_name_in_another_checkout(tmp_path, monkeypatch):
     plan = compile_plan(ROBOTS.parent / "examples" / "xhand1_palm.yaml")
     assert plan.scene.assets

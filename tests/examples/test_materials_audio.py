@@ -10,6 +10,7 @@ from scipy.signal import find_peaks
 
 import tgdsl
 
+pytestmark = pytest.mark.slow
 EXAMPLE = Path(__file__).parents[2] / "examples" / "materials_audio.yaml"
 BOXES = ("steel", "wood", "glass")
 NUM_DROPS, NUM_STEPS, RATE = 50, 400, 24000.0
@@ -57,7 +58,6 @@ def decay(sound):
     return -0.5 * np.polyfit(0.006 * np.arange(10), np.log(energy).T, 1)[0]
 
 
-@pytest.mark.slow
 def test_the_solver_cannot_tell_them_apart(drops):
     _, balls, first, _ = drops
     for ball, centre in zip(balls, (-0.3, 0.0, 0.3), strict=True):
@@ -67,7 +67,6 @@ def test_the_solver_cannot_tell_them_apart(drops):
         assert (np.abs(first[name] // 24 - first["wood"] // 24) <= 1).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("feature", [centroid, decay])
 def test_every_drop_is_told_apart(drops, feature):
     """50 of 50 of each: the ranges of the three do not meet, neither of the centroid nor of the decay."""
@@ -94,7 +93,6 @@ def test_peaks_of_the_spectrum_are_at_modes(drops, name):
         assert all((np.abs(modes - peak) < allowed).any() for peak in peaks)
 
 
-@pytest.mark.slow
 def test_an_ear_hears_a_box_as_much_later_and_fainter_as_it_is_away():
     """ρc √(A/4π)/r of the surface's velocity, r/c later, to 5e-3 of the loudest; at the end some is still on its way."""
     touch = tgdsl.compile(EXAMPLE, sensors=["ear"], overrides={"sensors.ear.hears": ["glass"]}, dtype="float64")

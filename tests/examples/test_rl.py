@@ -19,7 +19,6 @@ def task(tmp_path):
     return str(small_task(tmp_path))
 
 
-@pytest.mark.slow
 def test_skrl(task, tmp_path):
     """After 24 steps it has learned once: what it sees are 6 + 4 + 7 numbers."""
     example = runpy.run_path(str(EXAMPLES / "skrl_ppo.py"))
@@ -29,7 +28,6 @@ def test_skrl(task, tmp_path):
     assert changed and all(weight.isfinite().all() for weight in agent.policy.parameters())
 
 
-@pytest.mark.slow
 def test_stable_baselines3(task, capsys):
     example = runpy.run_path(str(EXAMPLES / "stable_baselines3_ppo.py"))
     model = example["main"](["--task", task, "--envs", "4", "--steps", "24"])

@@ -53,6 +53,13 @@ def test_each_quantity_has_its_bound():
         ADAPTER.validate_python({})
 
 
+def test_the_schema_has_the_bounds_of_numbers_and_of_a_mapping():
+    number, _, each, null = ADAPTER.json_schema()["anyOf"]
+    assert number == {"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}
+    assert (each["type"], each["minProperties"], null) == ("object", 1, {"type": "null"})
+    assert each["additionalProperties"]["anyOf"][0] == number
+
+
 def test_the_schema_takes_what_is_read():
     patterns = [own["pattern"] for own in ADAPTER.json_schema()["anyOf"] if own.get("type") == "string"]
     for text in ("1%", ".5 %", "0.02 mm", "2 N*mm", "0.5 K"):

@@ -7,10 +7,10 @@ from typing import Annotated
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from tgdsl.fields import units
-from tgdsl.fields.models import Quantity, SpecModel, Usual
+from tgdsl.fields.models import Quantity, RangeOf, SpecModel, Usual
 from tgdsl.fields.units import Dimension, doubt
 
 RTOL = 4e-16  # one product in float64: two roundings of at most 2⁻⁵³
@@ -180,3 +180,27 @@ def test_its_schema_takes_its_units_and_doubt_names_them():
 def test_a_dimension_without_a_unit_inside_or_with_unreadable_ones_is_refused(units):
     with pytest.raises(ValueError, match="the units of capacitance: found"):
         Dimension("capacitance", units)
+
+
+Span = TypeAdapter(Annotated[tuple[float, float], RangeOf("time", ge=0.0, le=2.0)])
+
+
+def test_a_range_is_a_number_or_two_in_order():
+    assert Span.validate_python("5 ms") == (5e-3, 5e-3)
+    assert Span.validate_python([0, "20 ms"]) == (0.0, 0.02)
+    assert Span.validate_python([1.0, 1.0]) == (1.0, 1.0)
+    for wrong, message in (
+        ([2, 1], r"\[2, 1\] is not ordered"),
+        ([1], "found a list of 1"),
+        ([0, 1, 2], "found a list of 3"),
+        ([0, 3], "3 is out of range, expected at most 2"),
+        (-1, "-1 is out of range, expected at least 0"),
+    ):
+        with pytest.raises(ValidationError, match=message):
+            Span.validate_python(wrong)
+
+
+def test_the_schema_of_a_range_is_a_quantity_or_two():
+    one, two = Span.json_schema()["anyOf"]
+    assert one["anyOf"][0] == {"type": "number", "minimum": 0.0, "maximum": 2.0}
+    assert two == {"type": "array", "items": one, "minItems": 2, "maxItems": 2}

@@ -1,48 +1,44 @@
 """Files that appear whole: their permissions are those of any new file, and nothing of the process is changed for it."""
 
 import os
-import subprocess
-import sys
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hand_logs import random_readings, write_log
+from joint_scenes import ALL, ROBOT_XML, joint_module
 
+import tgdsl
 from tgdsl.errors import FileError
 from tgdsl.files.write import atomic_path, atomic_write, atomic_write_all, new_folder
-
-REPOSITORY = Path(__file__).parents[2]
-SCRIPT = """
-import sys, numpy as np, tgdsl
-from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-from hand_logs import random_readings, write_log
-from joint_scenes import ALL, joint_module
 from tgdsl.formats.robot import export_model
 from tgdsl.runtime.rollout import Recorder
-out = Path(sys.argv[1])
-touch = joint_module(out, {"policy": ALL})
-tgdsl.save(touch, out / "a.safetensors")
-Recorder(touch, 1, 1).write(out / "a.npz", np.zeros((1, 4)))
-write_log(out / "log.npz", random_readings(np.arange(3.0)))
-export_model(out / "scene.xml", out / "a.usda")
-(out / "plain").touch()
-"""
-WRITTEN = ("a.safetensors", "a.npz", "log.npz", "a.usda")
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def touch(tmp_path_factory):
+    """A module, beside its scene."""
+    return joint_module(tmp_path_factory.mktemp("scene"), {"policy": ALL})
+
+
+@pytest.mark.filterwarnings("ignore:.*USD holds no")
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
-def test_permissions_are_those_of_a_new_file(tmp_path, umask):
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    command = [sys.executable, "-W", "ignore", "-c", SCRIPT, str(tmp_path), str(REPOSITORY / "tests" / "helpers")]
-    run = subprocess.run(command, env=environment, umask=umask, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    expected = (tmp_path / "plain").stat().st_mode & 0o777
-    assert expected == 0o666 & ~umask
-    assert {name: (tmp_path / name).stat().st_mode & 0o777 for name in WRITTEN} == dict.fromkeys(WRITTEN, expected)
+def test_permissions_are_those_of_a_new_file(tmp_path, touch, umask):
+    (tmp_path / "scene.xml").write_text(ROBOT_XML)
+    writers = {
+        "a.safetensors": lambda path: tgdsl.save(touch, path),
+        "a.npz": lambda path: Recorder(touch, 1, 1).write(path, np.zeros((1, 4))),
+        "log.npz": lambda path: write_log(path, random_readings(np.arange(3.0))),
+        "a.usda": lambda path: export_model(tmp_path / "scene.xml", path),
+        "plain": lambda path: path.touch(),
+    }
+    before = os.umask(umask)
+    try:
+        for name, write in writers.items():
+            write(tmp_path / name)
+    finally:
+        os.umask(before)
+    assert {name: (tmp_path / name).stat().st_mode & 0o777 for name in writers} == dict.fromkeys(writers, 0o666 & ~umask)
 
 
 def test_the_process_keeps_its_umask(tmp_path, monkeypatch):

@@ -117,7 +117,6 @@ def test_a_flat_visual_is_read(tmp_path):
     assert trimesh_of(model, "a").area == pytest.approx(0.01)
 
 
-@pytest.mark.slow
 def test_an_artefact_carries_them_by_content(tmp_path, monkeypatch):
     two_nodes()[0].export(tmp_path / "a.glb")
     urdf_of(tmp_path, "<mesh filename='a.glb'/>")

@@ -167,7 +167,6 @@ def test_a_geom_is_told_by_what_it_is():
     assert Geom(name="n", mesh="m", is_colliding=True, **shape).names == ("n", "m")
 
 
-@pytest.mark.slow
 def test_every_link_of_the_xhand1_has_a_closed_surface_that_matches_its_files():
     model = load_model(ROBOTS / "xhand1" / "xhand1_right.xml")
     carriers = [body for body in model.bodies if body != "world" and model.touchable(body)]

@@ -222,7 +222,6 @@ def test_freed_meshes_are_refused():
         torch.ops.tgdsl.mesh_distance(point, which, [key], 1.0)
 
 
-@pytest.mark.slow
 def test_operator_contract():
     meshes = [TriangleMesh(*cube()), TriangleMesh(*cube())]
     point = 0.1 * torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
@@ -270,7 +269,6 @@ def test_quiet(capfd):
     assert capfd.readouterr().out == ""
 
 
-@pytest.mark.slow
 def test_many_points():
     vertices, faces = icosphere(5)
     mesh = TriangleMesh(vertices, faces)

@@ -98,7 +98,6 @@ def test_where_the_gradient_vanishes_it_is_a_fixed_unit_vector(method):
     np.testing.assert_array_equal(np.linalg.norm(gradient, axis=1), 1.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_gradient_is_the_derivative(method, rough):
     """Inside, across the border and outside; trilinear not at faces of cells, where its gradient jumps."""

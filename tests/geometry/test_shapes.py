@@ -44,7 +44,6 @@ def special_points(size: tuple[float, ...]) -> np.ndarray:
     return np.array(list(itertools.product(*values)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "size"), CASES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_distance_is_that_of_the_nearest_surface_point(shape, size, dtype):
@@ -54,7 +53,6 @@ def test_distance_is_that_of_the_nearest_surface_point(shape, size, dtype):
     assert np.abs(found - expected).max() <= DISTANCE_TOLERANCE[dtype] * max(size)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "size"), CASES)
 def test_gradient_points_away_from_the_nearest_surface_point(shape, size):
     points = random_points(size, 1500)

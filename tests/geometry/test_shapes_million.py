@@ -8,7 +8,6 @@ from tgdsl.report.oracles import geometry
 NUM = 1_000_000
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "size"), geometry.PRIMITIVES)
 def test_a_million_points_at_known_distances(shape, size):
     assert_holds(geometry.at_known_distances(shape, size, NUM))

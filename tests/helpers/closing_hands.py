@@ -25,7 +25,7 @@ def arm(inside: str, num: int = 5, name: str = "arm", pos: str = "0 0 0", euler:
         axis = "0 0 1" if i % 2 else "0 1 0"
         text = (
             f'<body name="{name}{i}" {where}><joint axis="{axis}" range="-170 170"/>'
-            f'<geom type="capsule" size=".03" fromto="0 0 .03 0 0 .17"/>{text}</body>'
+            f'<geom type="box" size=".03 .03 .07" pos="0 0 .1"/>{text}</body>'
         )
     return text
 

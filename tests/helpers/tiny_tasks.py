@@ -77,7 +77,7 @@ sensors:
   depth: {{kind: contact_depth, links: hand, feels: [ball]}}
   touch: {{kind: kinematic_taxel, links: hand, feels: [ball]}}
   load: {{kind: force_taxel, links: hand, feels: [ball]}}
-  near: {{kind: proximity, links: hand, feels: [ball]}}
+  near: {{kind: proximity, links: hand, feels: [ball], backend: points, points: 200}}
   skin: {{kind: elastomer, links: hand, feels: [ball], anchors: points, points: 40}}
   felt: {{kind: link_contact, links: hand, feels: [ball], outputs: [force]}}
   gap: {{kind: surface_distance, links: hand, feels: [ball], max_range: 1 m}}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tgdsl.errors import TaxelError
-from tgdsl.layout.identity import AREA, DIRECTION, POSITION, check_same_rows, columns_of, taxels_id
+from tgdsl.layout.identity import check_same_rows, columns_of, taxels_id
 from tgdsl.layout.layout import Layout, Link
 
 LAYOUT = Layout(
@@ -21,6 +21,10 @@ LAYOUT = Layout(
     area=np.full(4, 1e-5),
     cell=np.array([[0, 0], [0, 1], [1, 0], [-1, -1]]),
 )
+
+
+POSITION, DIRECTION, AREA = 1e-6, 1e-4, 0.05
+"""What files in float32 differ by, at most [m, rad], and what counting a few hundred sampled points does, relative."""
 
 
 def changed(**arrays: object) -> Layout:
@@ -82,6 +86,10 @@ def test_columns_that_one_table_lacks_are_not_compared():
     short = {name: column for name, column in columns_of(moved("tangent", 0, [0, 1, 0])).items() if name != "tangent"}
     check_same_rows(short, columns_of(LAYOUT), "x")
     check_same_rows(columns_of(LAYOUT), short, "x")
+    wide = columns_of(moved("radius", 0, 0.001))
+    for here, there in ((wide, short), (short, wide)):
+        with pytest.raises(TaxelError, match=r"radius 0\.00[23] here, link .* radius 0\.00[23] expected$"):
+            check_same_rows(here, there, "x")
 
 
 def test_an_id_is_of_every_bit_and_name_but_groups():

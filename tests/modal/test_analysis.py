@@ -99,7 +99,6 @@ def test_gains_of_modes_that_symmetry_makes_equal():
     assert (np.diff(found.frequency) > 0).all()
 
 
-@pytest.mark.slow
 def test_a_box_of_slabs_is_a_box_with_a_cavity():
     """Geoms that touch are one solid: the same modes, frequency by frequency, and gain by gain."""
     one = analysed("box", surface_of(thin_box(0.1, 0.004)), STEEL, 1e9)
@@ -162,17 +161,15 @@ def test_a_mesh_that_is_open_is_an_error_that_names_the_body():
         analysed("cup", surface_of(mesh), STEEL, 1e9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("material", ["steel", "wood", "glass"])
-def test_thin_walled_boxes_ring(material, monkeypatch):
-    """At the default resolution: 10 cm, walls of 2 mm, at least four modes below 0.45 of 16 kHz, and within 2 % of finer ones.
+def test_thin_walled_boxes_ring(monkeypatch):
+    """10 cm, walls of 2 mm, with four fifths of the default's unknowns: at least four modes below 0.45 of 16 kHz, within 2 % of finer ones.
 
     The lowest is that of elements of half the size, with 95,000 unknowns: κ 0.15844 at Poisson's ratio 0.3.
     """
-    monkeypatch.setattr(spectra, "UNKNOWNS", 25_000)
-    found = analysed("box", surface_of(thin_box(0.1, 0.002)), made_of(material, 32), 0.45 * 16_000)
+    monkeypatch.setattr(spectra, "UNKNOWNS", 20_000)
+    found = analysed("box", surface_of(thin_box(0.1, 0.002)), made_of("wood", 6), 0.45 * 16_000)
     assert len(found.frequency) >= 4
-    own = MATERIALS[material]
+    own = MATERIALS["wood"]
     wave_number = 2 * np.pi * found.frequency[0] * 0.1 / np.sqrt(own.youngs_modulus / own.density)
     assert wave_number == pytest.approx(0.15844 * np.sqrt(0.91 / (1 - own.poissons_ratio**2)), rel=0.02)
 

@@ -340,7 +340,6 @@ def test_a_module_is_cast_between_its_dtypes(touch):
     torch.testing.assert_close(single.double(), double, rtol=0, atol=1e-5 * float(double.abs().max()))
 
 
-@pytest.mark.slow
 def test_tables_have_no_tiles(document, tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
     wedge = '<asset><mesh name="wedge" vertex="0 -.01 0  0 .01 0  0 -.01 .04  0 .01 .04  .01 -.01 0  .01 .01 0"/></asset>'

@@ -130,7 +130,6 @@ def test_integers_of_nothing_are_refused_or_do_no_harm(plans, which, tmp_path):
     assert {name.rpartition("/")[2] for name in kept - refused} <= {"cell", "is_absolute", "0"}  # "0": a flag of a link, flat
 
 
-@pytest.mark.slow
 def test_the_message_says_what_is_right(plans, tmp_path):
     plan, path = plans["forces"], tmp_path / "edited.safetensors"
     for name, value, expected in (
@@ -148,7 +147,6 @@ def test_the_message_says_what_is_right(plans, tmp_path):
         assert str(error.value) == f'{path}: the array "{name}" holds {value}, expected {expected}'
 
 
-@pytest.mark.slow
 def test_plain_indices_are_looked_at_too(plans, tmp_path):
     """Numbers of queries, objects, tables and channels, which are no arrays."""
     plan, path = plans["fields"], tmp_path / "edited.safetensors"

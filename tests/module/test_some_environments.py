@@ -60,7 +60,6 @@ def with_grad(request):
         yield request.param
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_each_environment_is_as_if_it_were_alone(touch, seed, with_grad):
     """A batch of which some are read equals modules of one environment each, which are called only when theirs is read."""

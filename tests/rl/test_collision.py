@@ -15,6 +15,7 @@ TASK = TASKS / "in_palm_rotate.yaml"
 GIVEN = {"physics.collision": "primitive", "physics.ls_tolerance": 0.05, "physics.iterations": 20, "physics.tolerance": 1e-6}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "palm"), [(TASK.name, "right_hand_link"), ("in_hand_repose_sharpa.yaml", "right_hand_C_MC")])
 def test_colliders_and_options_reach_the_simulation(task, palm):
     env = TouchEnv(TASKS / task, 2, overrides=GIVEN | {"touch": "none"}, threads=1)

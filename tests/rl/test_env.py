@@ -2,7 +2,6 @@
 
 import math
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -180,9 +179,8 @@ def test_the_same_seed_gives_the_same_bytes(make):
 
 
 @pytest.mark.slow
-def test_compiled_equals_eager(make, monkeypatch):
+def test_compiled_equals_eager(make):
     """Drives with a delay, noise, pushes, resets: all that is compiled besides the module."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # torch.compile cannot trace run-time checks
     more = NOISY + RANDOM + "episode: 0.2 s\n"
     eager, compiled = make(more=more, seed=1), make(more=more, seed=1, compiled=True)
     for i, action in enumerate(actions(eager, STEPS)):

@@ -53,8 +53,6 @@ TOLERANCE = 1e-3
 ELSEWHERE = 10e-3
 """The same on backs and flanks, which only have to keep things out [m]."""
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module", params=HANDS, ids=lambda hand: hand.name)
 def hand(request):
@@ -91,6 +89,7 @@ def test_where_objects_touch_a_link_primitives_are_within_a_millimetre(hand, rob
         assert any(collider.is_core for collider in own), mesh
 
 
+@pytest.mark.slow
 def test_every_taxel_of_every_layout_is_near_a_primitive(hand, colliders):
     """Taxels are on the mesh: the distance of each from its own link's primitives is that of the surface."""
     for resolution in ("low", "med", "high"):
@@ -128,6 +127,7 @@ def test_a_link_is_fitted_again_to_the_same_numbers(hand, robot, colliders):
     assert written.text({body: again}, hand.name) == written.text({body: own}, hand.name)
 
 
+@pytest.mark.slow
 def test_taxels_of_a_task_are_the_same_with_either_colliders(hand):
     file = ROOT / "examples" / "tasks" / hand.task
     plans = [compile_plan(file, {"robot.collision": word}, sensors=["felt", "load"]) for word in ("mesh", "primitive")]

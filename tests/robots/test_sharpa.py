@@ -73,8 +73,6 @@ sensors:
   depth: {{kind: contact_depth, links: hand, feels: [{feels}]}}
 """
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def hand():
@@ -187,7 +185,7 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte():
     assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == before
 
 
-@pytest.mark.parametrize("resolution", COUNTS)
+@pytest.mark.parametrize("resolution", ["med", *(pytest.param(name, marks=pytest.mark.slow) for name in ("low", "high"))])
 def test_counts_are_the_papers(document, resolution):
     plan = compile_plan(document, {"resolution": resolution})
     layout = plan.layout
@@ -203,6 +201,7 @@ def test_counts_are_the_papers(document, resolution):
     np.testing.assert_allclose((layout.normal * layout.tangent).sum(axis=1), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
     """MuJoCo collides convex hulls: they may leave out a little of a pad, and only the palm's hollow is spanned by one."""
     plan = compile_plan(document, {"resolution": "high"})
@@ -225,6 +224,7 @@ def test_taxels_lie_on_the_surfaces_and_near_what_collides(document):
         assert signed.min() > (-2.8e-3 if link.name == "right_hand_C_MC" else -0.4e-3), link.name
 
 
+@pytest.mark.slow
 def test_pads_face_away_from_the_bone(document):
     """In the straight hand all fingers' taxels look out of the palm, as the palm's own do; a thumb's look along its pad."""
     plan = compile_plan(document, {"resolution": "high"})
@@ -246,6 +246,7 @@ def test_pads_face_away_from_the_bone(document):
             assert ((pos - bone.xpos) @ out).mean() > 0.001, link.name
 
 
+@pytest.mark.slow
 def test_a_cube_pressed_on_a_tip_is_felt_where_it_is(document):
     """Depth is radius minus distance to the cube for every taxel whose link touches it, from poses and a box alone."""
     touch = tgdsl.compile(document, dtype=torch.float64)

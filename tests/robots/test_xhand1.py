@@ -32,8 +32,6 @@ JOINTS = [
     *((f"{name}_joint{i}", 0.0, 1.919) for name in ("index", "mid", "ring", "pinky") for i in (1, 2)),
 ]
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def hand():
@@ -62,7 +60,7 @@ def test_surfaces_are_closed_and_made_again_byte_for_byte(tmp_path):
     assert {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in assets} == before
 
 
-@pytest.mark.parametrize("resolution", COUNTS)
+@pytest.mark.parametrize("resolution", ["med", *(pytest.param(name, marks=pytest.mark.slow) for name in ("low", "high"))])
 def test_counts_are_the_papers(resolution):
     plan = compile_plan(EXAMPLE, {"resolution": resolution})
     layout = plan.layout
@@ -72,6 +70,7 @@ def test_counts_are_the_papers(resolution):
     np.testing.assert_allclose((layout.normal * layout.tangent).sum(axis=1), 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_example_gives_the_same_bytes_twice(tmp_path):
     for name in ("a", "b"):
         save_plan(compile_plan(EXAMPLE), tmp_path / name)
@@ -104,6 +103,7 @@ def in_cube(touch, state):
     return turn[rows["cube"]].inv().apply(world - pos[rows["cube"]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["rest", "squeeze"])
 def test_what_is_felt_is_where_the_cube_is(squeezed, moment):
     """Depth is radius minus distance to the cube for every taxel whose link touches it, from poses and a box alone."""
@@ -123,6 +123,7 @@ def test_what_is_felt_is_where_the_cube_is(squeezed, moment):
         assert {"right_hand_thumb_rota_link2", "right_hand_index_rota_link2"} <= set(links[is_felt])
 
 
+@pytest.mark.slow
 def test_squeezing_is_felt_more_than_resting(squeezed):
     _, readings = squeezed
     rest, squeeze = (readings[moment][0]["touch"][0, :, :3].norm(dim=1) for moment in ("rest", "squeeze"))
@@ -130,6 +131,7 @@ def test_squeezing_is_felt_more_than_resting(squeezed):
     assert (squeeze > 0).sum() > (rest > 0).sum()
 
 
+@pytest.mark.slow
 def test_environments_that_start_alike_stay_alike(squeezed):
     for reading, *_ in squeezed[1].values():
         for value in reading.values():

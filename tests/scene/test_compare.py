@@ -16,7 +16,7 @@ from tgdsl.formats.robot import load_model
 from tgdsl.module.artifact import load_plan, save_plan
 from tgdsl.plan.inputs import Inputs
 from tgdsl.quantities.pairs import Pair
-from tgdsl.scene.compare import PATH_FIELDS, differing_fields
+from tgdsl.scene.compare import differing_fields
 from tgdsl.scene.scene import compiled, scene_model
 
 NOTHING = Inputs((), (), (), {}, 0)
@@ -88,6 +88,8 @@ def fields_of(struct: str, prefix: str = "") -> list[str]:
 
 
 FIELDS = fields_of("mjModel")
+PATH_FIELDS = {"paths", "npaths", "mesh_pathadr", "hfield_pathadr", "skin_pathadr", "tex_pathadr", "nbuffer"}
+"""Where files were found, and the size of the memory that holds it."""
 SHARED = {name: ["flg_gravcomp", "ngravcomp"] for name in ("flg_gravcomp", "ngravcomp")}
 """Fields that are two names of one number."""
 
@@ -124,7 +126,6 @@ def changed(model: mujoco.MjModel, name: str) -> mujoco.MjModel | None:
     return other
 
 
-@pytest.mark.slow
 def test_every_field_of_mujocos_model_that_can_be_changed_is_named_when_it_is(rich):
     model = rich.compiled
     tried = []

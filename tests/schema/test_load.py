@@ -5,7 +5,7 @@ from documents import DOCUMENT, LAYOUT, POISSON, mistakes, read, write
 from wrong import WRONG, WRONG_LAYOUT
 
 from tgdsl.errors import SpecError, did_you_mean, listed
-from tgdsl.schema.load import load
+from tgdsl.schema.load import load, load_layout
 
 
 def test_a_good_document(tmp_path):
@@ -48,6 +48,14 @@ def test_a_layout_that_is_no_yaml(tmp_path):
     ]
     assert mistakes(tmp_path, layout="") == ["layout.yaml:1:1: the document is empty"]
     assert mistakes(tmp_path, layout="groups: {}\n") == ['layout.yaml:1:1: missing key "resolutions"']
+
+
+def test_a_layout_with_mistakes_of_its_yaml_alone_is_refused(tmp_path):
+    (tmp_path / "layout.yaml").write_text(LAYOUT)
+    assert set(load_layout(tmp_path / "layout.yaml").spec.resolutions) == {"low", "high"}
+    (tmp_path / "layout.yaml").write_text(f"{LAYOUT}resolutions: {{}}\n")
+    with pytest.raises(SpecError, match="resolutions"):
+        load_layout(tmp_path / "layout.yaml")
 
 
 def test_files_that_cannot_be_read(tmp_path):

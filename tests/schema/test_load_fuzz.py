@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tgdsl.errors import SpecError
 from tgdsl.schema.load import load
 
-FUZZ = settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 WORDS = sorted(set(DOCUMENT.replace(":", " ").split()) | {"noise", "observations", "scene", "grid", "points", "box"})
 SCALARS = st.one_of(
@@ -53,7 +53,6 @@ def test_the_fuzzed_document_is_valid():
     assert load(valid()).problems == []
 
 
-@pytest.mark.slow
 @FUZZ
 @given(st.data())
 def test_one_or_two_parts_replaced(data):
@@ -71,7 +70,6 @@ def test_one_or_two_parts_replaced(data):
     never_another_error(document)
 
 
-@pytest.mark.slow
 @FUZZ
 @given(st.dictionaries(KEYS_OR_TEXT, VALUES, max_size=8))
 def test_arbitrary_mappings(document):
@@ -93,7 +91,6 @@ def test_arbitrary_text(tmp_path: Path, text):
     never_another_error(write(tmp_path, text))
 
 
-@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_a_document_with_pieces_put_in(tmp_path: Path, data):
@@ -104,7 +101,6 @@ def test_a_document_with_pieces_put_in(tmp_path: Path, data):
     never_another_error(write(tmp_path, text))
 
 
-@pytest.mark.slow
 @FUZZ
 @given(data=st.data())
 def test_arbitrary_overrides(tmp_path: Path, data):

@@ -69,6 +69,7 @@ class TestActuationAudio(KindConformance):
 class TestActuationAudioBlock(TestActuationAudio):
     """Read once per control step, of joints by name, without noise."""
 
+    test_compiled_equals_eager = None  # its graph is part of the one above, step by step
     parameters = {"samples": 8, "substeps": 3, "joints": ["free", "r*"], "friction": 0.0, "hum": 0.0}
     float64_tolerance = 1e-12
     is_differentiable = True
@@ -137,7 +138,6 @@ def test_partials_that_the_rate_does_not_hold_fade_out():
     assert_holds(oracles.fading())
 
 
-@pytest.mark.slow
 def test_friction_has_its_spectral_density_at_every_rate():
     """(β ω)² Pa²/Hz from 20 and from 40 samples per step: mean square over half the rate, white, independent of one another."""
     assert_holds(oracles.friction())
@@ -156,11 +156,13 @@ def test_hum_is_there_at_rest():
     assert_holds(oracles.hum())
 
 
-@pytest.mark.slow
 def test_single_precision_keeps_the_phase(build):
-    """After 5,000 steps at a varying speed samples are off by less than 1e-3 of the amplitude."""
-    velocities = 5.0 + 2.0 * np.sin(np.arange(5000) * 0.01)
-    found = [driven(build(dtype, load=1.0, partials=[1.0]), velocities, 1.0)[0][-200:] for dtype in ("float64", "float32")]
+    """After 1,250 turns of the phase, at a varying speed, samples are off by less than 1e-3 of the amplitude."""
+    velocities = 5.0 + 2.0 * np.sin(np.arange(1000) * 0.01)
+    found = [
+        driven(build(dtype, load=1.0, partials=[1.0], pitch=250.0), velocities, 1.0)[0][-200:]
+        for dtype in ("float64", "float32")
+    ]
     np.testing.assert_allclose(found[1], found[0], atol=1e-3)
 
 

@@ -12,6 +12,7 @@ from tgdsl.testing import KindConformance
 
 
 class TestContactDepth(KindConformance):
+    test_compiled_equals_eager = None  # its graph is part of that of kinematic taxels
     kind = CONTACT_DEPTH
 
 

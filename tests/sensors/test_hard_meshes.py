@@ -51,7 +51,6 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("TGDSL_CACHE", str(tmp_path / "cache"))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -69,7 +68,6 @@ def test_at_rest_the_reading_is_right_and_does_not_alternate(tmp_path, name, que
     assert spread < 1e-3, f"a normal turns by {spread:.2g} rad"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("query", ["sdf", "raycast"])
 def test_deep_inside_and_on_the_surface_it_is_bounded(tmp_path, name, query):

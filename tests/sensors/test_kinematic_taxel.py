@@ -22,6 +22,7 @@ from tgdsl.testing import KindConformance
 
 class TestKinematicTaxel(KindConformance):
     kind = KINEMATIC_TAXEL
+    test_compiled_equals_eager = None  # its graph is part of that of all options
 
 
 class TestKinematicTaxelAsInThePaper(KindConformance):
@@ -267,8 +268,7 @@ def test_a_sliding_cube_that_is_balanced_drags_no_harder_than_the_solver(tmp_pat
     assert (force[sizes > 1e-6, 0] > 0).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("alpha", [1.0, 1.2, 1.5])
+@pytest.mark.parametrize("alpha", [1.0, 1.5])
 def test_a_ball_on_a_dense_pad_is_on_a_winkler_foundation(alpha):
     """Force against depth δ of a ball: a power of α + 1 where Hertz has 1.5."""
     assert_holds(kinematic.winkler(alpha))

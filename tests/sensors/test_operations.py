@@ -130,12 +130,14 @@ def test_an_interpreted_kernel_is_the_definition(errors, name):
     assert errors("interpret")[name] == ""
 
 
+@pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", NAMES)
 def test_a_kernel_compiles_for_a_gpu_that_is_not_here(errors, name):
     assert errors("assemble")[name] == ""
 
 
+@pytest.mark.slow
 @needs_triton
 @pytest.mark.parametrize("name", NAMES)
 def test_one_graph_launches_the_kernel(errors, name):

@@ -1,11 +1,14 @@
 """`tgdsl deploy`, as users run it."""
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 from hand_logs import random_readings, write_log
 from pressing_hands import CALIBRATION, Blind, press_policy, press_task
+
+from tgdsl.rl.deploying.deploy import Deployment
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 
@@ -49,7 +52,6 @@ def test_what_of_the_task_is_otherwise_is_told(base, here):
     assert second.startswith("score ")
 
 
-@pytest.mark.slow
 def test_on_a_log(base, here):
     write_log(base / "press.npz", random_readings(1.0 + 0.02 * np.arange(8)))
     arguments = ("--policy", "student.pt", "--source", "press.npz", "--lockstep", "--goal", "1", "--calibration", "hand.yaml")
@@ -59,7 +61,22 @@ def test_on_a_log(base, here):
     assert "press.npz was not moved: actions were computed, and went nowhere\n" in out
 
 
-@pytest.mark.slow
+def test_what_was_done_until_ctrl_c_is_told(base, here, monkeypatch):
+    steps = Deployment.steps
+
+    def interrupted(self, *arguments):
+        yield from itertools.islice(steps(self, *arguments), 3)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Deployment, "steps", interrupted)
+    code, out, error = here(base, "deploy", "task.yaml", "--policy", "student.pt", "--goal", "1", "--out", "made.npz")
+    assert code == 0, error
+    first, second, *_ = out.splitlines()
+    assert first == "interrupted" and second.endswith("no episode has ended; 0 episodes, 3 control steps")
+    with np.load(base / "made.npz") as found:
+        assert found["action"].shape == (3, 6)
+
+
 def test_mistakes(base, here):
     card = json.loads((base / "student.json").read_text())
     assert card["spec"]["touch"] == "agg_force"

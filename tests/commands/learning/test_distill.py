@@ -15,12 +15,15 @@ from tgdsl.commands.learning.sweep_trial import run_trial
 from tgdsl.rl.load import load_task
 from tgdsl.rl.students.results import Row
 from tgdsl.rl.train.checkpoint import read_checkpoint
+from tgdsl.rl.train.run import Run
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 SMALL = [
     *("--set", "distill.steps=4"),
     *("--set", "distill.networks.encoder.hidden=[8]"),
+    *("--set", "distill.networks.touch_encoder.hidden=[8]"),
     *("--set", "distill.networks.hidden=[8]"),
+    *("--set", "distill.epochs=2"),
 ]
 TEACHER = ("--teacher", "teacher.pt", "--device", "cpu")
 FIVE = ("--types", "depth,bool,none", "--placements", "ends,all", "--seeds", "1")
@@ -65,6 +68,8 @@ def test_from_a_teacher_to_students_that_play(base, here):
     folder = base / "out" / "task_students"
     rows = rows_of(folder / "table.csv")
     kinds = [("depth", "ends"), ("bool", "ends"), ("depth", "all"), ("bool", "all"), ("none", "")]
+    assert out.splitlines()[-1] == "table: out/task_students/table.csv"
+    assert [line.split()[0] for line in out.splitlines()[-6:-1]] == [kind for kind, _ in kinds]
     assert [(row["type"], row["placement"]) for row in rows] == kinds
     assert all(row["samples"] == "16" and row["episodes"] == "2" for row in rows)
     evaluation = json.loads((folder / "default" / "evaluation.json").read_text())
@@ -76,7 +81,9 @@ def test_from_a_teacher_to_students_that_play(base, here):
     assert code == 0 and out.startswith("score "), error
     code, out, error = here(base, "evaluate", "task.yaml", *student, "--set", "touch=depth", "--set", "placement=tip")
     assert code == 2 and "this policy feels with other taxels" in error
-    code, out, error = here(base, "distill", "task.yaml", "--resume", str(folder), "--device", "cpu", "--iterations", "3")
+    code, out, error = here(
+        base, "distill", "task.yaml", "--resume", str(folder), "--device", "cpu", "--iterations", "3", "--episodes", "2"
+    )
     assert code == 0, error
     assert read_checkpoint(folder / "default" / "checkpoint.pt")["iteration"] == 3
     curve = rows_of(folder / "default" / "curve.csv")
@@ -146,6 +153,28 @@ def test_a_run_goes_on_with_its_teacher_wherever_that_is_now(base, here):
     assert code == 2 and "--teacher teacher.pt: this run began with sub/moved.pt; begin another one" in error
 
 
+def test_minutes_limit_each_start_and_are_told_of_all(base, here, monkeypatch):
+    """Of learning that takes 90 s by its own account. Names are written as people read them."""
+    asked = []
+
+    def learned(run, iterations, seconds, shown):
+        asked.append((iterations, run.seconds, seconds))
+        run.seconds += 90.0
+        run.save()
+
+    monkeypatch.setattr(Run, "learn", learned)
+    (base / "teacher.pt").rename(base / "Lehrer für alle.pt")
+    few = ("--teacher", "Lehrer für alle.pt", "--types", "none", "--seeds", "1", "--envs", "2", *SMALL, "-o", "run")
+    assert here(base, "distill", "task.yaml", *few, "--device", "cpu", "--episodes", "0", "--minutes", "2")[0] == 0
+    assert '"Lehrer für alle.pt"' in (base / "run" / "distill.json").read_text()
+    on = ("--resume", "run", "--device", "cpu", "--episodes", "2", "--minutes", "3", "--iterations", "7")
+    code, _, error = here(base, "distill", "task.yaml", *on)
+    assert code == 0, error
+    assert asked == [(6000, 0.0, 120.0), (7, 90.0, 180.0)]
+    (row,) = rows_of(base / "run" / "table.csv")
+    assert float(row["minutes"]) == 3.0
+
+
 def test_a_teacher_that_does_not_say_what_it_feels_is_refused(base, fails):
     loaded = load_task(base / "task.yaml", {"touch": "depth"})
     spec = {name: value for name, value in loaded.spec.model_dump(mode="json").items() if name != "resolution"}
@@ -190,13 +219,20 @@ def test_what_is_refused_leaves_a_run_as_it_was(base, here):
     code, _, error = here(base, "distill", "task.yaml", *on)
     assert code == 0, error
     assert [row["iteration"] for row in rows_of(base / "run" / "default" / "curve.csv")] == ["1", "2"]
+    (base / "other").mkdir()
+    (base / "other" / "default").write_text("")
+    code, _, error = here(base, "distill", "task.yaml", *few, "--iterations", "1", "-o", "other")
+    assert code == 2 and "other/default is a file, expected a folder" in error
+    assert [file.name for file in (base / "other").iterdir()] == ["default"]
     (base / "run" / "distill.json").unlink()
     code, _, error = here(base, "distill", "task.yaml", *few, "-o", "run")
     assert code == 2 and "run: this folder holds default/run.json of a run; give another --out" in error
 
 
-def test_resolutions_are_simulations_one_after_the_other(base, here):
+def test_resolutions_are_simulations_one_after_the_other(base, here, monkeypatch):
     """One that the layout lacks is named before the first begins, and one that cannot go on before the first goes on."""
+    compared = []
+    monkeypatch.setattr("tgdsl.commands.learning.distill._warn_unlike", compared.extend)
     arguments = (*TEACHER, "--types", "depth", "--placements", "ends", "--seeds", "2", "--envs", "4", "--iterations", "1")
     code, _, error = here(base, "distill", "task.yaml", *arguments, "--resolutions", "low,med", *SMALL)
     assert code == 2 and '"med"' in error and not (base / "out").exists()
@@ -208,6 +244,7 @@ def test_resolutions_are_simulations_one_after_the_other(base, here):
     assert code == 0, error
     rows = rows_of(base / "both" / "table.csv")
     assert [(row["resolution"], row["seeds"]) for row in rows] == [("low", "2"), ("high", "2")]
+    assert [row.resolution for row in compared] == ["low", "high"]
     cards = [
         json.loads((base / "both" / name / "students" / "depth-ends-clean-s1.json").read_text()) for name in ("low", "high")
     ]

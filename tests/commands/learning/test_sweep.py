@@ -4,6 +4,7 @@ import json
 import runpy
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -201,6 +202,58 @@ def test_an_error_of_a_trial_is_in_its_log(base, monkeypatch):
     assert run_trial(Trial("y", {}, ("train", "task.yaml")), str(base / "y")) == "failed: ZeroDivisionError: of this test"
     assert 'broken.py", line 1' in (base / "y" / "log.txt").read_text()
     assert not (base / "y" / "ended.json").exists()
+
+
+def test_what_a_trial_scored_is_told(base, monkeypatch):
+    """With the interval of its mean, which one episode has none of."""
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    for ends, expected in (([0.1234, 0.5], "[0.123, 0.5]"), ([None, None], "[–, –]")):
+        own = base / str(ends[0])
+        score = json.dumps({"score": 0.25, "score_interval": ends, "unit": "rad"})
+        monkeypatch.setattr(
+            "runpy.run_module", lambda *_, own=own, score=score, **__: (own / "evaluation.json").write_text(score)
+        )
+        assert run_trial(Trial("x", {}, ("train", "task.yaml")), str(own)) == f"score 0.25 {expected} rad"
+
+
+def fake_ray(monkeypatch, cpus, gpus):
+    """Put a Ray with one machine in place of the real one, whose tasks tell their names; return what is asked of it."""
+    asked = []
+    work = SimpleNamespace(remote=lambda trial, place: (trial.name, place))
+    ray = ModuleType("ray")
+    ray.init = ray.shutdown = lambda **_: None
+    ray.nodes = lambda: [{"Resources": {"CPU": cpus, "GPU": gpus}}]
+    ray.remote = lambda **own: lambda _: asked.append(own) or work
+    ray.wait, ray.get = lambda waiting: (waiting[:1], waiting[1:]), lambda done: f"was {done[0]}"
+    ray.exceptions = ModuleType("ray.exceptions")
+    for name in ("LocalRayletDiedError", "NodeDiedError", "OutOfMemoryError", "RayError", "WorkerCrashedError"):
+        setattr(ray.exceptions, name, type(name, (Exception,), {}))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray.exceptions", ray.exceptions)
+    return asked
+
+
+@pytest.mark.parametrize(("cpus", "gpus"), [(1.0, 2.0), (4.0, 0.0)])
+def test_a_run_that_no_machine_can_hold_is_refused(base, here, monkeypatch, cpus, gpus):
+    fake_ray(monkeypatch, cpus, gpus)
+    write(base, {"--seed": [1]}, cpus=2, gpus=1)
+    code, out, error = here(base, "sweep", "sweep.yaml")
+    expected = f"a run takes 2 processors and 1 GPUs, no machine has more than {cpus:g} and {gpus:g}"
+    assert (code, out) == (2, "") and expected in error
+
+
+def test_each_run_has_a_process_of_its_own(base, here, monkeypatch):
+    asked = fake_ray(monkeypatch, 2.0, 0.0)
+    write(base, {"--seed": [1, 2]}, cpus=2, retries=1)
+    code, out, error = here(base, "sweep", "sweep.yaml")
+    assert (code, error) == (0, "")
+    assert asked == [{"num_cpus": 2, "num_gpus": 0, "max_retries": 1, "max_calls": 1}]
+    assert out.splitlines() == ["1/2 seed=1: was seed=1", "2/2 seed=2: was seed=2"]
+
+
+def test_a_name_may_be_as_long_as_a_folders(base):
+    _, (trial,) = load_sweep(write(base, {"--types": ["b" * 194]}, {"--teacher": "task.yaml"}, command="distill"))
+    assert len(trial.name) == 200
 
 
 def killed_once(folder):

@@ -36,7 +36,6 @@ def fails(here, base):
     return run
 
 
-@pytest.mark.slow
 def test_from_nothing_to_a_policy_that_plays(base, here):
     code, out, error = here(
         base, "train", "task.yaml", *ON, "--iterations", "2", "--episodes", "6", *ARGUMENTS, "--set", "rewards.spin=3"
@@ -72,7 +71,7 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
         "rewards.spin=3",
     )
     assert code == 0, error
-    assert out.splitlines() == [lines[-1]]
+    assert out.splitlines()[0] == lines[-1] and "progress while no finger touches the object" in out
     assert json.loads((base / "e.json").read_text()) == card["score"]
     code, out, error = here(
         base, "play", "task.yaml", "--policy", "out/task/policy.pt", "--envs", "1", "--seconds", "0.1", "--no-video"
@@ -83,7 +82,6 @@ def test_from_nothing_to_a_policy_that_plays(base, here):
         assert found["action"].shape == (4, 1, 2)
 
 
-@pytest.mark.slow
 def test_a_run_goes_on_with_its_overrides_and_says_what_has_changed(base, here):
     start = ["train", "task.yaml", "--device", "cpu", "--episodes", "0"]
     assert here(base, *start, "--envs", "3", "--seed", "7", "--iterations", "1", "-o", "a run", *ARGUMENTS)[0] == 0
@@ -146,7 +144,6 @@ def test_rates_that_are_set_when_a_run_goes_on_count(base, here):
     assert rows[2][rows[0].index("Loss/learning_rate")] == "0.0005"
 
 
-@pytest.mark.slow
 def test_time_is_a_limit_too(base, here):
     """Without any no iteration is made, whether a run begins or goes on; else one at least."""
     start = ["train", "task.yaml", *ON, "--episodes", "0", *ARGUMENTS]
@@ -191,10 +188,9 @@ def test_an_evaluation_tells_which_variants_it_leaves_out(base, here):
     for envs, says in ((1, ['of the 2 variants of "item" 1 is played: there are no more environments']), (2, [])):
         code, out, error = here(base, "evaluate", "task.yaml", "--episodes", "2", "--envs", str(envs))
         assert code == 0, error
-        assert out.splitlines()[:-1] == says
+        assert out.partition("score ")[0].splitlines() == says
 
 
-@pytest.mark.slow
 def test_mistakes(fails, here, base):
     assert "there is no run to go on with: run.json is missing or empty" in fails("train", "task.yaml", *ON, "--resume", "none")
     assert "train.clip: -1 is out of range, expected more than 0" in fails("train", "task.yaml", *ON, "--set", "train.clip=-1")

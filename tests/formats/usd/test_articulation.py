@@ -220,3 +220,11 @@ def test_branches_keep_the_order_of_the_keyframe(tmp_path):
     key = model.key("authored").qpos
     for name, angle in angles.items():
         close(key[model.joint(name).qposadr[0]], angle)
+
+
+def test_names_that_whole_paths_share_are_numbered_from_2(tmp_path):
+    stage = new_stage(tmp_path)
+    for path in ("/a/b_c", "/x/b_c", "/a_b/c", "/y/c"):
+        add_body(stage, path)
+    model = compiled(stage)
+    assert {model.body(i).name for i in range(1, model.nbody)} == {"a_b_c", "x_b_c", "a_b_c_2", "y_c"}

@@ -3,16 +3,30 @@
 import mujoco
 import numpy as np
 import pytest
-from odd_hands import BALL, HANDS, command, compiled
+from odd_hands import BALL, CAPSULES, HANDS, VISUAL, command, compiled
 
 import tgdsl
-from tgdsl.placement.propose.propose import escaped
+from tgdsl.compiler.pipeline import placed
+from tgdsl.placement.propose.propose import FACTORS, escaped
 from tgdsl.schema.load import load_layout
 
 PRESSED = 0.0005
 """How deep it is pressed into the skin [m]."""
 DEPTH_ATOL = 1e-12
 """Everything is float64, half a metre from the origin."""
+DENSITY = 0.3e4
+"""Taxels per square metre, as the command is asked for."""
+LINES = {
+    VISUAL: (
+        "# Left out: floor: unnamed plane geom 4 of body floor has no bounded surface to put taxels on\n",
+        '# Left out: "world/[6]": no name, so no document can mean it\n',
+        "# Left out: table, target: stands or floats by itself: taken for scenery or an object; --include adds it\n",
+        "  # no palm: the chains part from nothing that has a surface, or there is only one chain\n",
+        '  tips: ["jaw a", "jaw b"]\n',
+    ),
+    CAPSULES: ('  tips: ["[t]ips", "f[[]2] end", "thumb end"]\n', '  palm: ["[p]alm"]\n'),
+}
+"""What the file says, by hand."""
 
 
 @pytest.fixture(scope="module", params=HANDS)
@@ -21,7 +35,7 @@ def odd(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     hand = HANDS[request.param]
     (folder / "hand.xml").write_text(hand.text)
-    assert command(folder, "layout", "new", "hand.xml", "--density", "2/cm2") == 0
+    assert command(folder, "layout", "new", "hand.xml", "--density", "0.3/cm2") == 0
     return hand, folder
 
 
@@ -34,7 +48,6 @@ def touch(odd):
     return compiled(folder, {group: gates.get(group, "geometric") for group in groups})
 
 
-@pytest.mark.slow
 def test_from_the_file_to_readings(odd, touch):
     """A ball pressed into the middle of each tip is felt as deep as its pose says; nothing else reads anything."""
     hand, _ = odd
@@ -103,29 +116,32 @@ def test_what_a_hand_is_taken_for(odd, touch):
         assert [part.facing for part in region] == ([] if facing is None else [facing]), name
 
 
-@pytest.mark.slow
-def test_the_same_command_writes_the_same_file(odd):
-    _, folder = odd
-    assert command(folder, "layout", "new", "hand.xml", "--density", "2e4/m2", "-o", "new/again.yaml") == 0
+def test_the_file_says_what_was_left_out_and_what_is_a_guess(odd):
+    hand, folder = odd
     text = (folder / "layout.yaml").read_text()
-    assert (folder / "new/again.yaml").read_text() == text
-    assert str(folder) not in text
+    for line in LINES.get(hand.text, ()):
+        assert line in text
 
 
-@pytest.mark.slow
-def test_counts_follow_the_density(odd):
-    """Each count is the link's area times the density, rounded, and at least 1: four times the density, four times the count."""
+def test_no_taxel_is_unfelt_but_where_nothing_is_collided(odd):
+    """At every resolution; what the simulator does not collide is named in the file."""
+    hand, folder = odd
+    found = placed({"tgdsl": 1, "robot": {"model": str(folder / "hand.xml"), "layout": str(folder / "layout.yaml")}})
+    assert set(found.layouts) == set(FACTORS)
+    is_named = "the simulator collides none of these links" in (folder / "layout.yaml").read_text()
+    assert any(found.unfelt.values()) == is_named == (not hand.collides)
+
+
+def test_counts_follow_the_resolution(odd):
+    """A quarter as many taxels at low as at med, rounded, but at least 1; four times as many at high."""
     _, folder = odd
     placements = load_layout(folder / "layout.yaml").spec.resolutions
-    assert command(folder, "layout", "new", "hand.xml", "--density", "20/cm2", "-o", "dense.yaml") == 0
-    dense = load_layout(folder / "dense.yaml").spec.resolutions
     for name, placement in placements["high"].items():
         low, med = placements["low"][name].count, placements["med"][name].count
         assert abs(placement.count - 4 * med) <= 2
         assert abs(med - 4 * low) <= 2 or low == 1
-        assert dense["med"][name].count == pytest.approx(2.5 * placement.count, rel=0.1)
 
 
 def test_taxels_are_as_dense_as_asked(odd, touch):
     table = touch.taxels["hand"]
-    assert len(table) / table["area"].sum() == pytest.approx(2e4, rel=0.05)
+    assert len(table) / table["area"].sum() == pytest.approx(DENSITY, rel=0.05)

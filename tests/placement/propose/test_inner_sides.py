@@ -1,5 +1,7 @@
 """Inner sides, hands and closing motions of hands made so that these are known, and of our robots, whose pads are."""
 
+from functools import cache
+
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from tgdsl.errors import TgdslError
 from tgdsl.files.find import layout_of
 from tgdsl.formats.robot import load_model
 from tgdsl.placement.links import open_robot
-from tgdsl.placement.propose.propose import closing_motion, propose
+from tgdsl.placement.propose.propose import Proposal, closing_motion, propose
 from tgdsl.placement.propose.surfaces import Sampler
 from tgdsl.schema.load import load_layout
 from tgdsl.schema.select import matching
@@ -89,15 +91,40 @@ def test_the_command_says_what_is_weak_and_takes_include(tmp_path, here):
     assert "# Left out: arm2, arm3, arm4: before" in text and text.count("asked for with --include: all around\n") == 2
 
 
-@pytest.mark.parametrize("robot", ["xhand1", "xhand1_left", "sharpa", "sharpa_left"])
+REAL = [
+    "xhand1",
+    pytest.param("xhand1_left", marks=pytest.mark.slow),
+    "sharpa",
+    pytest.param("sharpa_left", marks=pytest.mark.slow),
+]
+
+
+@cache
+def proposed(robot: str) -> Proposal:
+    """Return what is proposed for a robot that comes with tgdsl."""
+    return propose(open_robot(robot), DENSITY)
+
+
+@pytest.mark.parametrize("robot", REAL)
 def test_our_robots_face_their_pads(robot):
     """Each link with a pad of which a layout by hand says where it faces is guessed to face there, within 45 deg."""
-    model, layout = open_robot(robot), load_layout(layout_of(robot)).spec
-    found = {link.name: link.facing for link in propose(model, DENSITY).links}
+    layout = load_layout(layout_of(robot)).spec
+    found = {link.name: link.facing for link in proposed(robot).links}
     for pattern, placement in layout.resolutions["med"].items():
-        for name in matching(pattern, list(model.bodies)):
+        for name in matching(pattern, list(open_robot(robot).bodies)):
             known, guess = -np.array(placement.direction), np.array(found[name])
             assert known @ guess / np.linalg.norm(known) / np.linalg.norm(guess) > np.cos(np.radians(45.0)), name
+
+
+@pytest.mark.parametrize("robot", REAL[:2])
+def test_the_xhand1_is_taken_for_what_its_own_layout_says(robot):
+    proposal, stem = proposed(robot), "left_hand" if robot == "xhand1_left" else "right_hand"
+    tips = ("thumb_rota_link2", "index_rota_link2", "mid_link2", "ring_link2", "pinky_link2")
+    assert proposal.groups["tips"] == tuple(f"{stem}_{tip}" for tip in tips)
+    assert proposal.groups["palm"] == (f"{stem}_link",)
+    facing = {link.name.removeprefix(f"{stem}_"): link.facing for link in proposal.links}
+    assert facing["thumb_rota_link2"] == (0, 0, 1)
+    assert {facing[name] for name in ("link", "index_rota_link2", "mid_link1", "mid_link2", "pinky_link2")} == {(1, 0, 0)}
 
 
 def test_slides_close_to_where_they_meet(tmp_path):
@@ -233,3 +260,21 @@ def test_only_links_with_taxels_are_sampled(tmp_path, monkeypatch):
     assert sorted(sampled) == ["arm2", "gripper", "jaw0", "jaw1"]
     closing_motion(robot)
     assert len(sampled) == 4
+
+
+def test_a_knuckle_that_bends_and_spreads_closes_by_bending(tmp_path):
+    """Both joints are of one body."""
+    text = MADE["five_fingers"].text
+    place = text.index("<joint", text.index('name="f0_1"'))
+    robot = loaded(tmp_path, f'{text[:place]}<joint name="spread" axis="1 0 0" range="-20 20"/>{text[place:]}')
+    found = closing_motion(robot)
+    assert found.keys() == closing_motion(loaded(tmp_path, text)).keys() and "spread" not in found
+
+
+def test_a_tip_that_rolls_about_its_middle_closes_nothing(tmp_path):
+    text = world(slides())
+    for name in ("jaw0", "jaw1"):
+        place = text.index("</body>", text.index(f'name="{name}"'))
+        roller = f'<body name="{name}_tip" pos="0 0 .07"><joint name="{name}_roll" axis="0 0 1" range="-90 80"/><geom type="box" size=".004 .004 .01"/></body>'
+        text = text[:place] + roller + text[place:]
+    assert closing_motion(loaded(tmp_path, text)).keys() == {"slide0", "slide1"}

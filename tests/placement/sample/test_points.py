@@ -23,6 +23,14 @@ def test_points_are_taken_as_they_are():
     np.testing.assert_array_equal(found.cell, np.full((3, 2), -1))
 
 
+def test_a_cell_is_counted_from_0():
+    point = {"pos": [0, 0, 0], "normal": [0, 0, 1], "row": 0, "column": 0}
+    found = sample(surface_of(ball(0.01)), placement("points", points=[point, {**point, "column": 3}]), HERE)
+    np.testing.assert_array_equal(found.cell, [[0, 0], [0, 3]])
+    with pytest.raises(ValueError, match="greater than or equal to 0"):
+        placement("points", points=[{**point, "row": -1}])
+
+
 def test_points_from_a_file(tmp_path):
     text = "x, y, z, nx, ny, nz, radius, area\n1,2,3,0,0,2,,\n\n4,5,6,0,-3,4,0.01,1e-6\n"
     (tmp_path / "pads.csv").write_text("\ufeff" + text, encoding="utf-8")

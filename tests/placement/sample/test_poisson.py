@@ -85,9 +85,8 @@ def test_poisson_counts_touching_and_flush_faces_as_the_union_does(shift, size, 
     assert KDTree(found.pos).query(found.pos, k=2)[0][:, 1].min() > 0.2
 
 
-@pytest.mark.slow
 def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
-    inner, outer = ball(0.008), ball(0.01)
+    inner, outer = ball(0.008, subdivisions=3), ball(0.01, subdivisions=3)
     inner.faces = inner.faces[:, ::-1]
     hole = [mesh.faces[np.argmax(mesh.triangles_center[:, 2])] for mesh in (inner, outer)]
     joined = trimesh.util.concatenate([inner, outer])
@@ -99,8 +98,8 @@ def test_poisson_leaves_out_a_pocket_behind_a_pinhole():
     mesh = trimesh.Trimesh(joined.vertices, faces + tunnel, process=False)
     assert mesh.is_watertight
     assert mesh.body_count == 1
-    found = sample(surface_of(mesh), placement("poisson", count=300), HERE)
-    assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 3
+    found = sample(surface_of(mesh), placement("poisson", count=100), HERE)
+    assert (np.linalg.norm(found.pos, axis=1) < 0.0098).sum() <= 1
 
 
 def test_poisson_on_open_meshes():

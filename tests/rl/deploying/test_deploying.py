@@ -115,6 +115,7 @@ def test_an_emulated_hand_shows_what_the_simulation_does(task, blind):
 SOURCES = {"simulation": {}, "emulator": LOCKSTEP}
 
 
+@pytest.mark.slow
 def test_the_emulators_score_is_that_of_the_simulation(task, policy):
     """A policy that acts on what it feels: within the interval of as many episodes in environments."""
     env = TouchEnv(task, EPISODES, threads=1, overrides={"joint_vel": "measured"})
@@ -128,6 +129,7 @@ def test_the_emulators_score_is_that_of_the_simulation(task, policy):
     assert emulated.held == expected.held == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_contact_bits_are_forces_beyond_the_threshold(tmp_path, side):
     """The emulated hand feels forces that the policy does not see."""

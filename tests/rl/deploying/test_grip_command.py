@@ -17,6 +17,7 @@ PLAIN = {"touch": "none", "randomise.drive": {}, "randomise.push": {}}
 """Ideal drives, and no pushes."""
 
 
+@pytest.mark.slow
 def test_a_force_of_ones_own_is_commanded_throughout():
     """Whatever the object weighs; beyond the document's forces it is refused."""
     loaded = load_task(DOCUMENT, PLAIN)
@@ -29,6 +30,7 @@ def test_a_force_of_ones_own_is_commanded_throughout():
         GripForce.asked_for(loaded.spec, (9.0,))
 
 
+@pytest.mark.slow
 def test_the_number_of_an_environment_says_its_object():
     """The fourth of eight environments is what it is alone: object, command and start."""
     together = TouchEnv(DOCUMENT, 8, threads=1, overrides=PLAIN)

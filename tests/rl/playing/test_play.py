@@ -44,6 +44,7 @@ def test_nobody_and_chance(env):
     assert not torch.equal(once, again)
     assert torch.equal(actor_of(env, "random", seed=5)(obs), once)
     assert not torch.equal(actor_of(env, "random", seed=6)(obs), once)
+    assert torch.equal(actor_of(env, "random")(obs), actor_of(env, "random", seed=0)(obs))
     one = Draws(5, 1, first_env=2).uniform("played actions", torch.tensor([2]), 2, -1.0, 1.0)
     assert torch.equal(again[2:], one)  # the same for an environment however many there are
 

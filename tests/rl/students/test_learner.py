@@ -174,7 +174,8 @@ def test_memory_ends_with_episodes(make):
 @pytest.mark.parametrize(("aggregate", "kind"), [(1, "mlp"), (3, "mlp"), (3, "lstm")])
 def test_passes_go_through_rollouts_that_are_kept(make, aggregate, kind):
     """The first through the latest one; the others through any of the last, with what was said and remembered in it."""
-    found, rollouts, passes = make(aggregate=aggregate, epochs=12, networks__touch_kind=kind), [], []
+    chosen = {"types": ("depth",), "placements": ("ends",), "aggregate": aggregate, "epochs": 12}
+    found, rollouts, passes = make(**chosen, networks__touch_kind=kind), [], []
     learned = found._learned
 
     def noted():
@@ -263,19 +264,18 @@ def test_a_checkpoint_of_others_is_refused(make, tmp_path):
             restore(make(**chosen), read_checkpoint(file), file)
 
 
-@pytest.mark.parametrize("loss", ["mse", "inverse_variance"])
-def test_students_learn_what_they_can_see(make, loss):
+def test_students_learn_what_they_can_see(make):
     """A teacher that looks at joints alone, as all of them can."""
     chosen = {
-        "learning_rate": 1e-2,
+        "learning_rate": 3e-2,
         "max_grad_norm": "null",
         "clip": 1.0,
         "networks__hidden": "[16]",
         "networks__encoder__size": 8,
     }
     heads = "{goal_distance: {weight: 0.01, hidden: [4]}}"
-    found = make(num_envs=40, sees=("proprio",), loss=loss, decoders=heads, **chosen)
-    told = [found.iterate().told for _ in range(40)]
+    found = make(num_envs=40, sees=("proprio",), decoders=heads, **chosen)
+    told = [found.iterate().told for _ in range(12)]
     for key in found.keys:
         errors = [row[f"Loss/{key.name}"] for row in told]
         assert min(errors[-5:]) < 0.1 * errors[0]

@@ -149,7 +149,7 @@ def test_rubber_fingers_never_know(tmp_path):
     env = bin_of_balls(2, document=str(tmp_path / "rubber.yaml"))
     settled(env)
     put_on(env, [0, 0])
-    for _ in range(80):
+    for _ in range(40):
         made = env.step(still(env))
     assert env.task.is_touched.all() and not env.task.is_latched.any()
     assert (hottest(env) > 22.001).all() and (hottest(env) < 23.0).all() and (made.info.score == 0).all()

@@ -1,5 +1,6 @@
 """A run's folder: who runs in it, what a kill has left of its curve, and what is no run."""
 
+import contextlib
 import subprocess
 import sys
 
@@ -53,22 +54,33 @@ def test_what_is_no_curve_is_refused_before_a_run_goes_on(tmp_path, text, expect
     assert folder.curve.read_text() == text
 
 
+def is_held(folder):
+    """Whether the folder is refused to who comes second."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(folder.held())
+        except TgdslError as error:
+            return "run: another process runs in this folder; wait until it has ended" in str(error)
+    return False
+
+
 def test_two_processes_do_not_run_in_one_folder(tmp_path):
-    """Another one holds it; when that is killed, it is free."""
+    """A run holds it, by a lock of the folder; when a process that holds one is killed, it is free."""
     folder = RunFolder(tmp_path / "run")
-    code = f"import time; from pathlib import Path; from tgdsl.rl.train.folder import RunFolder\nwith RunFolder(Path({str(folder.path)!r})).held(): print(flush=True); time.sleep(600)"
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+    with folder.held():
+        assert is_held(RunFolder(folder.path))
+    assert not is_held(folder)
+    folder.path.mkdir(exist_ok=True)
+    code = (
+        "import fcntl, os, sys, time; fcntl.flock(os.open(sys.argv[1], 0), fcntl.LOCK_EX); print(flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(folder.path)], stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        with (
-            pytest.raises(TgdslError, match="run: another process runs in this folder; wait until it has ended"),
-            folder.held(),
-        ):
-            pass
+        assert is_held(folder)
         other.kill()
         other.wait()
-        with folder.held():
-            assert list(folder.path.iterdir()) == []
+        assert not is_held(folder) and list(folder.path.iterdir()) == []
 
 
 @pytest.mark.parametrize("text", ["[]", '{"starts": 3}', '{"starts": [{"seed": 0}]}', "{}"])

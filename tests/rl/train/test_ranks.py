@@ -60,7 +60,7 @@ def test_the_command_in_two_processes(tmp_path):
 
 
 def test_what_torchrun_says():
-    assert Ranks.of({}) == Ranks(0, 1, 0) and Ranks().rsl_rl is None and Ranks().is_first
+    assert Ranks.of({}) == Ranks() == Ranks(0, 1, 0) and Ranks().rsl_rl is None and Ranks().is_first
     two = Ranks.of({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"})
     assert (two.device("cuda"), two.device("cpu"), two.is_first) == ("cuda:1", "cpu", False)
     assert two.rsl_rl == {"global_rank": 1, "local_rank": 1, "world_size": 2}

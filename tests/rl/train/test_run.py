@@ -65,6 +65,18 @@ def test_a_checkpoint_holds_all_that_learning_goes_on_from(tmp_path):
     assert other.iteration == 4
 
 
+def test_a_checkpoint_of_a_gpu_goes_on_on_a_cpu(tmp_path, monkeypatch):
+    """Without the GPU's random numbers, which torch would keep until there is a GPU."""
+    monkeypatch.setattr(torch.cuda, "set_rng_state", lambda *_: pytest.fail("there is no GPU"))
+    run, _ = begun(tmp_path)
+    run.learn(1, float("inf"))
+    state = read_checkpoint(run._folder.checkpoint)
+    state["processes"][0]["cuda"] = torch.zeros(16, dtype=torch.uint8)
+    other, _ = small_learner(tmp_path, seed=5)
+    restore(other, state, run._folder.checkpoint)
+    assert torch.equal(torch.get_rng_state(), state["processes"][0]["cpu"])
+
+
 def test_a_learner_is_told_how_much_of_its_run_is_over(tmp_path, monkeypatch):
     """Of iterations, or of time, if of that more is over; what was learned before is included of both."""
     run, learner = begun(tmp_path)
@@ -337,6 +349,7 @@ run.learn(100, float("inf"))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "iteration"),
     [

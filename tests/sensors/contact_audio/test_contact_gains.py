@@ -61,7 +61,6 @@ def wanted(touch: TactileModule, places: np.ndarray) -> np.ndarray:
     return np.stack([found.real, found.imag], axis=1)[:, None]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
 def test_a_blow_strikes_each_mode_by_its_shape_there(tmp_path, dtype, tolerance):
     """The plate no longer touches anything when the impulse is passed on: it is that of where it was struck.
@@ -73,7 +72,6 @@ def test_a_blow_strikes_each_mode_by_its_shape_there(tmp_path, dtype, tolerance)
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max() + 1e-12)
 
 
-@pytest.mark.slow
 def test_the_centre_of_a_square_plate_rings_in_x2_plus_y2_alone(tmp_path):
     """xy, x² − y² and the pair have a node there; at the corner the first is louder than anywhere else of these places."""
     touch = plate(tmp_path, **GIVEN, scrape=0)
@@ -84,7 +82,6 @@ def test_the_centre_of_a_square_plate_rings_in_x2_plus_y2_alone(tmp_path):
     assert size[:, 0].argmax() == 1 and size[1, 0] > 2.0
 
 
-@pytest.mark.slow
 def test_scraping_is_heard_where_a_mode_moves(tmp_path):
     """The mean square of a mode's phasor is s² times that of gains in the mean, exactly: the noise is the same."""
     places = np.repeat(PLACES, 3, axis=0)
@@ -100,14 +97,12 @@ def test_scraping_is_heard_where_a_mode_moves(tmp_path):
     np.testing.assert_allclose(energy[0], energy[1] * (rate**2).sum(axis=1) / decay, rtol=1e-9, atol=1e-25)
 
 
-@pytest.mark.slow
 def test_environments_together_are_environments_alone(tmp_path):
     together = struck(plate(tmp_path, **GIVEN, scrape=0), PLACES)
     alone = [struck(plate(tmp_path, **GIVEN, scrape=0), PLACES[i : i + 1]) for i in range(len(PLACES))]
     np.testing.assert_allclose(np.concatenate(alone), together, rtol=0, atol=1e-15)
 
 
-@pytest.mark.slow
 def test_a_new_episode_forgets_what_is_pending(tmp_path):
     """Of two environments that were struck one is reset before the blow is passed on: it is silent, and the other is not."""
     touch = plate(tmp_path, **GIVEN, scrape=0)
@@ -118,7 +113,6 @@ def test_a_new_episode_forgets_what_is_pending(tmp_path):
     assert not heard[0].any() and heard[1].any()
 
 
-@pytest.mark.slow
 def test_an_artefact_knows_the_shapes(tmp_path):
     touch = plate(tmp_path, **GIVEN)
     tgdsl.save(touch, tmp_path / "plate.safetensors")
@@ -126,7 +120,6 @@ def test_an_artefact_knows_the_shapes(tmp_path):
     np.testing.assert_array_equal(struck(again, PLACES), struck(touch, PLACES))
 
 
-@pytest.mark.slow
 def test_bodies_of_one_shape_have_one_table(tmp_path):
     """Two equal plates: the nodes once, and what strikes the one is not heard of the other."""
     one = plate(tmp_path, **GIVEN).plan.sensors[0].constants
@@ -139,7 +132,6 @@ def test_bodies_of_one_shape_have_one_table(tmp_path):
     assert not found[:, 1].any()
 
 
-@pytest.mark.slow
 def test_an_account_says_how_exact_shapes_are(tmp_path):
     touch = plate(tmp_path, **GIVEN)
     said = r"plate: mode shapes on 2 × \d+ × \d+ nodes; interpolated within [01]\.\d% of a mode's mean on the surface"
@@ -147,7 +139,6 @@ def test_an_account_says_how_exact_shapes_are(tmp_path):
     assert "mode shapes" not in plate(tmp_path, **{**GIVEN, "gains": "mean"}).explain()
 
 
-@pytest.mark.slow
 def test_listed_modes_have_no_shapes(tmp_path):
     """Of one body of several too, and its name is said."""
     message = (
@@ -162,7 +153,6 @@ def test_listed_modes_have_no_shapes(tmp_path):
     assert message.format("other") in str(caught.value)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("of", ["link", "object"])
 def test_what_is_said_of_modal_analysis(tmp_path, of):
     """A line for each part that takes long, of each body; of what is kept already none of them."""
@@ -175,7 +165,6 @@ def test_what_is_said_of_modal_analysis(tmp_path, of):
         assert [own.startswith(part) for own, part in zip(said[1:], wanted, strict=True)] == [True] * len(wanted)
 
 
-@pytest.mark.slow
 def test_a_ball_that_mujoco_drops_on_a_plate(tmp_path):
     """At the centre the plate's first mode, xy, hardly rings; near a corner it does; both are struck."""
     touch = plate(tmp_path, **GIVEN, scrape=0)

@@ -25,7 +25,6 @@ def dropped(tmp_path):
     return build
 
 
-@pytest.mark.slow
 def test_amplitude_grows_with_impulse():
     """Six heights, a factor of 32: the slope of log amplitude over log impulse is 1, and the amplitude is the impulse."""
     found = impact()
@@ -45,7 +44,6 @@ def test_a_collision_sounds_the_same_at_any_time_step(dropped):
     assert np.ptp(found, axis=0).max() < 0.1 * np.max(found)
 
 
-@pytest.mark.slow
 def test_a_ball_at_rest_is_silent(dropped):
     """It is heard when it lands, and no more once it lies: neither as it goes on, nor in an episode that begins so."""
     sim, touch = dropped(heights=np.array([0.002]), stiffness="0.01 1")

@@ -13,8 +13,7 @@ from tgdsl.report.oracles.setups.sounds import STEP, half_sine, plate, pressed, 
 MODE = [{"frequency": 1000.0, "decay": 10.0, "gain": 1.0}]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("duration", [0.0005, 0.001, 0.002, 0.004])
+@pytest.mark.parametrize("duration", [0.0005, 0.004])
 def test_a_collision_strikes_once_with_its_impulse_whatever_the_number_of_steps(duration):
     """0.02 N·s in one step to 16 steps: within the share T/τ of it, and alike for all steps."""
     found = oracles.collision(duration)
@@ -33,10 +32,9 @@ def test_a_steady_load_makes_no_sound(tmp_path):
     assert not found.any()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rate", [20.0, 200.0])
-def test_a_slow_load_hardly_sounds(tmp_path, rate):
+def test_a_slow_load_hardly_sounds(tmp_path):
     """A load that rises for 0.3 s strikes once it no longer rises, with R τ²; as a blow of a step ΔF it would with ΔF Δt."""
+    rate = 200.0
     loads = np.minimum(np.arange(400) * STEP, 0.3) * rate
     impulse, last = struck(plate(tmp_path, modes=MODE, scrape=0), loads, MODE[0]["decay"])
     assert impulse == pytest.approx(rate * 0.02**2, rel=0.1)
@@ -58,7 +56,6 @@ def test_the_next_collision_is_heard_for_itself(tmp_path):
     np.testing.assert_allclose(found, sum(waves), rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_the_level_of_scraping_is_as_the_equation_says():
     """The mean square of the samples is g² m_s F v/(4d): 10 dB for ten times the force or ten times the speed."""
     found = oracles.scraping()
@@ -66,7 +63,6 @@ def test_the_level_of_scraping_is_as_the_equation_says():
     np.testing.assert_allclose(10 * np.log10(found.ours[1:] / found.ours[0]), 10, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_the_spectrum_of_scraping_is_that_of_the_modes(tmp_path):
     """The noise itself is white: two modes of the same decay and gain are as loud, a low one and one near the end."""
     modes = [{"frequency": f, "decay": 300.0, "gain": 1.0} for f in (400.0, 4100.0)]

@@ -46,7 +46,6 @@ def document(folder, mesh: trimesh.Trimesh, **sensor) -> dict:
     return found
 
 
-@pytest.mark.slow
 def test_thin_walled_boxes_of_geoms_and_of_a_mesh(tmp_path):
     """Six slabs, and a mesh with an inner shell, which MuJoCo collides as its hull: both ring as the box with a cavity."""
     touch = tgdsl.compile(document(tmp_path, thin_box(SIDE, WALL), modes={"material": "steel", "count": 6}, samples=64))

@@ -154,7 +154,6 @@ def test_the_kernel_is_the_torch_code():
     interpreted(__file__)
 
 
-@pytest.mark.slow
 def test_a_distance_is_less_than_a_cell_below_that_of_the_next_node():
     """By this the kernel passes over points; half a cell's diagonal is 0.87 cells, the rest is for what interpolation adds."""
     sensor = {"kind": "elastomer", "links": "hand", "feels": ["cube"], "anchors": "points", "points": 50}

@@ -168,7 +168,6 @@ def test_below_the_cap_nothing_slides():
     np.testing.assert_array_equal([skin.memory[name] for name in PLANES], anchor)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("part", ["out", "back", "again"])
 def test_a_tangential_cycle_is_the_winkler_coulomb_loop(part):
     """A sphere held in a pad and moved to and fro: Winkler's curve, and back and forth by Masing's rule."""

@@ -51,7 +51,6 @@ class Unsheared(KindConformance):
     num_envs = 4
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("suite", "tolerance"), [(BondedLayer(), 1e-5), (Unsheared(), 1e-12)])
 def test_other_kernels_equal_their_reference(tmp_path, suite, tolerance):
     """The layer's table against the integrals themselves; pressure without shear, which keeps no state."""

@@ -87,7 +87,6 @@ def test_the_table_is_the_integral():
     assert_holds(layer.table())
 
 
-@pytest.mark.slow
 def test_a_layer_moves_nothing_at_its_base_and_no_volume_if_incompressible():
     assert_holds(layer.bonded_base())
     assert_holds(layer.no_volume())
@@ -99,7 +98,6 @@ def test_the_force_of_a_ball(compare):
     assert_holds(compare())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kernel", markers.SKINS)
 def test_twice_the_taxels_change_the_mean_little(kernel):
     """A ball pressed into a pad of 12² and of 17² taxels (half the area each): mean |u| over the pad within 2 %, for each part."""

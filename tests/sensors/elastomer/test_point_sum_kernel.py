@@ -10,7 +10,7 @@ from pulling_points import CASES, given
 from tgdsl.geometry.planes import vec
 from tgdsl.sensors.elastomer.point_anchors import POINT_SUM, Markers, ShearLoad
 
-pytestmark = needs_triton
+pytestmark = [needs_triton, pytest.mark.slow]
 TOLERANCE = 1e-5
 """Of the largest sum: what float32 leaves of positions of some centimetres and of a few hundred terms."""
 
@@ -77,7 +77,6 @@ def found() -> dict:
     return json.loads(interpreted(__file__))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_kernel_is_the_sum(found, name):
     assert max(found[name]) < TOLERANCE  # of strengths, and of how many there are

@@ -97,7 +97,6 @@ def test_a_cube_turned_about_the_normal_twists_the_markers(tmp_path):
     assert np.linalg.norm(found[0]) < 0.05 * twist.mean()
 
 
-@pytest.mark.slow
 def test_many_points_and_many_taxels_agree(tmp_path):
     """Under a flat face the anchors of taxels and of points are two quadratures of one integral."""
     line = np.linspace(-0.029, 0.029, 30)
@@ -115,7 +114,6 @@ def test_many_points_and_many_taxels_agree(tmp_path):
     assert np.sqrt(((points - taxels) ** 2).mean() / (taxels**2).mean()) < 0.03
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("friction", [None, 0.3])
 def test_gradients_by_pose_with_anchors_held(tmp_path, friction):
     """Of the second call, while points stick, or some of them slide: against central differences."""

@@ -141,7 +141,6 @@ def test_a_small_correction_is_the_least_norm_one():
         np.testing.assert_allclose(share[0], linear, atol=10 * size**2)
 
 
-@pytest.mark.slow
 def test_four_steps_suffice_where_the_moment_is_in_reach():
     """Contacts anywhere in the middle of the pad: four steps leave little of force times footprint, and twelve leave less.
 
@@ -161,7 +160,6 @@ def test_four_steps_suffice_where_the_moment_is_in_reach():
     assert (twelve <= 1.01 * four + 1e-15).all()
 
 
-@pytest.mark.slow
 def test_more_steps_never_leave_more():
     """Also where the moment is out of reach, and with depths that span three decades: no step makes the residual grow for good."""
     rng = np.random.default_rng(8)
@@ -234,7 +232,6 @@ def test_taxels_that_face_a_contact_more_carry_more():
         np.testing.assert_allclose(share[0], expected, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
     """A ball rolls around a round finger of 8 mm whose front has taxels: to the back all is handed over, without a jump.
 
@@ -254,11 +251,11 @@ def test_forces_are_continuous_as_a_contact_goes_around_a_finger():
             found.append(np.concatenate([(share.T @ force).ravel(), left / 0.02, [share.sum()]]))
         return np.array(found)
 
-    coarse, fine = roll(401), roll(801)
+    coarse, fine = roll(201), roll(401)
     np.testing.assert_array_equal(coarse[-1], 0)
     assert coarse[0, -1] == pytest.approx(1, abs=1e-12)
     change = np.abs(np.diff(coarse, axis=0)).max()
-    assert change < 12 * np.pi / 400  # some times the force per radian
+    assert change < 12 * np.pi / 200  # some times the force per radian
     assert np.abs(np.diff(fine, axis=0)).max() == pytest.approx(change / 2, rel=0.2)
 
 

@@ -30,7 +30,6 @@ class TestForceTaxel(KindConformance):
     kind = FORCE_TAXEL
     float64_tolerance = 1e-11  # a step towards the moment solves a system of condition up to 1e3, and there are four
 
-    @pytest.mark.slow
     def test_what_is_missed_and_left_over_are_the_references(self, scene):
         module, reference = self.build(self.document(scene), torch.float64)
         for state in self.states(module):
@@ -43,7 +42,6 @@ class TestForceTaxel(KindConformance):
             assert readings["s/missed"].abs().max() > 0.1
             assert readings["s/residual"].abs().max() > 1e-4
 
-    @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore:contacts of")
     def test_what_slots_lack_is_shared_out_as_in_the_reference(self, scene):
         """Pairs whose net force is that of more contacts than are shown: the definition adds it up one contact at a time."""
@@ -99,7 +97,6 @@ def test_contacts_beyond_the_slots_act_where_the_others_do(tmp_path):
     assert not readings["s"][0][np.linalg.norm(away, axis=1) > FOOTPRINT].any()
 
 
-@pytest.mark.slow
 def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
     """From the pad's middle to beyond its reach: force and missed always sum to the contact's, and neither ever jumps."""
     touch = pad(tmp_path)
@@ -118,7 +115,6 @@ def test_a_contact_that_slides_off_hands_its_force_over(tmp_path):
     assert ((captured > 0.01) & (captured < 0.99)).sum() > 10
 
 
-@pytest.mark.slow
 def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
     """A ball rolls over the edge of the pad at the outermost taxels: the normal turns, and by a right angle all is missed."""
     touch = pad(tmp_path)
@@ -138,7 +134,6 @@ def test_a_contact_that_turns_around_an_edge_hands_its_force_over(tmp_path):
 HANDS = {"xhand1": "*_link2", "sharpa": "*_elastomer"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("hand", HANDS)
 def test_the_nail_is_not_the_pad(hand, side):

@@ -55,7 +55,6 @@ def test_a_sliding_cube_drags_the_sensor_along_with_it(motion):
     assert_holds(forces.friction_cone(motion))
 
 
-@pytest.mark.slow
 def test_an_impact_adds_up_to_the_change_of_momentum():
     assert_holds(forces.impact())
 

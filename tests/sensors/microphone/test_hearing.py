@@ -20,7 +20,6 @@ def build(tmp_path):
     return compiled
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("falloff", [1.0, 2.0, 0.5])
 def test_level_is_that_of_the_inverse_law(falloff):
     """To 1e-3, from 25 cm to 8 m: the amplitude of a tone is 1/r^p."""
@@ -42,18 +41,15 @@ def test_a_pulse_arrives_when_sound_does():
     assert_holds(oracles.pulse())
 
 
-@pytest.mark.slow
 def test_doppler_shift():
     """f′ − f to 1 %: f/(1 + v/c) of a source that moves away with v, f (1 − v/c) of a microphone that does."""
     assert_holds(oracles.doppler())
 
 
-@pytest.mark.slow
 def test_of_both_in_motion_the_shift_is_the_product():
     assert_holds(oracles.doppler_of_both())
 
 
-@pytest.mark.slow
 def test_a_source_that_flies_by_is_heard_without_a_jump(build):
     """At 30 m/s and 30 cm: successive samples of a low tone differ by no more than its slope and level allow."""
     touch = build(tone={"frequency": 200.0})
@@ -122,7 +118,6 @@ def test_a_jump_without_a_reset_is_heard_as_one_and_nothing_lasts(build):
     assert samples.square().mean().mul(2).sqrt() == pytest.approx(0.25, rel=1e-2)
 
 
-@pytest.mark.slow
 def test_single_precision_hears_the_same_for_long(build):
     """A kilometre from the origin: samples as the float64 module has them, to what the time of a float32 clock is worth."""
     found = [

@@ -22,8 +22,6 @@ SCENE = """
 </worldbody></mujoco>
 """
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def touch():
@@ -39,6 +37,7 @@ def readings(touch):
     return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}
 
 
+@pytest.mark.slow
 def test_it_runs_from_the_command_line(here, tmp_path):
     code, out, err = here(tmp_path, "run", str(EXAMPLE), "--keyframes", "squeeze", "--seconds", "0.05")
     assert code == 0, err
@@ -54,6 +53,7 @@ def test_every_observation_type_of_the_paper_is_there(touch):
     assert types == known - {"none", "link_bool", "link_force", "reading"} - of_the_hand
 
 
+@pytest.mark.slow
 def test_the_clean_reading_is_that_of_a_clean_sensor(touch, readings):
     """`touch/clean` is what the same document reads with `readout: clean`; the measured one differs where something is felt."""
     clean = tgdsl.compile(EXAMPLE, overrides={"sensors": CLEAN, "observations": "{}"})
@@ -69,6 +69,7 @@ def test_the_clean_reading_is_that_of_a_clean_sensor(touch, readings):
 CLEAN = "{touch: {kind: kinematic_taxel, links: hand, feels: [cube], noise: noisy, readout: clean}}"
 
 
+@pytest.mark.slow
 def test_readings_are_of_the_quantisers_steps(touch, readings):
     """Steps of the paper's table: 0.1 mm, 0.01 N and 0.1 mm; where `worn` says so, none on the palm."""
     for name, step in {"depth": 1e-4, "touch": 1e-2, "near": 1e-2, "skin": 1e-4}.items():
@@ -81,6 +82,7 @@ def test_readings_are_of_the_quantisers_steps(touch, readings):
     assert ((share - share.round()).abs() > 1e-2)[..., is_palm, :].float().mean() > 0.8
 
 
+@pytest.mark.slow
 def test_the_skin_takes_a_sample_at_every_second_call(readings):
     """50 Hz read every 10 ms: each value stands twice, and then changes."""
     skin = readings["skin"]
@@ -88,6 +90,7 @@ def test_the_skin_takes_a_sample_at_every_second_call(readings):
     assert (skin[2::2] != skin[1:-1:2]).flatten(1).any(dim=1).all()
 
 
+@pytest.mark.slow
 def test_the_history_is_the_last_three_readings(readings):
     worn = readings["worn"]
     torch.testing.assert_close(worn[2:, :, 0], worn[:-2, :, 2], rtol=0, atol=0)

@@ -54,7 +54,7 @@ RADIUS_ERRORS = {"points": 1e-12, "field": 0.1}
 """Largest error over full scale at R ± ρ, against a module that is compiled with that radius."""
 
 
-@pytest.mark.parametrize("backend", ["points", pytest.param("field", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", ["points", "field"])
 def test_radius_noise_of_proximity(tmp_path, monkeypatch, backend):
     made = document(tmp_path, {"s": {"kind": "proximity", "backend": backend, "tolerance": 0.02, "points": 1000}})
     (tmp_path / "scene.xml").write_text(SCENE.replace('type="sphere" size=".025"', 'type="box" size=".01 .01 .01"'))

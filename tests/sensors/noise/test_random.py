@@ -87,7 +87,6 @@ def test_a_seed_and_a_name_are_told_apart():
     assert random.sensor_key(1, "2touch") != random.sensor_key(12, "touch")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("along", ["taxel", "env", "step", "episode", "seed"])
 def test_each_bit_is_set_half_the_time(along):
     found = {
@@ -107,7 +106,6 @@ def flips(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(np.abs(bits.mean(axis=0) - 0.5).max() / (0.5 / np.sqrt(len(bits))))
 
 
-@pytest.mark.slow
 def test_neighbours_differ_in_half_their_bits():
     """Of neighbouring taxels, environments, steps, episodes, purposes, sensors and seeds each bit flips half the time."""
     base = {"env": 1000, "count": 1000}

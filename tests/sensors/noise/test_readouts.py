@@ -1,8 +1,10 @@
 """Clean and measured readings, what each knob remembers, and what `explain` tells of it."""
 
+from pathlib import Path
+
 import pytest
 import torch
-from noisy_modules import EVERY_KNOB, EXAMPLE, RANGES, assert_same, read
+from noisy_modules import EVERY_KNOB, EXAMPLE, RANGES, assert_same, document, read
 from ruamel.yaml import YAML
 
 import tgdsl
@@ -10,26 +12,22 @@ from tgdsl.sensors import KINDS
 from tgdsl.sensors.noise import PROFILES
 
 
-def example_of(kind: str, **changes) -> dict:
-    """The example with one sensor, of a kind, at low resolution."""
-    made = YAML(typ="safe").load(EXAMPLE)
-    made["robot"] = {
-        "model": str(EXAMPLE.parent / made["robot"]["model"]),
-        "layout": str(EXAMPLE.parent / made["robot"]["layout"]),
-    }
-    made["scene"] = {"model": str(EXAMPLE.parent / made["scene"]["model"])}
-    (own,) = (sensor for sensor in made["sensors"].values() if sensor["kind"] == kind)
-    return {**made, "resolution": "low", "sensors": {"s": {**own, **changes}}, "observations": {}}
+def example_of(folder: Path, kind: str, **changes) -> dict:
+    """A sensor of a kind as in the example, on two small links."""
+    (own,) = (sensor for sensor in YAML(typ="safe").load(EXAMPLE)["sensors"].values() if sensor["kind"] == kind)
+    coarse = {"proximity": {"tolerance": 0.1}}.get(kind, {})
+    made = document(folder, {"s": {**own, "links": ["pad", "tip"], "feels": ["item"], **coarse, **changes}})
+    made["objects"]["item"] |= {"material": "aluminium", "temperature": 45.0}
+    return made
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind.name for kind in KINDS if kind.knobs])
 @pytest.mark.filterwarnings("ignore:sensor .* the profile .noisy. has no knobs:UserWarning")
-def test_both_readouts(kind):
+def test_both_readouts(tmp_path, kind):
     """`s` is what a measured sensor reads, and `s/clean` is to the bit what one without noise reads."""
-    both = tgdsl.compile(example_of(kind, noise="noisy", readout="both"))
-    measured = tgdsl.compile(example_of(kind, noise="noisy"))
-    clean = tgdsl.compile(example_of(kind))
+    both = tgdsl.compile(example_of(tmp_path, kind, noise="noisy", readout="both"))
+    measured = tgdsl.compile(example_of(tmp_path, kind, noise="noisy"))
+    clean = tgdsl.compile(example_of(tmp_path, kind))
     shapes = {output.name: output.shape for output in both.outputs}
     assert shapes["s"] == shapes["s/clean"] == clean.outputs[0].shape
     is_noisy = kind in PROFILES["noisy"]

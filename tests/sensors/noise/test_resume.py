@@ -5,7 +5,6 @@ import torch
 from noisy_modules import CONTACT_NOISE, EVERY_KNOB, RANGES, assert_same, held_state, read
 
 
-@pytest.mark.slow
 def test_kill_and_resume(build, tmp_path):
     """Through a file and a fresh module, wherever it is cut: noise, delay, hysteresis, drift, rate, history, bits."""
     sensors = {

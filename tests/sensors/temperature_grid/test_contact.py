@@ -11,13 +11,12 @@ from tgdsl.report.oracles import heat
 from tgdsl.report.oracles.setups.boxes import begin, cells_of, heat_module, heat_state
 
 
-@pytest.mark.parametrize("steps", [500, 1000])
-def test_aluminium_on_warm_rubber_warms_as_two_solids_do(steps):
+def test_aluminium_on_warm_rubber_warms_as_two_solids_do():
     """Carslaw and Jaeger, 2.14: both surfaces go to (e₁T₁ + e₂T₂)/(e₁ + e₂) at once and stay there, √(kρc) being e.
 
     Aluminium at 22 °C on rubber at 45 °C: its surface rises by 0.69 K, and erfc(x/√4αt) of it at depth x.
     """
-    found = heat.two_bodies(steps)
+    found = heat.two_bodies(400)
     assert_holds(found)
     assert found.atol == pytest.approx(0.01 * 0.69, rel=0.01)
 
@@ -81,7 +80,7 @@ def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
     """For any step, conductivity and area, with two objects and another link at once, losses on."""
     rng = np.random.default_rng(1)
     slack = 1e-10 if dtype == torch.float64 else 3e-5
-    for dt, k, area in itertools.product((1e-4, 0.01, 1.0, 10.0), (0.1, 400.0), (1e-9, 1e-5, 1e-2)):
+    for k, area in itertools.product((0.1, 400.0), (1e-9, 1e-5, 1e-2)):
         material = {"like": "steel", "conductivity": k}
         objects = {
             "hot": ([0.03] * 3, {"material": {"like": "copper", "conductivity": k}, "temperature": 80.0}),
@@ -94,12 +93,14 @@ def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
             ("tip", name): [(tuple(rng.uniform(-5e-3, 5e-3, 3)), tuple(n), 1.0)]
             for name, n in zip(objects, np.eye(3), strict=True)
         }
-        state = heat_state(module, dt, contacts)
-        begin(module, state)
-        for _ in range(4):
-            readings = module(state)
-            every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]])
-            assert float(every.min()) >= -20.0 - slack and float(every.max()) <= 80.0 + slack
+        for dt in (1e-4, 0.01, 1.0, 10.0):
+            module.reset()
+            state = heat_state(module, dt, contacts)
+            begin(module, state)
+            for _ in range(4):
+                readings = module(state)
+                every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]])
+                assert float(every.min()) >= -20.0 - slack and float(every.max()) <= 80.0 + slack
 
 
 def test_reading_more_often_differs_by_the_step(tmp_path):
@@ -116,7 +117,7 @@ def test_reading_more_often_differs_by_the_step(tmp_path):
             )
             state = heat_state(module, dt * every / 5, {("tip", "ball"): [((0, 0, 0.005), (0, 0, -1), 2.0)]})
             begin(module, state)
-            for _ in range(round(2.0 / (dt * every / 5))):
+            for _ in range(round(1.0 / (dt * every / 5))):
                 readings = module(state)
             found[dt, every] = readings["heat"][0, :, 0]
     apart = [float((found[dt, 1] - found[dt, 5]).abs().max()) for dt in (0.2, 0.1, 0.05)]

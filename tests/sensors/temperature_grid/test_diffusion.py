@@ -57,7 +57,7 @@ def test_only_spectral_oversteps_a_jump(tmp_path):
     assert 1.0 < beyond["spectral"] < 5.0
 
 
-@pytest.mark.parametrize("seconds", [1.0, 4.0, 10.0])
+@pytest.mark.parametrize("seconds", [1.0, 4.0])
 def test_a_thick_solid_warms_under_a_constant_flux(seconds):
     assert_holds(heat.thick_solid(seconds))
     assert_holds(heat.thick_solids_surface(seconds))

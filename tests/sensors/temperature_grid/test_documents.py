@@ -11,7 +11,6 @@ ROOT = Path(__file__).parents[3]
 BLOCKS = [part.split("```")[0] for part in (ROOT / "docs" / "heat.md").read_text().split("```yaml\n")[1:]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("text", BLOCKS)
 def test_what_the_docs_show_compiles(text, tmp_path):
     path = tmp_path / "heat.yaml"
@@ -20,7 +19,6 @@ def test_what_the_docs_show_compiles(text, tmp_path):
     assert [output.name for output in touch.outputs] == ["heat", "heat/heat", "heat/objects"]
 
 
-@pytest.mark.slow
 def test_a_warm_cube_warms_the_palm():
     """What the links gain since the episode began is what the cube lost: 0.25 kg of it rests on the palm."""
     touch = tgdsl.compile(ROOT / "examples" / "warm_palm.yaml")

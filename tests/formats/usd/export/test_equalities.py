@@ -84,6 +84,17 @@ def test_the_same_constraints(twins):
     assert [two.equality(i).name for i, name in enumerate(names) if name] == [name for name in names if name]
 
 
+def test_a_coupling_that_is_off_stays_off(tmp_path):
+    first, second = twins_of(tmp_path, HAND.replace('joint2="a" polycoef', 'joint2="a" active="false" polycoef'))
+    assert first.equality("a2").active0 == second.equality("a2").active0 == 0
+    assert (
+        not Usd.Stage.Open(str(next(tmp_path.glob("*.usda"))))
+        .GetPrimAtPath("/closed/joints/a2")
+        .GetAttribute("newton:mimicEnabled")
+        .Get()
+    )
+
+
 @pytest.mark.parametrize("chosen", ["as written", "all others"])
 def test_the_same_motion(twins, chosen):
     """Positions of all bodies over 500 steps; then with the constraints that were off, and without the others."""

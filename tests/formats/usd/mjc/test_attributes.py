@@ -5,12 +5,15 @@ what MJCF's documentation says of the attribute of the same name, and what the s
 """
 
 import math
+from contextlib import contextmanager
 
 import mujoco
 import numpy as np
 import pytest
 from schema_stages import PRIMS, author, schema_stage
 from stages import compiled, warned
+
+from tgdsl.scene.compare import differing_fields
 
 DEGREE = math.radians(1)
 REF, IMP = [0.03, 0.8], [0.7, 0.9, 0.002, 0.4, 3.0]
@@ -270,20 +273,39 @@ def flat(table):
     return [(where, name, value) for where, rows in table.items() for name, value in rows.items()]
 
 
-@pytest.mark.parametrize(("where", "name", "value", "field", "expected"), SEEN, ids=[f"{row[0]}-{row[1]}" for row in SEEN])
-def test_what_is_read(tmp_path, where, name, value, field, expected):
-    """No warning comes: warnings are errors."""
-    stage = schema_stage(tmp_path)
-    assert not np.array_equal(field(compiled_of(stage, name)), expected)  # it is not so anyway
-    author(stage.GetPrimAtPath(PRIMS[where]), name, value)
-    np.testing.assert_allclose(field(compiled(stage)), expected, rtol=1e-6)
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    """The stage without any of the attributes."""
+    return schema_stage(tmp_path_factory.mktemp("stage"))
 
 
-def compiled_of(stage, name):
-    """Return the model without the attribute; a keyframe is there as soon as it holds anything."""
-    if name.startswith("mjc:q"):
-        author(stage.GetPrimAtPath("/key"), "mjc:ctrl", [0.0, 0.0])
+@pytest.fixture(scope="module")
+def plain(stage):
+    """Its model."""
     return compiled(stage)
+
+
+@contextmanager
+def authored(stage, where, name, value):
+    """Have the stage hold one attribute for a while."""
+    prim = stage.GetPrimAtPath(PRIMS[where])
+    author(prim, name, value)
+    try:
+        yield
+    finally:
+        prim.RemoveProperty(name)
+
+
+def test_what_is_read(stage, plain, subtests):
+    """No warning comes: warnings are errors."""
+    with authored(stage, "key", "mjc:ctrl", [0.0, 0.0]):
+        with_key = compiled(stage)
+    for where, name, value, field, expected in SEEN:
+        with subtests.test(where=where, name=name):
+            assert not np.array_equal(field(with_key if where == "key" else plain), expected)  # it is not so anyway
+            with authored(stage, where, name, value):
+                model = compiled(stage)
+            np.testing.assert_allclose(field(model), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("where", "name", "array"), LIMITED, ids=[f"{row[0]}-{row[1]}" for row in LIMITED])
@@ -303,25 +325,21 @@ def test_limits_hold_as_the_compiler_says(tmp_path, where, name, array, is_auto)
         assert getattr(compiled(stage), array)[0] == limited
 
 
-@pytest.mark.parametrize(("where", "name", "value"), flat(WARNED), ids=[f"{w}-{n}" for w, n, _ in flat(WARNED)])
-def test_what_is_not_read_is_named(tmp_path, where, name, value):
-    stage = schema_stage(tmp_path)
-    author(stage.GetPrimAtPath(PRIMS[where]), name, value)
-    _, messages = warned(stage)
-    assert len(messages) == 1
-    assert name in messages[0] or name.rpartition(":")[0] in messages[0]
-    assert messages[0].endswith(PRIMS[where])
+def test_what_is_not_read_is_named(stage, plain, subtests):
+    for where, name, value in flat(WARNED):
+        with subtests.test(where=where, name=name), authored(stage, where, name, value):
+            _, messages = warned(stage)
+            assert len(messages) == 1
+            assert name in messages[0] or name.rpartition(":")[0] in messages[0]
+            assert messages[0].endswith(PRIMS[where])
 
 
-@pytest.mark.parametrize(("where", "name", "value"), flat(SILENT), ids=[f"{w}-{n}" for w, n, _ in flat(SILENT)])
-def test_what_says_nothing_changes_nothing(tmp_path, where, name, value):
-    stage = schema_stage(tmp_path)
-    before = compiled(stage)
-    author(stage.GetPrimAtPath(PRIMS[where]), name, value)
-    after = compiled(stage)
-    assert (before.nu, before.neq, before.nexclude) == (after.nu, after.neq, after.nexclude)
-    for array in ("body_inertia", "jnt_range", "geom_gap", "mesh_vert", "tendon_range", "actuator_gear"):
-        np.testing.assert_array_equal(getattr(before, array), getattr(after, array))
+def test_what_says_nothing_changes_nothing(stage, plain, subtests):
+    for where, name, value in flat(SILENT):
+        with subtests.test(where=where, name=name):
+            with authored(stage, where, name, value):
+                after = compiled(stage)
+            assert differing_fields(plain, after) == []
 
 
 def test_newtons_values_are_in_the_stages_units(tmp_path):

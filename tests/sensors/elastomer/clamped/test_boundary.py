@@ -83,7 +83,6 @@ def test_exact_solutions(shape, bulk):
     assert error < RULE * np.abs(field(pad.edge_pos[:, :2])).max()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", [pads.l_shape(), pads.ring()], ids=["l_shape", "ring"])
 def test_order_of_convergence(shape, monkeypatch):
     """Quadratic elements of one size on a polygon: third order."""

@@ -230,7 +230,6 @@ def test_taxels_off_a_coarse_cylinder_are_projected(offset):
     np.testing.assert_allclose(distances(places(pad)), 8 * MM * np.abs(angle[:, None] - angle), atol=0.02 * 8 * MM)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("facing", [(1, 0, 0), (0, 1, 0), (0, 0, -1)])
 @pytest.mark.parametrize("part", ["finger_link2", "thumb_link2"])
 def test_the_side_of_a_real_fingertip(part, facing):

@@ -1,0 +1,78 @@
+"""The wheel in an empty environment outside the clone: a document that names one of its robots compiles and runs."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+DOCUMENT = """\
+tgdsl: 1
+robot: {model: xhand1}
+objects:
+  ball: {geom: {type: sphere, size: [15 mm], density: 600}, pos: [0.08, 0, 0.15]}
+resolution: low
+sensors:
+  touch: {kind: contact_depth, links: tips, feels: [ball]}
+"""
+MINUTES_TO_INSTALL = 6
+
+
+def python_of(version: str) -> Path | None:
+    """Return an interpreter of a version: this one, one on PATH that starts, or one of pyenv."""
+    candidates = [sys.executable, shutil.which(f"python{version}"), *Path.home().glob(f".pyenv/versions/{version}*/bin/python")]
+    for candidate in filter(None, candidates):
+        asked = subprocess.run([candidate, "--version"], capture_output=True, text=True)
+        if asked.returncode == 0 and asked.stdout.startswith(f"Python {version}."):
+            return Path(candidate)
+    return None
+
+
+@pytest.fixture(scope="session")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel of this clone."""
+    folder = tmp_path_factory.mktemp("wheel")
+    built = subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, REPOSITORY],
+        capture_output=True,
+        text=True,
+    )
+    if built.returncode:
+        pytest.skip(f"the wheel cannot be built, as without an index for hatchling: {built.stderr[-300:]}")
+    return next(folder.glob("*.whl"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["3.11", "3.13"])
+def test_a_robot_of_the_wheel_compiles_and_runs(wheel, version, tmp_path):
+    python = python_of(version)
+    if python is None:
+        pytest.skip(f"there is no Python {version}")
+    subprocess.run([python, "-m", "venv", tmp_path / "venv"], check=True, capture_output=True)
+    commands = tmp_path / "venv" / "bin"
+    pip = [commands / "pip", "install", "--quiet", "-c", REPOSITORY / "constraints.txt", wheel]
+    try:
+        installed = subprocess.run(pip, capture_output=True, text=True, timeout=60 * MINUTES_TO_INSTALL)
+    except subprocess.TimeoutExpired:
+        pytest.skip(f"torch and the rest were not installed for Python {version} in {MINUTES_TO_INSTALL} minutes")
+    if installed.returncode:
+        pytest.skip(f"an index is missing for Python {version}: {installed.stderr[-300:]}")
+
+    (tmp_path / "hand.yaml").write_text(DOCUMENT)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    for arguments in (["compile", "hand.yaml", "-o", "hand.safetensors"], ["run", "hand.safetensors", "--seconds", "0.05"]):
+        ran = subprocess.run([commands / "tgdsl", *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "out" / "readings.npz").is_file() and (tmp_path / "out" / "picture.png").is_file()
+    where = subprocess.run(
+        [commands / "python", "-c", "import tgdsl; print(tgdsl.__file__)"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert where.stdout.startswith(str(tmp_path))
+    shutil.rmtree(tmp_path / "venv")  # some gigabytes
