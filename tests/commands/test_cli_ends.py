@@ -143,7 +143,6 @@ def test_a_picture_that_grows_too_large(base):
     assert files_in(base / "out") == ["readings.npz"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

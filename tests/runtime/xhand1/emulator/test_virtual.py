@@ -81,7 +81,6 @@ def test_readings_come_as_fast_as_the_line_carries_them(monkeypatch):
     assert max(reading.received_at - reading.requested_at for reading in readings) < EXCHANGE_S + 0.002
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_one_reply_in_twenty_is_faulty(fault, monkeypatch):
     stamps = Stamps()
@@ -105,7 +104,6 @@ def test_every_reply_is_faulty(fault, monkeypatch):
             assert type(failure) is not HandError
 
 
-@pytest.mark.slow
 def test_all_faults_at_once(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=5) as (hand, port, time):

@@ -151,7 +151,6 @@ def test_what_is_not_newer_is_refused(tmp_path):
         assert (log.num_readings, log.num_faults) == (1, 1)
 
 
-@pytest.mark.slow
 def test_a_long_log_takes_little_memory(tmp_path):
     """10 MB of readings; what is in memory at a time is a few chunks of 1 MB."""
     reading = random_readings(np.array([1.0]))[0]

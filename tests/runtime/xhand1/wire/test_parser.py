@@ -123,7 +123,6 @@ def test_a_frame_within_another_is_payload():
     assert parsed(outer, [10, 12]) == [(0x80, 0xFE, 0x15, b"<" + inner + b">")]
 
 
-@pytest.mark.slow
 def test_heads_that_lead_nowhere_keep_memory_and_work_bounded():
     """Each head promises the longest frame: every candidate costs one checksum of 8 KiB, no more."""
     parser = FrameParser()
