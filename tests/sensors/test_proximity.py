@@ -39,7 +39,7 @@ class TestProximityOverPointsAsInThePaper(KindConformance):
     kind = PROXIMITY
     parameters = {"backend": "points", "points": 600, "max_bytes": 2**22, "model": "paper", "torque_about": "link"}
     gates = ()
-    num_envs = 4
+    num_envs = 7
 
 
 class TestProximityAsInThePaper(KindConformance):
