@@ -77,7 +77,7 @@ def launch(
 
 def _padded(size: int) -> int:
     """Return along how many numbers a product of blocks goes."""
-    return max(triton.next_power_of_2(size), MIN_BLOCK)
+    return max(triton.next_power_of_2(size), MIN_BLOCK)  # pyright: ignore[reportReturnType]
 
 
 def _block(sizes: Sequence[int]) -> int:

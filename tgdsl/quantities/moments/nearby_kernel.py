@@ -216,7 +216,7 @@ def nearby_kernel(
         num_z = tl.load(table + 3, is_probe)
     lattice = lattice_ptr + first_env * lattice_env_step + (env * lattice_env_step + taxel * lattice_taxel_step)
     cell = tl.load(lattice + 3, is_probe)
-    cell_x, along_x, is_in_x = _along((point_x - tl.load(lattice, is_probe)) / cell, num_x)
+    cell_x, along_x, is_in_x = _along((point_x - tl.load(lattice, is_probe)) / cell, num_x)  # pyright: ignore[reportGeneralTypeIssues]
     cell_y, along_y, is_in_y = _along((point_y - tl.load(lattice + 1, is_probe)) / cell, num_y)
     cell_z, along_z, is_in_z = _along((point_z - tl.load(lattice + 2, is_probe)) / cell, num_z)
 

@@ -273,7 +273,7 @@ def _away(box, point, force, inverse):
 @triton.jit
 def _moments(pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
-    away, is_beside = _away(box, point, force, inverse)
+    away, is_beside = _away(box, point, force, inverse)  # pyright: ignore[reportGeneralTypeIssues]
     if is_beside:
         found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
     else:
@@ -369,7 +369,7 @@ def _summed(a):
 @triton.jit
 def _unmet(captured, mean, force, torque):
     """Return Σ_c γ_c (Σ_j λ_cj (x_j − x_c) × f_c − τ_c), (env,) [N·m]."""
-    x, y, z = cross(mean, force)
+    x, y, z = cross(mean, force)  # pyright: ignore[reportGeneralTypeIssues]
     return _summed(scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
 
 
