@@ -57,6 +57,8 @@ NAMES = {
     "floor": "ceil",
     "clamp_min": "clamp_max",
 }
+LARGE = 16
+"""Integers from here on are counts and sizes rather than indices, and are doubled."""
 NAMES |= {other: name for name, other in NAMES.items()}
 
 
@@ -76,7 +78,7 @@ class Mutant:
 
 
 class Sites(ast.NodeVisitor):
-    """Collect the nodes of a file that can be changed: no messages, annotations, assertions, docstrings or GPU kernels."""
+    """Collect the nodes of a file that can be changed: no messages, annotations, assertions, `strict` or GPU kernels."""
 
     def __init__(self) -> None:
         """Start with none."""
@@ -86,7 +88,8 @@ class Sites(ast.NodeVisitor):
     def visit(self, node: ast.AST) -> None:
         """Collect a node and what is below it."""
         skipped = ast.Raise | ast.Assert | ast.JoinedStr | ast.Import | ast.ImportFrom | ast.arg
-        if isinstance(node, skipped) or _is_kernel(node) or _is_guard(node) or _is_docstring(node):
+        is_strict = isinstance(node, ast.keyword) and node.arg == "strict"
+        if isinstance(node, skipped) or is_strict or _is_kernel(node) or _is_guard(node) or _is_docstring(node):
             return
         if isinstance(node, ast.AnnAssign):
             if node.value is not None:
@@ -134,7 +137,7 @@ def changes_of(node: ast.AST) -> Iterator[ast.AST]:
         case ast.Constant(value=bool(value)):
             new.value = not value
         case ast.Constant(value=int(value)):
-            new.value = value + 1
+            new.value = value + 1 if abs(value) < LARGE else 2 * value
         case ast.Constant(value=float(value)):
             new.value = 2 * value if value else 1.0
         case ast.Name(id=name) if name in NAMES:
@@ -311,12 +314,12 @@ def _run_in_child(mutant: Mutant, tests: list[str], log: Path) -> None:
 
 
 def files_of(place: str) -> list[Path]:
-    """Return the files of a room, folder or file below `tgdsl/`."""
+    """Return the files of a room, folder or file below `tgdsl/`; tests of kernels interpret them in processes of their own."""
     path = REPOSITORY / "tgdsl" / place
     if not path.exists():
         names = sorted(folder.name for folder in (REPOSITORY / "tgdsl").iterdir() if (folder / "__init__.py").exists())
         raise SystemExit(f'no room "{place}"; expected one of {", ".join(names)}, or a folder or file in it')
-    return sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    return sorted(file for file in path.rglob("*.py") if not file.stem.endswith("_kernel")) if path.is_dir() else [path]
 
 
 def main() -> None:

@@ -73,6 +73,7 @@ def test_every_group_is_of_the_instant_of_its_call(make, simulator):
         passed = torch.where(ended, 0.0, passed)
         torch.testing.assert_close(ball[:, 1], speed * passed, rtol=0, atol=1e-6)
         torch.testing.assert_close(ball[:, 2], RADIUS + 0.2 + 0.1 * episode, rtol=0, atol=1e-6)
+        torch.testing.assert_close(env.now.object.pos.cpu().float(), ball[:, :3])
         for env_id in range(3):
             qpos = env.sim.model.qpos0.copy()
             qpos[:2] = made.obs["proprio"][env_id, :2].double().cpu()

@@ -54,6 +54,7 @@ def test_episodes_end_and_begin_within_a_captured_step(env):
     state, final = made.obs["priv_obj_state"], made.info.final_obs["priv_obj_state"]
     assert torch.equal((state == final).all(dim=1), ~made.info.ended)
     after = env.step(chosen[5])
+    torch.testing.assert_close(env.now.object.pos.float(), after.obs["priv_obj_state"][:, :3])  # not that of `reset`
     assert not after.info.faults.any() and all(bool(value.isfinite().all()) for value in after.obs.values())
 
 

@@ -201,7 +201,7 @@ class TouchEnv:
             self._begin(everyone)
             if seed is not None:
                 self.touch.seed(seed, self._first_env)
-            now = self._now(self.sim.read())
+            now = self._instant = self._now(self.sim.read())
             self._measure(now, everyone)
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
@@ -220,7 +220,7 @@ class TouchEnv:
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too
             self._action.copy_(action)
-            made = self._call()
+            made, self._instant = self._call()
             made = saving.copied(made) if self.device.type == "cuda" else made
         self._obs, self._is_loaded = made.obs, False
         return made._replace(obs=dict(made.obs))
@@ -237,7 +237,7 @@ class TouchEnv:
             self.actuation.follow(control)
             self.pushes.advance()
             self.sim.step(self.sim.ctrl)
-            now = self._now(self.sim.read())
+            now = self._instant = self._now(self.sim.read())
             self._measure(now)
             self.task.keep_up(now, self.sim.faults)
             made = self._judged(now, self.sim.faults)
@@ -310,8 +310,11 @@ class TouchEnv:
         for held in (self._used, self._before):
             held.masked_fill_(chosen[:, None], 0.0)
 
-    def _advance(self) -> Step:
-        """Make one control step with the action that was copied: see the top of this page."""
+    def _advance(self) -> tuple[Step, Now]:
+        """Make one control step with the action that was copied, and return the instant it ends at: see the top of this page.
+
+        A captured step runs no Python: what it makes is known by what it returned when it was captured.
+        """
         sim = self.sim
         with self._logic_by():
             self._before.copy_(self._used)
@@ -321,8 +324,8 @@ class TouchEnv:
         with self._logic_by():
             return self._conclude(readings)
 
-    def _conclude(self, readings: dict[str, Tensor]) -> Step:
-        """Return what a control step has brought, by its readings, and begin episodes where some have ended."""
+    def _conclude(self, readings: dict[str, Tensor]) -> tuple[Step, Now]:
+        """Return what a control step has brought, by its readings, and its instant; begin episodes where some have ended."""
         sim, now = self.sim, self._now(readings)
         self._measure(now)
         self.task.keep_up(now, sim.faults)
@@ -332,7 +335,7 @@ class TouchEnv:
             now = self._now(sim.read(made.info.ended))
             self._measure(now, made.info.ended)
             made = made._replace(obs=self._observed(now))
-        return made
+        return made, now
 
     def _command(self, action: Float[Tensor, "env joint"], ctrl: Float[Tensor, "env nu"]) -> Float[Tensor, "env nu"]:
         """Take an action over; return the simulation's controls, which are no numbers where an action is none."""
@@ -373,7 +376,7 @@ class TouchEnv:
         watched, none, num = self.sim.watched(), self._used[:, :0], self.num_actions
         distance = self._sensed.distance
         force, normal_force = self._sensed.forces(readings, self._used)
-        self._instant = Now(
+        return Now(
             watched=watched,
             object=watched.body(self._sensed.object),
             joint_pos=watched.joint_pos[:, :num],
@@ -389,7 +392,6 @@ class TouchEnv:
             mass=self._episodes.mass,
             readings=readings,
         )
-        return self._instant
 
     def _observe(self, now: Now) -> Observations:
         """Return all groups of observations."""

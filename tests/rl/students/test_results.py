@@ -6,14 +6,20 @@ import pytest
 from scipy.stats import ttest_1samp
 
 from tgdsl.rl.playing.evaluation import Evaluation
+from tgdsl.rl.playing.gait import Gait
 from tgdsl.rl.students.keys import student_keys
 from tgdsl.rl.students.results import Row, interval, rows_of, shown
+
+GAIT = Gait(
+    *[None] * 8, max_speed=0.0, max_spin=0.0, joint_speed=None, saturations={}, link_forces={}, joint_speeds={}, rated_speeds={}
+)
+"""Of nothing that touches."""
 
 
 def evaluation(score: float, half: float, held: float = 1.0, episodes: int = 10) -> Evaluation:
     """Return what one seed's episodes were."""
     bounds = (score - half, score + half)
-    return Evaluation("small", "RMS", episodes, 2, 1, score, bounds, held, (0.0, 1.0), 3.0, 2.0, 0)
+    return Evaluation("small", "RMS", episodes, 2, 1, score, bounds, held, (0.0, 1.0), 3.0, 2.0, 0, GAIT)
 
 
 @pytest.mark.parametrize(("is_less_better", "expected"), [(False, ["a", "b"]), (True, ["b", "a"])])

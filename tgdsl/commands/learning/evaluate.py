@@ -76,7 +76,7 @@ class Evaluate:
         finally:
             env.close()
         print(found)
-        print(f"\n{found.gait or 'the gait is measured on a CPU alone: --device cpu'}")
+        print(f"\n{found.gait}")
         if self.out is not None:
             atomic_write(with_folder(self.out), (json.dumps(found.plain(), indent=2, allow_nan=False) + "\n").encode())
         failures = [failure for one in required if (failure := one.failure(found)) is not None]

@@ -42,7 +42,7 @@ class Evaluation:
         episode_return: Mean of the sum of rewards.
         seconds: Mean of the duration [s].
         faults: How many a fault ended.
-        gait: How the object was moved; None on a GPU, where it is not measured.
+        gait: How the object was moved.
     """
 
     task: str
@@ -57,7 +57,7 @@ class Evaluation:
     episode_return: float
     seconds: float
     faults: int
-    gait: Gait | None = None
+    gait: Gait
 
     def plain(self) -> dict[str, Any]:
         """Return plain values as JSON has them: None for what is not finite, such as the interval of one episode."""
@@ -109,7 +109,7 @@ def evaluate_each(
     quota = quota.flatten()
     done, sums = torch.zeros_like(quota), torch.zeros((6, env.num_envs), dtype=torch.float64, device=env.device)
     obs, index = env.reset(seed), 0
-    meter = None if env.sim.qpos.is_cuda else GaitMeter(env, blocks)  # a captured step leaves `env.now` as it was captured
+    meter = GaitMeter(env, blocks)
     actor.begin(torch.ones(env.num_envs, dtype=torch.bool, device=env.device))
     while index % CHECKED_EVERY or (left := int((quota - done).sum())):
         if index % CHECKED_EVERY == 0:
@@ -117,8 +117,7 @@ def evaluate_each(
         step = env.step(actor(obs))
         info, obs, index = step.info, step.obs, index + 1
         is_asked = done < quota
-        if meter is not None:
-            meter.add(is_asked & ~info.ended)
+        meter.add(is_asked & ~info.ended)
         counts = info.ended & is_asked
         score = info.score.double()
         told = [score, score.square(), info.is_whole(env.max_steps), info.episode_return, info.episode_steps, info.faults]
@@ -126,11 +125,11 @@ def evaluate_each(
         done += counts
         actor.begin(info.ended)
     each = sums.view(6, blocks, size).sum(dim=2).T.tolist()
-    gaits = meter.gaits() if meter is not None else [None] * blocks
-    return [_evaluation(env, own, episodes, min(size, episodes), seed, gait) for own, gait in zip(each, gaits, strict=True)]
+    count = min(size, episodes)
+    return [_evaluation(env, own, episodes, count, seed, gait) for own, gait in zip(each, meter.gaits(), strict=True)]
 
 
-def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int, gait: Gait | None) -> Evaluation:
+def _evaluation(env: TouchEnv, sums: list[float], episodes: int, envs: int, seed: int, gait: Gait) -> Evaluation:
     """Return what episodes were, by sums over them, and how the object was moved in them."""
     total, squares, held, paid, steps, faults = sums
     mean = total / episodes

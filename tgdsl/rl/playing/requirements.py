@@ -52,9 +52,9 @@ class Requirement:
 
     def failure(self, found: Evaluation) -> str | None:
         """Return why an evaluation does not meet this; None if it does."""
-        value = getattr(found, self.name) if self.name in ("score", "held") else getattr(found.gait, self.name, None)
+        value = getattr(found, self.name) if self.name in ("score", "held") else getattr(found.gait, self.name)
         if value is None:
-            return f"not met: {self.text}: it was not measured: the task has none, nothing was touched, or it ran on a GPU"
+            return f"not met: {self.text}: it was not measured: the task has none, or nothing was touched"
         return None if COMPARISONS[self.sign](value, self.bound) else f"not met: {self.text}: found {value:.4g}{self._unit}"
 
     @property
