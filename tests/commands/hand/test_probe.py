@@ -2,8 +2,6 @@
 
 import os
 
-import pytest
-
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.faulty_line import Faults
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
@@ -16,7 +14,6 @@ def pseudo_terminal() -> tuple[int, int, str]:
     return *ends, os.ttyname(ends[1])
 
 
-@pytest.mark.slow
 def test_probe(emulator, plugged, here, tmp_path):
     one, other, silent = pseudo_terminal()
     try:
@@ -36,7 +33,6 @@ def test_probe(emulator, plugged, here, tmp_path):
     assert {frame.command for _, frame in emulator.requests} == {Command.VERSION, Command.READ_REGISTER}
 
 
-@pytest.mark.slow
 def test_probe_of_one_port(emulator, plugged, here, tmp_path):
     plugged("/dev/none")
     code, said, _ = here(tmp_path, "hand", "probe", "--port", emulator.device)
@@ -52,7 +48,6 @@ def test_a_computer_without_ports(plugged, here, tmp_path):
     assert here(tmp_path, "hand", "monitor") == (2, "", "tgdsl: no hand answers; this computer has no serial port\n")
 
 
-@pytest.mark.slow
 def test_no_hand_or_several_are_an_error_that_lists_them(emulator, plugged, here, tmp_path):
     with Emulator(EmulatedHand(3)) as second:
         plugged(emulator.device, second.device)

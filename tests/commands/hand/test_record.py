@@ -19,7 +19,6 @@ from tgdsl.runtime.xhand1.wire.protocol import Command
 REPOSITORY = Path(__file__).parents[3]
 
 
-@pytest.mark.slow
 def test_record_and_replay(emulator, plugged, here, tmp_path):
     plugged(emulator.device)
     assert here(tmp_path, "hand", "tare", "-o", "hand.yaml")[0] == 0
@@ -75,7 +74,6 @@ def test_a_recording_through_failures_shows_and_keeps_them(emulator, here, tmp_p
     assert f"NO NEW READING: {log.faults[-1].kind}: {log.faults[-1].message}" in said
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("action", ["monitor", "record"])
 def test_ctrl_c_closes_the_port_and_keeps_the_log(emulator, tmp_path, action):
     environment = {**os.environ, "PYTHONWARNINGS": "error", "PYTHONPATH": str(REPOSITORY), "NO_COLOR": "1"}

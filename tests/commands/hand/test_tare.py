@@ -1,7 +1,6 @@
 """`tgdsl hand tare` against emulated hands."""
 
 import numpy as np
-import pytest
 from resting_hands import TARE
 
 from tgdsl.runtime.xhand1.calibration import Calibration, load_calibration
@@ -9,7 +8,6 @@ from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand, TipForces
 
 
-@pytest.mark.slow
 def test_tare(emulator, plugged, here, tmp_path):
     plugged(emulator.device)
     code, said, error = here(tmp_path, "hand", "tare", "-o", "new/hand.yaml")
@@ -22,7 +20,6 @@ def test_tare(emulator, plugged, here, tmp_path):
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["hand.yaml"]
 
 
-@pytest.mark.slow
 def test_tare_replaces_nothing_unasked_and_keeps_the_rest(emulator, here, tmp_path):
     base = Calibration("N", np.full((5, 3), 0.2), np.tile(-np.eye(3), (5, 1, 1)), np.ones((5, 3)), np.zeros((5, 3)), "mine")
     (tmp_path / "hand.yaml").write_text(base.text())
@@ -39,7 +36,6 @@ def test_tare_replaces_nothing_unasked_and_keeps_the_rest(emulator, here, tmp_pa
     assert (found.rotation == base.rotation).all() and (found.bias == base.bias).all()
 
 
-@pytest.mark.slow
 def test_tare_of_a_hand_that_is_touched(here, tmp_path):
     calls = iter(range(10**6))
 

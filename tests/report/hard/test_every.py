@@ -17,19 +17,16 @@ def test_every_kind_stands(case):
     assert_stands(case())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", SLOW)
 def test_every_kind_stands_at_other_sizes(case):
     assert_stands(case())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", [*probes.CASES, *contacts.CASES, *heat.CASES])
 def test_hard_cases_stand(case):
     assert_stands(case())
 
 
-@pytest.mark.slow
 def test_every_finding_has_its_line():
     """Of cases that answer findings for this report."""
     cheap = (

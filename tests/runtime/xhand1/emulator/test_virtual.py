@@ -113,7 +113,6 @@ def test_all_faults_at_once(monkeypatch):
     assert len(readings) > 400 and errors
 
 
-@pytest.mark.slow
 def test_minutes_with_one_fault_of_each_kind_in_twenty(monkeypatch):
     stamps = Stamps()
     with virtual_hand(monkeypatch, EmulatedHand(forces=stamps), seed=7) as (hand, port, time):

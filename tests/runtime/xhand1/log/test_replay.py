@@ -77,7 +77,6 @@ def run_live(path) -> list[HandSample | Fault]:
     return live
 
 
-@pytest.mark.slow
 def test_the_very_samples_that_were_live(tmp_path):
     live = run_live(tmp_path / "a.npz")
     found: list[HandSample | Fault] = []

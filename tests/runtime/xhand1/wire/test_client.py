@@ -238,7 +238,6 @@ BYTES = st.one_of(
 TRAFFIC = st.lists(st.tuples(st.floats(0, 0.1), BYTES), max_size=6)
 
 
-@pytest.mark.slow
 @given(st.lists(TRAFFIC, max_size=4), st.booleans())
 @settings(max_examples=300, deadline=None)
 def test_whatever_comes_each_exchange_ends_in_time_with_a_whole_reply_or_a_named_error(traffic, tells_version):

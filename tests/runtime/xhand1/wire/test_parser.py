@@ -3,7 +3,6 @@
 from itertools import pairwise
 from random import Random
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from xhand1_streams import frame_bytes, frames_of
@@ -55,17 +54,15 @@ def agrees(stream: bytes, cuts: list[int]) -> None:
     assert parsed(stream, cuts) == frames_of(stream)
 
 
-@pytest.mark.slow
 @given(STREAMS, CUTS)
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=500, deadline=None)
 def test_any_stream_cut_anywhere_reads_as_a_whole(stream, cuts):
     agrees(stream, cuts)
 
 
-@pytest.mark.slow
 @given(st.lists(SMALL_PIECES, min_size=1, max_size=8), st.integers(0, 2**32))
-@settings(max_examples=5_000, deadline=None, suppress_health_check=list(HealthCheck))
-def test_a_hundred_thousand_streams_merged_mutated_and_cut(pieces, seed):
+@settings(max_examples=500, deadline=None, suppress_health_check=list(HealthCheck))
+def test_ten_thousand_streams_merged_mutated_and_cut(pieces, seed):
     """Twenty streams of the same pieces each."""
     random = Random(seed)
     for _ in range(20):
