@@ -7,7 +7,8 @@
 A change is a sign, an operator, a comparison, a number, an index, a swapped name or a dropped statement. Each runs in a fork of
 a process that has the libraries imported, with the changed module in place of the real one; the files stay as they are. The
 tests that reach the changed line are known from one run of `make test` under coverage, which is kept in `build/mutate` and
-made again with `--refresh`. A change is killed when a test fails or hangs.
+made again with `--refresh`. A change is killed when a test fails or hangs. What survives `--limit` seconds of tests, near and
+short ones first, is given ten times as many.
 
 A survivor means one of three things: a test is missing, the code has no effect and can go, or the change is equivalent.
 """
@@ -27,7 +28,7 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
@@ -280,10 +281,18 @@ class ChangedModule(MetaPathFinder):
         return spec_from_file_location(name, mutant.file, loader=Loader(name, str(mutant.file)))
 
 
-def run(mutant: Mutant, tests: list[str], log: Path, limit: float) -> str:
-    """Return whether tests notice a change: "killed", "survived", "timeout" or "unreached"."""
-    if not tests:
-        return "unreached"
+def verdict_of(mutant: Mutant, selections: Sequence[list[str]], log: Path) -> str:
+    """Return whether tests notice a change, the first selection of them or those that later ones add."""
+    verdict, done = "unreached", set[str]()
+    for tests in selections:
+        more = [test for test in tests if test not in done]
+        if more and verdict in ("unreached", "survived"):
+            verdict, done = run(mutant, more, log), done.union(more)
+    return verdict
+
+
+def run(mutant: Mutant, tests: list[str], log: Path, limit: float = 900.0) -> str:
+    """Return whether tests notice a change: "killed", "survived" or "timeout"."""
     child = os.fork()
     if child == 0:
         _run_in_child(mutant, tests, log)
@@ -343,12 +352,11 @@ def main() -> None:
     reached, rows = Reached(), []
     for room in options.rooms:
         mutants = mutants_of(files_of(room), options.count, options.seed)
-        selected = [reached.tests(mutant, options.limit) for mutant in mutants]
+        selected = [[reached.tests(mutant, limit) for limit in (options.limit, 10 * options.limit)] for mutant in mutants]
         logs = [RECORDS / f"{room.replace('/', '_')}_{i}.log" for i in range(len(mutants))]
         with ThreadPoolExecutor(options.jobs) as pool:
-            limits = [3 * options.limit + 60] * len(mutants)
             verdicts = []
-            for mutant, verdict in zip(mutants, pool.map(run, mutants, selected, logs, limits), strict=True):
+            for mutant, verdict in zip(mutants, pool.map(verdict_of, mutants, selected, logs), strict=True):
                 verdicts.append(verdict)
                 if verdict in ("survived", "unreached"):
                     print(f"{mutant.file.relative_to(REPOSITORY)}:{mutant.line}: {verdict}: {mutant.change}", flush=True)
