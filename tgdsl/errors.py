@@ -44,12 +44,13 @@ class FileError(TgdslError, OSError):
     """A file that cannot be written; also caught as the system's own error.
 
     Attributes:
+        file: The file.
         reason: What the system says.
     """
 
     def __init__(self, file: object, reason: str):
         super().__init__(f"{file}: {reason}")
-        self.reason = reason
+        self.file, self.reason = file, reason
 
 
 class HandError(TgdslError):

@@ -155,7 +155,7 @@ def inductor_options(checks_indices: bool, has_tiles: bool, is_fused: bool) -> d
     Args:
         checks_indices: Whether kernels assert that indices read from tensors are in range.
         has_tiles: Whether kernels on a GPU have tiles of 32 × 32 of two axes, instead of blocks of one flat axis whose size is
-            chosen by timing. Of a kernel that takes 10 µs that would be the time of its launch: one tile is as likely as another.
+            chosen by timing. Of a kernel that takes 10 µs that is the time of its launch: one tile is as likely as another.
         is_fused: Whether kernels have as many operations as can be, instead of 64 at most.
     """
     options: dict[str, Any] = {

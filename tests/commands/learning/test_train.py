@@ -1,6 +1,9 @@
 """`tgdsl train` and `tgdsl evaluate`, as users run them."""
 
 import json
+import os
+import shlex
+import signal
 import sys
 
 import numpy as np
@@ -11,6 +14,7 @@ from small_tasks import small_task
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.train.checkpoint import read_checkpoint
 from tgdsl.rl.train.folder import RunFolder
+from tgdsl.rl.train.learner import Learner
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 ON = ["--device", "cpu", "--envs", "4"]
@@ -285,3 +289,24 @@ def test_a_folder_in_which_another_process_runs_is_left_alone(base, here, fails,
     (base / "out" / "task" / "checkpoint.pt").write_bytes(b"half written")
     with RunFolder(base / "out" / "task").held():
         assert "another process runs in this folder" in fails("train", "task.yaml", *ON, "--resume", "out/task")
+
+
+def test_an_interrupted_run_leaves_its_policy_and_says_how_to_go_on(base, here, monkeypatch):
+    iterate = Learner.iterate
+
+    def interrupted(self, share=0.0):
+        if self.iteration == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return iterate(self, share)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Learner, "iterate", interrupted)
+        code, out, error = here(base, "train", "task.yaml", *ON, "--iterations", "5", "--episodes", "6", *ARGUMENTS)
+    assert (code, error.splitlines()[-1]) == (
+        130,
+        "stopped by SIGINT after iteration 2; to go on: tgdsl train task.yaml --device cpu --resume out/task",
+    )
+    assert "policy: out/task/policy.pt, after 2 iterations" in out and not (base / "out/task/evaluation.json").exists()
+    code, out, error = here(base, *shlex.split(error.splitlines()[-1])[-6:], "--iterations", "3", "--episodes", "0")
+    assert code == 0, error
+    assert "after 3 iterations" in out

@@ -134,6 +134,17 @@ def test_files_that_cannot_be_read(tmp_path):
     assert str(raised.value) == f"{tmp_path}/none.pt: cannot read this file: No such file or directory"
     torch.save({"actor_state_dict": {}}, tmp_path / "model_0.pt")  # what the runner keeps: no policy by itself
     (tmp_path / "text.pt").write_text("no module")
-    for name in ("model_0.pt", "text.pt"):
-        with pytest.raises(PolicyError, match=rf"{name}: this is no TorchScript file, as rsl_rl's `export_policy_to_jit`"):
-            Policy(read_policy(tmp_path / name), GROUPS, 3, 2)
+    what = {
+        "model_0.pt": "a checkpoint, from which learning goes on; the policy of a run is its policy.pt",
+        "text.pt": "no TorchScript",
+    }
+    for name, this in what.items():
+        with pytest.raises(PolicyError, match=rf"{name}: this is {this}"):
+            read_policy(tmp_path / name)
+    with pytest.raises(PolicyError, match=rf"{tmp_path}/policy\.pt: cannot read this file: No such file"):
+        read_policy(tmp_path)
+
+
+def test_a_runs_folder_has_its_policy(tmp_path):
+    torch.jit.script(torch.nn.Linear(13, 2)).save(str(tmp_path / "policy.pt"))
+    assert read_policy(tmp_path).content == (tmp_path / "policy.pt").read_bytes()

@@ -408,5 +408,57 @@ def test_a_disk_that_is_full_is_named_before_a_run_begins(tmp_path, monkeypatch)
     assert not folder.checkpoint.exists()
     full = type("Usage", (), {"free": 1000})()
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: full)
-    with pytest.raises(FileError, match=r"checkpoint\.pt: 0 MiB are free on the disk, expected 0 MiB for checkpoints"):
+    with pytest.raises(FileError, match=r"checkpoint\.pt: 0\.\d\d MiB are free on the disk, checkpoints take 0\.\d\d MiB"):
         Run(learner, folder, EVERY)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run_after_its_iteration(tmp_path, monkeypatch, number):
+    """With a checkpoint, and with the handlers that were there."""
+    run, learner = begun(tmp_path, every=1e9)
+    before = [signal.getsignal(own) for own in (signal.SIGINT, signal.SIGTERM)]
+    iterate = learner.iterate
+
+    def signalled(share):
+        if learner.iteration == 1:
+            os.kill(os.getpid(), number)
+        return iterate(share)
+
+    monkeypatch.setattr(learner, "iterate", signalled)
+    run.learn(5, float("inf"))
+    assert (run.iteration, run.stopped_by) == (2, number)
+    assert read_checkpoint(run._folder.checkpoint)["iteration"] == 2
+    assert [signal.getsignal(own) for own in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_a_second_interrupt_does_not_wait(tmp_path, monkeypatch):
+    run, learner = begun(tmp_path, every=1e9)
+
+    def signalled(share):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        pytest.fail("the second one was not heard")
+
+    monkeypatch.setattr(learner, "iterate", signalled)
+    with pytest.raises(KeyboardInterrupt):
+        run.learn(5, float("inf"))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_disk_that_fills_up_leaves_a_whole_checkpoint_and_says_how_to_go_on(tmp_path, monkeypatch):
+    run, learner = begun(tmp_path)
+    iterate = learner.iterate
+
+    def full(share):
+        if learner.iteration == 1:
+            monkeypatch.setattr("tgdsl.rl.train.run.write_checkpoint", no_space)
+        return iterate(share)
+
+    def no_space(state, file):
+        raise FileError(file, "No space left on device")
+
+    monkeypatch.setattr(learner, "iterate", full)
+    goes_on = r"No space left on device; .*checkpoint\.pt is whole, of iteration 1; --resume .*run goes on from it"
+    with pytest.raises(FileError, match=goes_on):
+        run.learn(5, float("inf"))
+    assert read_checkpoint(run._folder.checkpoint)["iteration"] == 1

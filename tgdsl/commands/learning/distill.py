@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tgdsl.rl.load import LoadedTask
     from tgdsl.rl.spec import TaskSpec
     from tgdsl.rl.students.results import Row
+    from tgdsl.rl.train.run import Run
 
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 Folder = tyro.conf.arg(metavar="FOLDER")
@@ -274,7 +275,7 @@ class _Part:
                 run.learn(total, limit, bar.show)
             finally:
                 bar.close()
-            return self._finish(distiller, origin, run.seconds), env.task.score_unit
+            return self._finish(distiller, origin, run), env.task.score_unit
         finally:
             env.close()
 
@@ -286,25 +287,28 @@ class _Part:
         other = before.get("teacher_sha256", origin["teacher_sha256"]) != origin["teacher_sha256"]
         return [*changes(before, origin, model), *(["the teacher's file"] if other else [])]
 
-    def _finish(self, distiller: Any, origin: dict[str, Any], seconds: float) -> list[Row]:
-        """Evaluate the students, write them, and return the table's rows."""
+    def _finish(self, distiller: Any, origin: dict[str, Any], run: Run) -> list[Row]:
+        """Evaluate the students unless the run was stopped, write them, and return the table's rows."""
         from tgdsl.rl.playing.evaluation import evaluate_each
         from tgdsl.rl.students.results import rows_of, write_students
+        from tgdsl.rl.train.run import end_if_stopped
 
-        command, keys = self._command, distiller.keys
+        command, keys, is_evaluated = self._command, distiller.keys, self._command.episodes > 0 and run.stopped_by is None
         found, text = [], shlex.join(["tgdsl", *sys.argv[1:]])
         with StatusLine() as progress:
-            if command.episodes:
+            if is_evaluated:
                 acting = distiller.acting()
                 found = evaluate_each(distiller.env, acting, len(keys), command.episodes, progress=progress)
             students = self._folder.path / "students"
-            write_students(distiller, self._loaded, origin, seconds, text, found, students, progress)
+            write_students(distiller, self._loaded, origin, run.seconds, text, found, students, progress)
+        resume = ("--device", command.device, "--resume", str(self._folder.path.parent))
+        end_if_stopped(run, shlex.join(["tgdsl", "distill", str(command.task), *resume]))
         if not found:
             self._folder.evaluation.unlink(missing_ok=True)  # of what they were before
             return []
         plain = {key.name: own.plain() for key, own in zip(keys, found, strict=True)}
         _write(self._folder.evaluation, plain)
-        return rows_of(keys, found, self.resolution, distiller.samples // len(keys), round(seconds / 60.0, 2))
+        return rows_of(keys, found, self.resolution, distiller.samples // len(keys), round(run.seconds / 60.0, 2))
 
 
 def _warn_unlike(rows: list[Row]) -> None:

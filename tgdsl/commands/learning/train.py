@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tgdsl.rl.train.folder import RunFolder
     from tgdsl.rl.train.learner import Learner
     from tgdsl.rl.train.ranks import Ranks
+    from tgdsl.rl.train.run import Run
 
 Task = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(help="The task's YAML document.", metavar="TASK")]
 Folder = tyro.conf.arg(metavar="FOLDER")
@@ -144,24 +145,26 @@ class Train:
                 if bar is not None:
                     bar.close()
             if ranks.is_first:
-                self._finish(learner, folder, origin, run.seconds)
+                self._finish(learner, folder, origin, run)
         finally:
             env.close()
 
-    def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], seconds: float) -> None:
-        """Write the policy, evaluate it, and say so."""
+    def _finish(self, learner: Learner, folder: RunFolder, origin: dict[str, Any], run: Run) -> None:
+        """Write the policy, evaluate it unless the run was stopped, and say so."""
         from tgdsl.files.write import atomic_write
         from tgdsl.rl.playing.evaluation import evaluate
         from tgdsl.rl.playing.policy import policy_for, read_policy
         from tgdsl.rl.train.policies import card_of, write_policy
+        from tgdsl.rl.train.run import end_if_stopped
 
         command = shlex.join(["tgdsl", *sys.argv[1:]])
-        card = card_of(learner, origin, seconds, command)
+        card = card_of(learner, origin, run.seconds, command)
         write_policy(learner, card, folder.policy)
         folder.evaluation.unlink(missing_ok=True)  # of what the policy was before
-        print(
-            f"policy: {folder.policy}, after {learner.iteration} iterations, {learner.samples:,} steps, {seconds / 60:.1f} min"
-        )
+        made = f"{learner.iteration} iterations, {learner.samples:,} steps, {run.seconds / 60:.1f} min"
+        print(f"policy: {folder.policy}, after {made}")
+        again = ["tgdsl", "train", str(self.task), "--device", self.device, "--resume", str(folder.path)]
+        end_if_stopped(run, shlex.join(again))
         if self.episodes:
             with StatusLine() as progress:
                 actor = policy_for(learner.env, read_policy(folder.policy))

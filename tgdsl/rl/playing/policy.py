@@ -14,6 +14,7 @@ from __future__ import annotations
 import io
 import json
 import warnings
+import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ ACTOR_GROUPS = ("proprio", "tactile_sensors", "goal")
 
 OF_LEARNING, OF_TOUCH = ("train", "distill"), ("touch", "placement", "resolution", "noise")
 """What of a document matters to those alone who learn, and to those alone who feel."""
+POLICY = "policy.pt"
+"""Name of a run's policy in its folder."""
 CARD = "card.json"
 """Name of the card in the file."""
 
@@ -69,9 +72,13 @@ class PolicyFile:
 def read_policy(file: Path) -> PolicyFile:
     """Read a policy's file, once.
 
+    Args:
+        file: The file; or the folder of a run, whose `policy.pt` is read.
+
     Raises:
         PolicyError: If it cannot be read, or is no TorchScript.
     """
+    file = file / POLICY if file.is_dir() else file
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -81,11 +88,22 @@ def read_policy(file: Path) -> PolicyFile:
         _module(content, "cpu", extra)
         card = json.loads(extra[CARD]) if extra[CARD] else None
     except (RuntimeError, ValueError) as error:
+        if _is_checkpoint(content):
+            policy = f"the policy of a run is its {POLICY}, that of rsl_rl's runner what `export_policy_to_jit` writes"
+            raise PolicyError(f"{file}: this is a checkpoint, from which learning goes on; {policy}") from error
         what = "this is no TorchScript file, as rsl_rl's `export_policy_to_jit` writes it"
         raise PolicyError(f"{file}: {what}: {str(error).strip().splitlines()[0]}") from error
     if card is not None:
         _check_fields(card, file)
     return PolicyFile(file, content, card)
+
+
+def _is_checkpoint(content: bytes) -> bool:
+    """Return whether a file is what `torch.save` writes: TorchScript has its constants in a file of their own."""
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return False
+    names = {Path(name).name for name in zipfile.ZipFile(io.BytesIO(content)).namelist()}
+    return "data.pkl" in names and "constants.pkl" not in names
 
 
 def actor_groups(

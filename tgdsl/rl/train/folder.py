@@ -131,7 +131,7 @@ class RunFolder:
         """
         free = shutil.disk_usage(self.path).free
         if free < COPIES * size:
-            what = f"{free / 2**20:.0f} MiB are free on the disk, expected {COPIES * size / 2**20:.0f} MiB for checkpoints"
+            what = f"{free / 2**20:.2f} MiB are free on the disk, checkpoints take {COPIES * size / 2**20:.2f} MiB"
             raise FileError(self.checkpoint, what)
 
     def begin(self, made_from: Mapping[str, Any], loaded: LoadedTask, env: TouchEnv) -> None:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+import signal
+import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from types import FrameType
+from typing import Any, Self
 
-from tgdsl.errors import TgdslError
+from tgdsl.errors import FileError, TgdslError
 from tgdsl.rl.train.checkpoint import not_finite, state_of, write_checkpoint
 from tgdsl.rl.train.folder import RunFolder
 from tgdsl.rl.train.iteration import Iteration, Learning
@@ -22,11 +26,38 @@ Shown = Callable[[Mapping[str, float | int], float], None]
 """Is told what an iteration was, as `curve.csv` has it, and how much time is left [s]."""
 
 
+class StopRequest:
+    """Notes the first SIGINT (Ctrl-C) or SIGTERM, so that work can end at a good place; the second acts as it did before.
+
+    Attributes:
+        signal: The signal that came; None: none has.
+    """
+
+    def __init__(self) -> None:
+        """Note nothing yet."""
+        self.signal: signal.Signals | None = None
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # Python lets no other thread handle signals
+            self._before = {own: signal.signal(own, self._note) for own in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for own, before in self._before.items():
+            signal.signal(own, before)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.signal = signal.Signals(number)
+        self.__exit__()
+
+
 class Run:
     """A run in its folder.
 
     Attributes:
         seconds: How long it has learned [s]; to make environments and to evaluate is not learning.
+        stopped_by: The signal that has ended `learn`; None: none has.
     """
 
     def __init__(self, learner: Learning, folder: RunFolder, every: float, seconds: float = 0.0):
@@ -43,6 +74,8 @@ class Run:
         """
         self._learner, self._folder, self._every, self.seconds = learner, folder, every, seconds
         self._rate, self._samples = 0.0, learner.samples
+        self._saved = learner.iteration
+        self.stopped_by: signal.Signals | None = None
         self._writes = learner.ranks.is_first
         if self._writes:
             folder.keep_rows(learner.iteration)
@@ -50,6 +83,11 @@ class Run:
         if self._writes:
             folder.check_room(size)
         self._board = Board(folder.path, learner.iteration) if self._writes else None
+
+    @property
+    def iteration(self) -> int:
+        """How many iterations were made."""
+        return self._learner.iteration
 
     @property
     def has_board(self) -> bool:
@@ -70,10 +108,12 @@ class Run:
                 f"iteration {learner.iteration}: {wrong} is not finite: something that the environments return was not, or it "
                 f"grew beyond all bounds; {self._folder.checkpoint} is from before"
             )
-        return write_checkpoint(state, self._folder.checkpoint) if self._writes else 0
+        size = write_checkpoint(state, self._folder.checkpoint) if self._writes else 0
+        self._saved = learner.iteration
+        return size
 
     def learn(self, iterations: int, seconds: float, shown: Shown | None = None) -> None:
-        """Learn.
+        """Learn. Ctrl-C and SIGTERM end it after the iteration under way, with a checkpoint.
 
         Iterations are told how much of the run is over: of iterations, or if that is more, of time, what was learned before
         included: a run that was killed and goes on for the rest of its time goes on as if it had not been.
@@ -87,26 +127,35 @@ class Run:
             DivergedError: If losses or state are no numbers any more; the last checkpoint is from before.
             FileError: If something cannot be written; likewise.
         """
-        learner, before = self._learner, self.seconds
-        begun = saved = time.monotonic()
-        is_over = learner.iteration >= iterations or seconds <= 0.0
         try:
-            while not is_over:
-                start = time.monotonic()
-                made = learner.iterate(max(learner.iteration / iterations, (before + start - begun) / (before + seconds)))
-                now = time.monotonic()
-                self.seconds = before + now - begun
-                self._refuse_diverged(made)
-                self._tell(made, now - start, iterations, seconds - (now - begun), shown)
-                is_over = learner.iteration >= iterations or now - begun >= seconds
-                is_due = is_over or now - saved + (now - start) > self._every
-                is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
-                if is_due:
-                    self.save()
-                    saved = now  # until it is written, what was there before counts
+            with StopRequest() as request:
+                self._iterate(iterations, seconds, shown, request)
+            self.stopped_by = request.signal
+        except FileError as error:
+            kept = f"{self._folder.checkpoint} is whole, of iteration {self._saved}"
+            raise FileError(error.file, f"{error.reason}; {kept}; --resume {self._folder.path} goes on from it") from error
         finally:
             if self._board is not None:
                 self._board.close()
+
+    def _iterate(self, iterations: int, seconds: float, shown: Shown | None, request: StopRequest) -> None:
+        """Make iterations until enough were made, time is over or someone asks to stop."""
+        learner, before = self._learner, self.seconds
+        begun = saved = time.monotonic()
+        is_over = learner.iteration >= iterations or seconds <= 0.0
+        while not is_over:
+            start = time.monotonic()
+            made = learner.iterate(max(learner.iteration / iterations, (before + start - begun) / (before + seconds)))
+            now = time.monotonic()
+            self.seconds = before + now - begun
+            self._refuse_diverged(made)
+            self._tell(made, now - start, iterations, seconds - (now - begun), shown)
+            is_over = learner.iteration >= iterations or now - begun >= seconds or request.signal is not None
+            is_due = is_over or now - saved + (now - start) > self._every
+            is_over, is_due = learner.ranks.agreed((is_over, is_due), learner.env.device)
+            if is_due:
+                self.save()
+                saved = now  # until it is written, what was there before counts
 
     def _tell(self, made: Iteration, duration: float, iterations: int, time_left: float, shown: Shown | None) -> None:
         """Write an iteration into curve and TensorBoard, and show it."""
@@ -140,3 +189,18 @@ class Run:
                 f"iteration {self._learner.iteration}: {what}; {self._folder.checkpoint} is from before: try a smaller "
                 f"{self._learner.rates}"
             )
+
+
+def end_if_stopped(run: Run, command: str) -> None:
+    """End the process if a signal has stopped a run, and say how to go on.
+
+    Args:
+        run: The run.
+        command: What goes on with it.
+
+    Raises:
+        SystemExit: With the exit code of a process that such a signal ends.
+    """
+    if run.stopped_by is not None:
+        print(f"stopped by {run.stopped_by.name} after iteration {run.iteration}; to go on: {command}", file=sys.stderr)
+        raise SystemExit(128 + run.stopped_by)
