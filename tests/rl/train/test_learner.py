@@ -43,6 +43,40 @@ def test_first_episodes_end_at_random_times(tmp_path):
     assert sum(found) == 64 and min(found) > 15
 
 
+@pytest.mark.parametrize("rnd", ["off", "both"])
+def test_a_return_goes_on_with_the_value_at_the_end_of_an_episode_that_was_cut_off(tmp_path, rnd):
+    """Of what was observed there, before the next episode began."""
+    options = {} if rnd == "both" else {"train__rnd": "off"}
+    learner, _ = small_learner(tmp_path, train__desynchronise=False, **options)
+    algorithm, steps, seen, paid = learner.algorithm, [], [], []
+    act, step, keep = algorithm.act, learner.env.step, algorithm.storage.add_transition
+
+    def acted(obs):
+        seen.append(obs.clone())
+        return act(obs)
+
+    def stepped(action):
+        steps.append(step(action))
+        return steps[-1]
+
+    def kept(own):
+        paid.append(own.rewards - algorithm.intrinsic_rewards if rnd == "both" else own.rewards.clone())
+        assert all(torch.equal(own.observations[name], value) for name, value in seen[-1].items())
+        keep(own)
+
+    algorithm.act, learner.env.step, algorithm.storage.add_transition = acted, stepped, kept
+    learner.roll()
+    algorithm.storage.clear()
+    learner.roll()
+    assert steps[-1].truncated.all() and len(steps) == STEPS
+    with torch.no_grad():
+        final = algorithm.critic(learner._seen(steps[-1].info.final_obs))[:, 0]
+        begun = algorithm.critic(learner._obs)[:, 0]
+    assert (final - begun).abs().min() > 1e-4
+    torch.testing.assert_close(paid[-1].flatten(), steps[-1].reward + algorithm.gamma * final)
+    torch.testing.assert_close(paid[-2].flatten(), steps[-2].reward)
+
+
 def test_the_same_seed_learns_the_same_and_another_seed_something_else(tmp_path):
     weights = []
     for seed in (1, 1, 2):

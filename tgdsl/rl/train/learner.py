@@ -22,6 +22,7 @@ from tgdsl.rl.train.config import config
 from tgdsl.rl.train.iteration import Clock, EpisodeTally, Iteration
 from tgdsl.rl.train.ppo import LOSSES, CapturedPPO
 from tgdsl.rl.train.ranks import Ranks
+from tgdsl.tensors.env_ids import may_hold
 
 
 class Learner:
@@ -81,7 +82,10 @@ class Learner:
         for _ in range(self._train.steps):
             step = self.env.step(algorithm.act(obs))
             obs = self._seen(step.obs)
-            algorithm.process_env_step(obs, step.reward, step.info.ended, {"time_outs": step.truncated})
+            extras: dict[str, Any] = {"time_outs": step.truncated}
+            if may_hold(step.truncated):
+                extras["final_obs"] = self._seen(step.info.final_obs)
+            algorithm.process_env_step(obs, step.reward, step.info.ended, extras)
             self._tally.add(step)
         self._obs = obs
         self._clock.split()

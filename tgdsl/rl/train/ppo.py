@@ -2,7 +2,9 @@
 
 `class_name: tgdsl.rl.train.ppo:CapturedPPO` gives it to rsl_rl. It does what rsl_rl 5.5's own PPO does, with these
 departures: the learning rate is a tensor on the device; gradients are those of `torch.autograd.grad`, in one buffer; to learn
-draws no actions; over several processes, advantages are normalised by mean and deviation of all of them.
+draws no actions; over several processes, advantages are normalised by mean and deviation of all of them. Where an episode is
+cut off because its time is over, the return goes on with the value of the observations at its end, V(o_T), if they are given;
+rsl_rl's goes on with the value before the last step.
 
 Shapes: `env` environments, `joint` joints that the policy moves, `row` rows of a mini-batch.
 """
@@ -85,6 +87,7 @@ class CapturedPPO(PPO):
         is_cuda, tf32 = self._flat.is_cuda, precision != "float32"
         self._autocast = {"device_type": "cuda", "dtype": torch.bfloat16, "enabled": is_cuda and precision == "bfloat16"}
         self._chosen = Captured(self._choose, device, tf32)
+        self._valued = Captured(self._final_value, device, tf32)
         self._judged = Captured(self._surprise, device, tf32, is_captured=not self.is_multi_gpu)  # all processes join in it
         self._returned = Captured(self._returns, device, tf32)
         self._learned = Captured(self._epoch, device, tf32)
@@ -110,14 +113,25 @@ class CapturedPPO(PPO):
         return made.actions
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]) -> None:
-        """Keep what a control step has brought: see rsl_rl."""
+        """Keep what a control step has brought: see rsl_rl.
+
+        Args:
+            obs: Observations after the step, of the next episode where one has ended.
+            rewards: Rewards of the step.
+            dones: Where an episode has ended.
+            extras: `time_outs`, where an episode was cut off; `final_obs`, observations at the ends of episodes.
+        """
         own = self.transition
         paid = rewards.clone()
         own.dones = dones
+        if self.rnd is not None or "final_obs" in extras:
+            own.observations = self._obs.clone()
+        if "final_obs" in extras:
+            self._see(extras["final_obs"])
+            self._value = self._valued()
         if "time_outs" in extras:
             paid += self.gamma * self._value[:, 0] * extras["time_outs"]
         if self.rnd is not None:
-            own.observations = self._obs.clone()
             self._see(obs)
             self.intrinsic_rewards = self._judged() * self.rnd.next_weight()
             paid += self.intrinsic_rewards
@@ -169,7 +183,7 @@ class CapturedPPO(PPO):
         for group in self.optimizer.param_groups:
             self.rate.fill_(float(group["lr"]))
             group["lr"] = self.rate
-        for captured in (self._chosen, self._judged, self._returned, self._learned, *self._parts, self._applied):
+        for captured in (self._chosen, self._valued, self._judged, self._returned, self._learned, *self._parts, self._applied):
             captured.forget()
         return is_loaded
 
@@ -224,6 +238,10 @@ class CapturedPPO(PPO):
             actions = distribution.sample()
             params = tuple(each.contiguous() for each in distribution.params)
             return actions, self._judge(self._obs), distribution.log_prob(actions), params
+
+    def _final_value(self) -> Tensor:
+        with torch.no_grad():
+            return self._judge(self._obs)
 
     def _surprise(self) -> Tensor:
         assert isinstance(self.rnd, Distillation)
