@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
-import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from tgdsl.runtime.simulators.objects.properties import ObjectProperties, RigidObject, refuse_other_fields
+
+if TYPE_CHECKING:
+    import mujoco.batch
 
 Array = np.ndarray
 _OWN = ("body_mass", "body_inertia", "geom_friction")

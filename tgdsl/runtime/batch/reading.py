@@ -5,14 +5,18 @@ Shapes: `env` environments.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mujoco
-import mujoco.batch
 import numpy as np
 from jaxtyping import Int
 
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.batch.contact_sensors import ContactSensors
 from tgdsl.runtime.simulators.bodies import STATE_ARRAYS, BodyFields
+
+if TYPE_CHECKING:
+    import mujoco.batch
 
 
 def _rows(array: np.ndarray, ids: np.ndarray) -> np.ndarray:

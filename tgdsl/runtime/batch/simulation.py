@@ -6,10 +6,9 @@ Shapes: `env` environments, `body` and `pair` as the module's `inputs` list them
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
-import mujoco.batch
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +17,7 @@ from tgdsl.errors import SimulationError
 from tgdsl.module.memory.some_rows import few_rows
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.batch import require_batch
 from tgdsl.runtime.batch.own_fields import OwnFields
 from tgdsl.runtime.batch.reading import BatchReader
 from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
@@ -34,6 +34,9 @@ from tgdsl.runtime.simulators.watch import Watch, WatchReader
 from tgdsl.scene.mujoco_warnings import StepWarnings, collected_messages
 from tgdsl.scene.options import Options
 from tgdsl.tensors.env_ids import EnvIds, env_indices, env_mask, is_env_mask
+
+if TYPE_CHECKING:
+    import mujoco.batch
 
 Array = np.ndarray
 _FORWARD, _VELOCITIES = int(mujoco.mjtStage.mjSTAGE_ACC), int(mujoco.mjtStage.mjSTAGE_VEL)
@@ -93,8 +96,9 @@ class BatchSimulation(Simulation):
             ArtifactError: If an asset of the scene is missing or has changed.
             SimulationError: If the model lacks a body, a contact sensor, the keyframe or what is watched, if its integrator is
                 RK4, if its bodies may sleep, if there is nothing to step, more environments than this computer has memory for,
-                or if the module's state is another simulation's or of other environments.
+                if the module's state is another simulation's or of other environments, or if this MuJoCo has no `mujoco.batch`.
         """
+        require_batch()
         refuse_unfit(touch, num_envs, substeps, model, options)
         if model is None:
             scenes = SharedMeshModels(touch.plan.scene, options, prepare)

@@ -9,14 +9,17 @@ Shapes: `env` environments, `joint` and `actuator` as the module's `inputs` list
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
-import mujoco.batch
 import numpy as np
 from jaxtyping import Int
 
 from tgdsl.errors import SimulationError, did_you_mean
 from tgdsl.plan.inputs import Inputs
+
+if TYPE_CHECKING:
+    import mujoco.batch
 
 MOVED = {"joint_pos": "qpos", "joint_vel": "qvel", "last_action": "ctrl"}
 """Fields of a state that a physics step, or its caller, moves on, and the arrays that they are read from."""
