@@ -33,7 +33,6 @@ class Press(Task[PressSpec]):
     """The task."""
 
     Spec = PressSpec
-    senses = ()
     score_unit = "rad"
     is_less_better = True
     hand_groups = ("goal",)

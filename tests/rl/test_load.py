@@ -98,6 +98,8 @@ def test_a_sensor_that_the_document_lacks_is_named(tmp_path):
     sensors.write_text("\n".join(line for line in whole.splitlines() if "link_contact" not in line))
     (found,) = problems(lambda: TouchEnv(task, 2))
     assert found.path == "task" and '"link_contact"' in found.what
+    sensors.write_text("\n".join(line for line in whole.splitlines() if "link_contact" not in line and "proximity" not in line))
+    assert [found.path for found in problems(lambda: TouchEnv(task, 2))] == ["task", "touch"]  # all at once
 
 
 def test_a_group_of_links_that_the_layout_lacks_is_named(tmp_path):

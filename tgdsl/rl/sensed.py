@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.console.progress import Progress
-from tgdsl.errors import listed
+from tgdsl.errors import SpecError, listed
 from tgdsl.layout.layout import Layout
 from tgdsl.module.module import TactileModule
 from tgdsl.rl.load import LoadedTask
@@ -138,7 +138,11 @@ def compile_sensed(
     """
     spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, sensors_document(loaded)
     kinds = _kinds(document)
-    by_kind = {kind: _sensor_of(loaded, kinds, kind, ("task",)) for kind in (loaded.task.senses if only is None else only)}
+    looked_at = [(kind, ("task",)) for kind in (loaded.task.senses if only is None else only)]
+    felt_kinds = [SENSED[name][0] for name in dict.fromkeys(each.type for each in feels)] if feels is not None else []
+    felt_kinds = [SENSED[spec.touch][0]] if feels is None and only is None and spec.touch != "none" else felt_kinds
+    named = _sensors_of(loaded, kinds, [*looked_at, *((kind, ("touch",)) for kind in felt_kinds)])
+    by_kind = {kind: named[kind] for kind, _ in looked_at}
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
@@ -148,11 +152,11 @@ def compile_sensed(
         overrides["robot.collision"] = spec.physics.collision
     felt, felts = None, {}
     if feels is not None:
-        felts = {each: _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",)) for each in feels}
+        felts = {each: named[SENSED[each.type][0]] for each in feels}
         overrides |= _overrides(loaded, felts)
     elif spec.touch != "none" and only is None:
         kind, observed = SENSED[spec.touch]
-        felt = _sensor_of(loaded, kinds, kind, ("touch",))
+        felt = named[kind]
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
     overrides["observations"] = {**overrides["observations"], **(also or {})}
@@ -233,9 +237,7 @@ def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
     Raises:
         SpecError: If not, or all mistakes of the sensors' document.
     """
-    kinds = _kinds(sensors_document(loaded))
-    for each in feels:
-        _sensor_of(loaded, kinds, SENSED[each.type][0], ("touch",))
+    _sensors_of(loaded, _kinds(sensors_document(loaded)), [(SENSED[each.type][0], ("touch",)) for each in feels])
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
@@ -303,15 +305,28 @@ def _kinds(document: Loaded) -> dict[str, str]:
     return {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
 
 
-def _sensor_of(loaded: LoadedTask, kinds: dict[str, str], kind: str, place: tuple[str, ...]) -> str:
-    """Return the document's only sensor of a kind.
+def _sensors_of(
+    loaded: LoadedTask, kinds: Mapping[str, str], wanted: Sequence[tuple[str, tuple[str, ...]]]
+) -> dict[str, str]:
+    """Return the document's only sensor of each kind that is wanted.
+
+    Args:
+        loaded: The task's document.
+        kinds: Kind of each sensor.
+        wanted: Kinds, each with the place in the task's document that wants it.
 
     Raises:
-        SpecError: If there is none, or several.
+        SpecError: All kinds of which there is none, or several.
     """
-    found = [name for name, own in kinds.items() if own == kind]
-    if len(found) == 1:
-        return found[0]
-    which = f"the sensors {listed(found)}" if found else "no sensor"
-    what = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
-    raise loaded.error(place, what)
+    named, problems = {}, []
+    for kind, place in wanted:
+        found = [name for name, own in kinds.items() if own == kind]
+        if len(found) == 1:
+            named[kind] = found[0]
+            continue
+        which = f"the sensors {listed(found)}" if found else "no sensor"
+        what = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
+        problems += loaded.error(place, what).problems
+    if problems:
+        raise SpecError(problems)
+    return named

@@ -166,7 +166,8 @@ class Task(ABC, Generic[S]):
 
     Attributes:
         Spec: Model of its document.
-        senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels.
+        senses: Kinds of sensors of the sensors' document that it looks at, besides what the policy feels: `now.link_force` is
+            that of `link_contact`, `now.distance` that of `surface_distance`.
         wants_normal_force: Whether it looks at the normal force of the `link_contact` sensor, besides the force.
         score_unit: Unit of its score.
         is_less_better: Whether its score is an error.
@@ -179,7 +180,7 @@ class Task(ABC, Generic[S]):
     """
 
     Spec: ClassVar[type[TaskSpec]]
-    senses: ClassVar[tuple[str, ...]] = ("link_contact", "surface_distance")
+    senses: ClassVar[tuple[str, ...]] = ()
     wants_normal_force: ClassVar[bool] = False
     score_unit: ClassVar[str]
     is_less_better: ClassVar[bool] = False

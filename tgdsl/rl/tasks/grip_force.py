@@ -163,6 +163,7 @@ class GripForce(Task[GripForceSpec]):
     """The task."""
 
     Spec = GripForceSpec
+    senses = ("link_contact", "surface_distance")
     wants_normal_force = True
     score_unit = "RMS of force error over command"
     is_less_better = True

@@ -216,6 +216,7 @@ class InHandRepose(Task[InHandReposeSpec]):
     """The task."""
 
     Spec = InHandReposeSpec
+    senses = ("link_contact", "surface_distance")
     score_unit = "goals in a row"
 
     def __init__(self, spec: InHandReposeSpec, setup: Setup):

@@ -194,6 +194,7 @@ class InPalmRotate(Task[InPalmRotateSpec]):
     """The task."""
 
     Spec = InPalmRotateSpec
+    senses = ("link_contact", "surface_distance")
     score_unit = "quarter turns"
 
     def __init__(self, spec: InPalmRotateSpec, setup: Setup):

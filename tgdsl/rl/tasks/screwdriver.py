@@ -217,6 +217,7 @@ class Screwdriver(Task[ScrewdriverSpec]):
     """The task."""
 
     Spec = ScrewdriverSpec
+    senses = ("link_contact", "surface_distance")
     score_unit = "rad/s"
 
     def __init__(self, spec: ScrewdriverSpec, setup: Setup):
