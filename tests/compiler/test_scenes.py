@@ -48,6 +48,30 @@ def test_an_object_of_its_own_falls_and_is_felt(tmp_path):
     assert abs(touch(sim.state())["s"][0, 0, 0].item()) < 5e-4  # on the pad, but for MuJoCo's soft contact
 
 
+@pytest.mark.parametrize(
+    ("pad", "given", "bits"),
+    [
+        ((1, 1), {}, (1, 1)),
+        ((2, 2), {}, (3, 3)),
+        ((0, 4), {}, (5, 1)),
+        ((8, 0), {}, (1, 9)),
+        ((2, 2), {"contype": 0, "conaffinity": 2}, (0, 2)),
+        ((2, 2), {"conaffinity": 0, "contype": 1}, None),
+        ((1, 1), {"contype": 0, "conaffinity": 0}, None),
+    ],
+)
+def test_an_object_of_its_own_collides_with_whatever_bits_others_have(tmp_path, pad, given, bits):
+    """Unless it is given others. It comes to rest on the pad, or falls through."""
+    text = SCENE.replace("<worldbody>", f'<default><geom contype="{pad[0]}" conaffinity="{pad[1]}"/></default><worldbody>')
+    doc = document(tmp_path, {"ball": {"geom": BALL, "pos": [0, 0, 0.14], **given}}, text)
+    sim = tgdsl.simulate(tgdsl.compile(doc), 1, substeps=100)
+    own = sim.model.geom(sim.model.body("ball").geomadr[0])
+    assert bits is None or (own.contype[0], own.conaffinity[0]) == bits
+    for _ in range(2):
+        sim.step()
+    assert (sim.batch.qpos[0, 3] - sim.batch.qpos[0, 0] > 0.12) == (bits is not None)
+
+
 def test_keyframes_keep_new_objects_where_they_start(tmp_path):
     quat = [0.5, 0.5, 0.5, 0.5]
     doc = document(
@@ -92,7 +116,7 @@ def test_one_geom_instead_of_the_scenes(tmp_path):
     [
         ({}, "expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own"),
         ({"geom": BALL, "variants": [BALL]}, "found `geom` and `variants`, expected one of them"),
-        ({"body": "pad", "pos": [0, 0, 1]}, '`pos` is for a body of its own; where body "pad" is, the scene says'),
+        ({"body": "pad", "pos": [0, 0, 1]}, '`pos` is for a body of its own; of body "pad" the scene says it'),
         ({"geom": {"type": "plane", "size": [1]}}, "objects.item.geom.type: found \"plane\", expected 'sphere'"),
         ({"geom": {"mesh": "no.stl"}}, 'objects.item.geom: there is no file "no.stl"'),
         ({"geom": BALL, "joint": "hinge"}, "objects.item.joint: found \"hinge\", expected 'free' or 'fixed'"),

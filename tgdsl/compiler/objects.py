@@ -12,6 +12,7 @@ from tgdsl.compiler.variants import Meshes, NewBody, OwnObjects, scene_object, v
 from tgdsl.errors import did_you_mean
 from tgdsl.formats.model import Model
 from tgdsl.plan.scene import SceneObject
+from tgdsl.scene.contact_bits import bits_that_meet
 from tgdsl.schema.loaded import Loaded
 from tgdsl.schema.yaml import Path
 from tgdsl.surfaces.sensed import SensedObject
@@ -60,13 +61,16 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
     is_forced = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     low = int(compiler.inertiagrouprange[0])
     group = low if is_forced and low > 0 else 0
+    contype, conaffinity = bits_that_meet(scene.spec.geoms)
     for name, target in loaded.spec.objects.items():
         if target.body is None and name in scene.bodies:
             what = f'the scene has a body "{name}" already'
             loaded.problems.append(loaded.problem(("objects", name), what, f"`body: {name}` gives that one these geoms"))
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
-            new.append(NewBody(name, pos, quat, target.joint != "fixed", group))
+            own = NewBody(name, pos, quat, target.joint != "fixed", group, contype, conaffinity)
+            given = {bits: value for bits in ("contype", "conaffinity") if (value := getattr(target, bits)) is not None}
+            new.append(replace(own, **given))
     return tuple(new)
 
 

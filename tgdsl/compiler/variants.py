@@ -49,6 +49,8 @@ class NewBody:
         quat: How it is turned there, w, x, y, z.
         is_free: Whether it moves freely, or is fixed to the world.
         group: Of its geoms: one that weighs, where the scene's compiler takes all inertias from geoms.
+        contype: MuJoCo's bits of its geoms.
+        conaffinity: Likewise.
     """
 
     name: str
@@ -56,6 +58,13 @@ class NewBody:
     quat: tuple[float, float, float, float]
     is_free: bool
     group: int = 0
+    contype: int = 1
+    conaffinity: int = 1
+
+    @property
+    def geom(self) -> dict[str, tuple[float, ...]]:
+        """Fields of its placeholder, which its geoms inherit: MuJoCo's own values, not those of the scene's `<default>`."""
+        return PLAIN | {"contype": (self.contype,), "conaffinity": (self.conaffinity,), "group": (self.group,)}
 
 
 WATER = 1000.0
@@ -63,8 +72,6 @@ WATER = 1000.0
 PLACEHOLDER = 0.01
 """Radius of the ball that a new body has until it is given its own geoms [m]."""
 PLAIN: dict[str, tuple[float, ...]] = {
-    "contype": (1,),
-    "conaffinity": (1,),
     "condim": (3,),
     "priority": (0,),
     "friction": (1, 0.005, 0.0001),
@@ -93,9 +100,9 @@ def with_bodies(scene: Model, bodies: Sequence[NewBody]) -> Model:
         body = spec.worldbody.add_body(name=new.name, pos=new.pos, quat=new.quat)
         body.explicitinertial, body.mass, body.inertia, body.ipos = True, 1.0, [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
         geom = body.add_geom(name=placeholder_name(new.name), type=mujoco.mjtGeom.mjGEOM_SPHERE)
-        for name, value in PLAIN.items():
+        for name, value in new.geom.items():
             setattr(geom, name, value if len(value) > 1 else next(iter(value)))
-        geom.size, geom.group, geom.density = [PLACEHOLDER, 0, 0], new.group, WATER
+        geom.size, geom.density = [PLACEHOLDER, 0, 0], WATER
         if new.is_free:
             body.add_freejoint().align = mujoco.mjtAlignFree.mjALIGNFREE_FALSE
     for key in spec.keys:
@@ -122,7 +129,7 @@ def as_worldbody(bodies: Sequence[NewBody]) -> ET.Element:
         if new.is_free:
             ET.SubElement(body, "freejoint", {"align": "false"})
         ET.SubElement(body, "inertial", {name: " ".join(map(repr, value)) for name, value in INERTIAL.items()})
-        numbers = PLAIN | {"size": (PLACEHOLDER, 0, 0), "group": (new.group,), "density": (WATER,)}
+        numbers = new.geom | {"size": (PLACEHOLDER, 0, 0), "density": (WATER,)}
         shown = {name: " ".join(map(repr, value)) for name, value in numbers.items()}
         ET.SubElement(body, "geom", {"name": placeholder_name(new.name), "type": "sphere"} | shown)
     return world

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -29,6 +31,15 @@ def free_bit(spec: mujoco.MjSpec, who: str, error: type[TgdslError], fields: tup
         names = " and ".join(f"`{field}`" for field in fields)
         raise error(f"the scene's geoms use all bits of {names}; {who} need a free one")
     return free
+
+
+def bits_that_meet(geoms: Iterable[mujoco.MjsGeom]) -> tuple[int, int]:
+    """Return `contype` and `conaffinity` of a geom that collides with all that collide with any: 1 and 1 where that will do."""
+    contype = conaffinity = 1
+    for geom in geoms:
+        if (geom.contype or geom.conaffinity) and not meets(1, 1, geom):
+            contype, conaffinity = contype | geom.conaffinity, conaffinity | geom.contype
+    return contype, conaffinity
 
 
 def meets(contype: int, conaffinity: int, geom: mujoco.MjsGeom) -> bool:

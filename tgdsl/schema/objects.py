@@ -116,6 +116,7 @@ ObjectTemperature = Annotated[
 _Materials = Annotated[tuple[MaterialField, ...], Field(min_length=1)]
 ObjectMaterials = Annotated[_Materials, BeforeValidator(_as_tuple, json_schema_input_type=MaterialField | _Materials)]
 Cells = Annotated[StrictInt, Field(ge=1)]
+Bits = Annotated[StrictInt, Field(ge=0, lt=2**31)]
 
 
 class ObjectSpec(SpecModel):
@@ -138,6 +139,11 @@ class ObjectSpec(SpecModel):
     """How it is turned there, w, x, y, z; default: not at all."""
     joint: Literal["free", "fixed"] | None = None
     """Whether a body of its own moves freely (the default) or is fixed to the world."""
+    contype: Bits | None = None
+    """MuJoCo's bits of the geoms of a body of its own; default: 1, and what makes it collide with all geoms of the scene that
+    collide."""
+    conaffinity: Bits | None = None
+    """Likewise."""
     surface: str = "collision"
     """What is felt of it: `collision`, the geoms that collide, meshes by their convex hulls as MuJoCo collides them; `visual`,
     the geoms that do not, meshes as they are; or the name of a geom or mesh of its body, with shell wildcards, as it is. The
@@ -175,9 +181,9 @@ class ObjectSpec(SpecModel):
             raise ValueError("found `geom` and `variants`, expected one of them")
         if self.body is None and not self.compounds:
             raise ValueError("expected `body`, the name of a body in the scene, or `geom` or `variants` for a body of its own")
-        placed = [key for key in ("pos", "quat", "joint") if getattr(self, key) is not None]
-        if self.body is not None and placed:
-            raise ValueError(f'`{placed[0]}` is for a body of its own; where body "{self.body}" is, the scene says')
+        own = [key for key in ("pos", "quat", "joint", "contype", "conaffinity") if getattr(self, key) is not None]
+        if self.body is not None and own:
+            raise ValueError(f'`{own[0]}` is for a body of its own; of body "{self.body}" the scene says it')
         if self.compounds and self.surface not in ("collision", "visual"):
             raise ValueError(f'surface "{self.surface}" names a geom; with geoms of its own it is `collision` or `visual`')
         if self.quat is not None:
