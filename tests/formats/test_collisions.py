@@ -70,6 +70,7 @@ CASES = {
     ),
     "one_of_two_geoms_collides": (two_bodies(FREE + TOUCHING_VISUAL, f"|{FREE}"), True),
     "contacts_disabled": (two_bodies(FREE, f"|{FREE}", rest="<option><flag contact='disable'/></option>"), False),
+    "constraints_disabled": (two_bodies(FREE, f"|{FREE}", rest="<option><flag constraint='disable'/></option>"), False),
     "mocap_and_free": (two_bodies(FREE, "mocap='true'|"), True),
     "mocap_and_static": (two_bodies("", "mocap='true'|"), False),
     "mocap_and_its_child": (two_bodies("", f"|{HINGE}", nested=True).replace("'a'", "'a' mocap='true'"), False),

@@ -33,7 +33,15 @@ def joint_of(name: str, parent: str, child: str, kind: str = "fixed") -> str:
 
 
 @pytest.mark.parametrize(
-    "reference", ["wedge.stl", "./meshes/../wedge.stl", "package://hand_pkg/urdf/wedge.stl", "file://wedge.stl"]
+    "reference",
+    [
+        "wedge.stl",
+        "./meshes/../wedge.stl",
+        "package://hand_pkg/urdf/wedge.stl",
+        "package://hand_description/urdf/wedge.stl",
+        "model://hand_pkg/urdf/wedge.stl",
+        "file://wedge.stl",
+    ],
 )
 def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
     folder = tmp_path / "hand_pkg" / "urdf"
@@ -43,6 +51,7 @@ def test_urdf_meshes_come_back_at_their_place(tmp_path, reference):
         folder, link_of("palm", mesh, origin=origin) + link_of("tip", "<sphere radius='.01'/>") + joint_of("j", "palm", "tip")
     )
     (folder / "meshes").mkdir()
+    (folder.parent / "package.xml").write_text("<package format='3'><name>hand_description</name></package>")
     wedge().export(folder / "wedge.stl")
     model = load_model(path)
     assert model.is_urdf
@@ -163,6 +172,21 @@ def test_urdf_errors(tmp_path, text, message):
     with pytest.raises(RobotError) as caught:
         load_model(path)
     assert str(caught.value) == f"{path}: {message.format(folder=tmp_path.resolve())}"
+
+
+@pytest.mark.parametrize("declared", ["", " xmlns:xacro='http://www.ros.org/wiki/xacro'"])
+def test_xacro_is_told_from_urdf(tmp_path, declared):
+    """Its links stand in files that it includes, so that without them there would be an empty world."""
+    path = tmp_path / "hand.urdf.xacro"
+    path.write_text(f"<robot name='hand'{declared}><xacro:include filename='fingers.xacro'/></robot>")
+    with pytest.raises(RobotError, match=r"this is xacro, of which URDF is made: xacro hand\.urdf\.xacro > hand\.urdf"):
+        load_model(path)
+
+
+def test_a_mesh_in_another_case_is_named(tmp_path):
+    wedge().export(tmp_path / "Wedge.STL")
+    with pytest.raises(RobotError, match=r'mesh "wedge\.stl": there is no file .*; there is Wedge\.STL'):
+        load_model(urdf_of(tmp_path, link_of("a", "<mesh filename='wedge.stl'/>")))
 
 
 def test_a_number_that_is_none_in_a_urdf(tmp_path):

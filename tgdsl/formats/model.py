@@ -154,7 +154,7 @@ class Model:
     def geoms_can_collide(self, geoms: Iterable[int], others: Iterable[int]) -> bool:
         """Return whether MuJoCo can ever report a contact between some geoms and some others, by their indices."""
         model = self.compiled
-        if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        if model.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
             return False
         pairs = {frozenset(ids) for ids in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
         for a, b in itertools.product(geoms, others):

@@ -63,7 +63,8 @@ def _fill_meshes(path: Path, spec: mujoco.MjSpec, files: Mapping[str, Path]) -> 
 def as_mujoco_text(path: Path) -> tuple[str, dict[str, Path]]:
     """Return a URDF's text with what MuJoCo needs to read it, and the file of each mesh by the stem of its name in there.
 
-    Mesh files are found (`package://` is looked up in the folders above the file), links on fixed joints keep their own
+    Mesh files are found (`package://` and `model://` are looked up in the folders above the file: by the name in a
+    `package.xml`, or by their own), links on fixed joints keep their own
     bodies, and inertias that no rigid body can have are replaced by a ball's of about the same size. Geoms that have a name
     which is taken get a number, as MuJoCo has each name once.
 
@@ -99,7 +100,7 @@ def _root(path: Path) -> ET.Element:
     """Return a URDF's root; tags of other programs, by prefixes that may not be declared, are taken out.
 
     Raises:
-        RobotError: If the file is not XML.
+        RobotError: If the file is not XML, or is xacro.
     """
     content = path.read_bytes()
     try:
@@ -114,6 +115,10 @@ def _root(path: Path) -> ET.Element:
             root = ET.fromstring(_ROOT.sub(f"<robot{declared}", text, count=1))
         except ET.ParseError:
             raise RobotError(f"{path}: not XML: {error}") from error
+    if any(isinstance(part.tag, str) and part.tag.partition("}")[0].endswith("xacro") for part in root.iter()):
+        raise RobotError(
+            f"{path}: this is xacro, of which URDF is made: xacro {path.name} > {path.name.partition('.')[0]}.urdf"
+        )
     for parent in list(root.iter()):
         for child in [child for child in parent if isinstance(child.tag, str) and child.tag.startswith("{")]:
             parent.remove(child)
@@ -139,19 +144,29 @@ def _number_names(robot: ET.Element) -> None:
 
 
 def _mesh_file(name: str, urdf: Path) -> Path:
-    if name.startswith("package://"):
-        inside = name.removeprefix("package://")
+    scheme, _, inside = name.partition("://")
+    if scheme in ("package", "model"):
         package, _, rest = inside.partition("/")
         for folder in urdf.resolve().parents:
-            if folder.name == package and (folder / rest).is_file():
+            if package in (folder.name, _package_name(folder)) and (folder / rest).is_file():
                 return folder / rest
             if (folder / inside).is_file():
                 return folder / inside
         raise RobotError(f'{urdf}: mesh "{name}": no folder above the file holds "{inside}"')
     found = urdf.resolve().parent / name.removeprefix("file://")
     if not found.is_file():
-        raise RobotError(f'{urdf}: mesh "{name}": there is no file {found}')
+        alike = [own.name for own in found.parent.glob("*") if own.name.lower() == found.name.lower()]
+        raise RobotError(f'{urdf}: mesh "{name}": there is no file {found}' + (f"; there is {alike[0]}" if alike else ""))
     return found
+
+
+def _package_name(folder: Path) -> str | None:
+    """Return the name that a ROS package gives itself; None if this folder is none."""
+    file = folder / "package.xml"
+    try:
+        return ET.parse(file).getroot().findtext("name", "").strip() if file.is_file() else None
+    except ET.ParseError as error:
+        raise RobotError(f"{file}: not XML: {error}") from error
 
 
 def _mend(link: ET.Element, moving: Collection[str]) -> bool:

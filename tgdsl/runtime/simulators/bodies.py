@@ -5,6 +5,7 @@ Shapes: `env` environments, `body` as the module's `inputs` list them.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -12,6 +13,7 @@ import mujoco
 import numpy as np
 import torch
 
+from tgdsl.errors import listed
 from tgdsl.plan.inputs import Inputs
 from tgdsl.runtime.simulators.model_ids import body_id
 
@@ -32,7 +34,7 @@ class BodyFields:
         take: Callable[[Any, Any], Any],
         cross: Callable[[Any, Any], Any],
     ):
-        """Look the bodies up.
+        """Look the bodies up; warn of mocap bodies whose velocity is wanted, as MuJoCo has them at rest however they are moved.
 
         Args:
             inputs: What the module wants.
@@ -48,6 +50,10 @@ class BodyFields:
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
         self._take, self._cross = take, cross
+        mocap = [name for name, id in zip(inputs.bodies, ids, strict=True) if model.body_mocapid[model.body_rootid[id]] >= 0]
+        if mocap and {"body_linvel", "body_angvel"} & set(inputs.fields):
+            what = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
+            warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=6)
 
     def read(self, arrays: Mapping[str, T]) -> dict[str, T]:
         """Return the fields that the module wants, (env, body, …), each an array of its own."""
