@@ -20,6 +20,7 @@ from tgdsl.module.state import SceneState
 from tgdsl.runtime.batch import require_batch
 from tgdsl.runtime.batch.own_fields import OwnFields
 from tgdsl.runtime.batch.reading import BatchReader
+from tgdsl.runtime.simulators.bodies import warn_of_mocap
 from tgdsl.runtime.simulators.claims import claim, refuse_two_instants, refuse_unfit
 from tgdsl.runtime.simulators.faults import DIVERGED, EnvFaults, OnFault
 from tgdsl.runtime.simulators.joint_fields import JointColumns, KeptJoints
@@ -114,6 +115,7 @@ class BatchSimulation(Simulation):
         self._keyframe = keyframe_id(model, keyframe)
         self.batch = mujoco.batch.Batch(self.model, num_envs, threads)
         self._warnings = StepWarnings()
+        warn_of_mocap(touch.inputs, self.model)
         self._reader = BatchReader(touch.inputs, self.model, self.batch)
         self._kept = KeptJoints(JointColumns.of(touch.inputs, self.model), self.batch)
         self._keepers = [self._kept]

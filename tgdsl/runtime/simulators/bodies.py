@@ -22,6 +22,16 @@ STATE_ARRAYS = ("xpos", "xquat", "cvel", "subtree_com", "sensordata")
 """Arrays of MuJoCo that poses, velocities and contacts of a state are read from."""
 
 
+def warn_of_mocap(inputs: Inputs, model: mujoco.MjModel) -> None:
+    """Warn of mocap bodies whose velocity a module wants, as MuJoCo has them at rest however they are moved."""
+    if not {"body_linvel", "body_angvel"} & set(inputs.fields):
+        return
+    mocap = [name for name in inputs.bodies if model.body_mocapid[model.body_rootid[body_id(model, name)]] >= 0]
+    if mocap:
+        what = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
+        warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=5)
+
+
 class BodyFields:
     """Gathers the fields of a state that are poses and velocities of bodies."""
 
@@ -34,7 +44,7 @@ class BodyFields:
         take: Callable[[Any, Any], Any],
         cross: Callable[[Any, Any], Any],
     ):
-        """Look the bodies up; warn of mocap bodies whose velocity is wanted, as MuJoCo has them at rest however they are moved.
+        """Look the bodies up.
 
         Args:
             inputs: What the module wants.
@@ -50,10 +60,6 @@ class BodyFields:
         self._bodies, self._roots = index(ids), index(model.body_rootid[ids].astype(np.int64))
         self._fields = inputs.fields
         self._take, self._cross = take, cross
-        mocap = [name for name, id in zip(inputs.bodies, ids, strict=True) if model.body_mocapid[model.body_rootid[id]] >= 0]
-        if mocap and {"body_linvel", "body_angvel"} & set(inputs.fields):
-            what = "MuJoCo gives a mocap body that is moved no velocity: shear, slip and sound of its motion are not felt"
-            warnings.warn(f"{what}: {listed(mocap)}; move it by a joint, or by a weld to a mocap body", stacklevel=6)
 
     def read(self, arrays: Mapping[str, T]) -> dict[str, T]:
         """Return the fields that the module wants, (env, body, …), each an array of its own."""

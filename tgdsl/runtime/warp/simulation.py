@@ -17,6 +17,7 @@ from torch import Tensor
 from tgdsl.errors import SimulationError
 from tgdsl.module.module import TactileModule
 from tgdsl.module.state import SceneState
+from tgdsl.runtime.simulators.bodies import warn_of_mocap
 from tgdsl.runtime.simulators.claims import claim, refuse_unfit
 from tgdsl.runtime.simulators.faults import OnFault
 from tgdsl.runtime.simulators.model_ids import keyframe_id
@@ -142,6 +143,7 @@ class WarpSimulation(Simulation):
             self._table = StateTable(model, self._arrays)
         if self._objects is not None:
             self._objects.write_to(self._worlds)
+        warn_of_mocap(touch.inputs, model)
         self._reader = StateReader(touch.inputs, model, self._worlds.arrays, self._worlds.kept, self._worlds.contacts)
         if self._watch is not None:
             self._watch_reader = StateReader(self._watch.inputs, model, self._worlds.arrays, self._worlds.kept)
