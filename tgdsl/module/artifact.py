@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
+from pathlib import Path
 
 import torch
 
@@ -28,10 +29,12 @@ def save(touch: TactileModule, path: str | PathLike[str]) -> int:
 
     Raises:
         FileError: If the file cannot be written.
-        TgdslError: If it is no module.
+        TgdslError: If it is no module, or the file's name is that of something else.
     """
     if not isinstance(touch, TactileModule):
         raise TgdslError(f"tgdsl.save writes a module that tgdsl.compile returned, found {type(touch).__name__}")
+    if Path(path).suffix.lower() in (".pt", ".pth", ".yaml", ".yml", ".xml"):
+        raise TgdslError(f"{path}: an artefact is a safetensors file, expected a name such as {Path(path).stem}.safetensors")
     return save_plan(touch.plan, path)
 
 

@@ -62,6 +62,10 @@ def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) ->
         ObservationError: If a reading that is observed is missing or of another shape, if readings are of different numbers of
             environments, or an observation is one that only the real hand has.
     """
+    if not isinstance(readings, Mapping):
+        raise ObservationError(
+            f"found a {type(readings).__name__}, expected readings by name, as a call of the module returns them"
+        )
     num_envs = _checked(plan, readings)
     groups: dict[str, list[Tensor]] = {}
     for term in plan.observations:

@@ -15,6 +15,7 @@ from contextlib import nullcontext
 from os import PathLike
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -206,16 +207,19 @@ class TouchEnv:
             self._obs, self._is_loaded = self._observe(now), False
             return dict(self._obs)
 
-    def step(self, action: Float[Tensor, "env joint"]) -> Step:
+    def step(self, action: Float[Tensor, "env joint"] | Float[np.ndarray, "env joint"]) -> Step:
         """Make one control step in all environments; those whose episodes end begin the next one.
 
         Args:
             action: What the policy asks for, from −1 to 1: what is beyond is clipped. An environment with actions that are not
-                finite ends its episode, and is named in `info.faults`.
+                finite ends its episode, and is named in `info.faults`. NumPy's arrays are taken too.
 
         Raises:
-            SimulationError: If an action does not fit, or a pool of MuJoCo Warp was too small.
+            SimulationError: If an action does not fit or is of integers, or a pool of MuJoCo Warp was too small.
         """
+        action = torch.as_tensor(action)
+        if not action.is_floating_point():
+            raise SimulationError(f"action is of {action.dtype}, expected numbers from -1 to 1")
         if tuple(action.shape) != tuple(self._action.shape):
             raise SimulationError(f"action has shape {tuple(action.shape)}, expected {tuple(self._action.shape)}")
         with torch.inference_mode(False), torch.no_grad(), self._dispatch(), self._step_by():  # memory is written outside too

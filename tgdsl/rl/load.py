@@ -65,6 +65,8 @@ def load_task(document: str | PathLike[str] | Mapping[str, Any], overrides: Mapp
         source.set(dotted, value)
     if not isinstance(source.value, dict) or not isinstance(source.value.get("task"), str):
         what = 'missing key "task", one of: ' + ", ".join(TASKS)
+        if isinstance(source.value, dict) and "sensors" in source.value:
+            what = "this is a document of sensors, which a task's document names: `document: …`"
         raise SpecError([*source.problems, source.problem(("task",), what, on_key=True)])
     task = _task_class(source, folder)
     problems: list[Problem] = list(source.problems)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from os import PathLike
 from typing import Any, Literal, overload
 
 from tgdsl.errors import SimulationError, listed
@@ -102,6 +103,9 @@ def simulate(
         SimulationError: If the device is not supported, an argument is for another device, or the scene lacks what the module
             wants.
     """
+    if not isinstance(touch, TactileModule):
+        made = f"tgdsl.compile({touch!r})" if isinstance(touch, (str, PathLike)) else "tgdsl.compile(document)"
+        raise SimulationError(f"found a {type(touch).__name__}, expected a module: {made}")
     given: dict[str, Any] = {"substeps": substeps, "threads": threads, "keyframe": keyframe, "on_fault": on_fault}
     given |= {"options": options, "watch": watch, "per_env": tuple(per_env), "nconmax": nconmax, "njmax": njmax}
     kind = _simulator_on(device)

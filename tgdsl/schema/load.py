@@ -22,6 +22,13 @@ from tgdsl.schema.yaml import Source
 from tgdsl.sensors import KINDS, Kind
 
 S = TypeVar("S", bound=BaseModel)
+ROBOT = "a robot or scene file, which a document names: `robot: {model: …}`"
+NO_DOCUMENTS = {
+    ".safetensors": "an artefact, which `tgdsl.load` reads",
+    ".pt": "a policy or checkpoint",
+    **dict.fromkeys((".xml", ".mjcf", ".urdf", ".xacro", ".usd", ".usda", ".usdc", ".usdz"), ROBOT),
+}
+"""What files are that are no YAML documents, by their endings."""
 
 
 def load(
@@ -55,6 +62,10 @@ def load(
         source, folder = _read_file(Path(document), str(document)), Path(document).parent
     if source.value is None:
         raise SpecError(source.problems)
+    if isinstance(source.value, dict) and "task" in source.value and "sensors" not in source.value:
+        what = "this is a task's document, expected one of sensors"
+        hint = f"its own is {source.value['document']}" if "document" in source.value else ""
+        raise SpecError([source.problem(("task",), what, hint, on_key=True)])
     for dotted, value in (overrides or {}).items():
         source.set(dotted, value)
     if sensors is not None:
@@ -145,6 +156,12 @@ def _read_file(path: Path, name: str) -> Source:
 
 def _content(path: Path, name: str) -> bytes:
     """Return what is in a file, or as much of it as shows that it is too large."""
+    if "\n" in name:
+        raise SpecError(
+            [Problem("<text>", 0, 0, "", "found YAML text, expected a file's name, or a mapping: `yaml.safe_load(text)`")]
+        )
+    if path.suffix.lower() in NO_DOCUMENTS:
+        raise SpecError([Problem(name, 0, 0, "", f"this is {NO_DOCUMENTS[path.suffix.lower()]}, expected a YAML document")])
     try:
         with path.open("rb") as file:
             return file.read(yaml.MAX_BYTES + 1)

@@ -60,7 +60,7 @@ def why_there_is_none(device: object, error: Exception, known: Sequence[str] = (
         known: Types of devices of which one may be meant.
     """
     if str(device).partition(":")[0] in known:
-        return f": {str(error).partition(chr(10))[0]}"
+        return f": {str(error).partition(chr(10))[0]}" + ('; expected "cpu"' if "cpu" in known else "")
     if str(device).startswith("gpu") and "cuda" in known:
         return '; did you mean "cuda"?'
     return "; expected " + " or ".join(f'"{name}"' for name in known)

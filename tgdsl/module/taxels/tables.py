@@ -69,6 +69,8 @@ def images_of(
     owner = {r.name: sensor for sensor in plan.sensors for r in sensor.readings if r.rows == "taxel"}
     if name not in owner:
         raise TgdslError(f'there is no reading of taxels "{name}"; {did_you_mean(name, owner, "readings of taxels")}')
+    if not isinstance(readings, Mapping):
+        raise TgdslError(f"found a {type(readings).__name__}, expected readings by name, as a call of the module returns them")
     by_channel = last_step(readings[name]).transpose(1, 2)
     images, masks = {}, {}
     for link, index in image_indices(plan.layout_of(owner[name])).items():

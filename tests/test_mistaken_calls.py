@@ -1,0 +1,77 @@
+"""Calls with something else than what is expected: each is told what it is, and what to do."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_tasks import small_task
+
+import tgdsl
+from tgdsl.errors import ObservationError, SimulationError, SpecError, TgdslError
+from tgdsl.rl.env import TouchEnv
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def touch():
+    return tgdsl.compile(EXAMPLES / "xhand1_palm.yaml")
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ("hand.xml", "hand.xml: this is a robot or scene file, which a document names: `robot: {model: …}`, expected a YAML"),
+        ("hand.safetensors", "this is an artefact, which `tgdsl.load` reads, expected a YAML document"),
+        ("policy.pt", "this is a policy or checkpoint, expected a YAML document"),
+        ("tgdsl: 1\nrobot: {model: xhand1}\n", "<text>: found YAML text, expected a file's name, or a mapping"),
+    ],
+)
+def test_what_is_no_document(document, message):
+    for read in (tgdsl.compile, lambda own: TouchEnv(own, 1)):
+        with pytest.raises(SpecError) as caught:
+            read(document)
+        assert message in str(caught.value)
+
+
+def test_documents_of_tasks_and_of_sensors_are_told_apart(here):
+    task = EXAMPLES / "tasks" / "in_palm_rotate_cube.yaml"
+    code, _, error = here(task.parent, "run", task.name)
+    assert (code, error.splitlines()[1:]) == (2, ["1 mistake"])
+    assert "task: this is a task's document, expected one of sensors; its own is palm.yaml" in error
+    code, _, error = here(task.parent, "play", "palm.yaml")
+    assert code == 2 and "this is a document of sensors, which a task's document names: `document: …`" in error
+
+
+def test_modules_readings_and_files(touch, tmp_path):
+    state = touch.example_state(2)
+    with pytest.raises(SimulationError, match=r"found a str, expected a module: tgdsl\.compile\('hand\.yaml'\)"):
+        tgdsl.simulate("hand.yaml", 2)  # type: ignore[arg-type]
+    with pytest.raises(ObservationError, match="found a SceneState, expected readings by name"):
+        touch.observe(state)
+    with pytest.raises(TgdslError, match="found a Tensor, expected readings by name"):
+        touch.images("touch", touch(state)["touch"])
+    with pytest.raises(TgdslError, match=r"x\.pt: an artefact is a safetensors file, expected a name such as x\.safetensors"):
+        tgdsl.save(touch, tmp_path / "x.pt")
+    assert not list(tmp_path.iterdir())
+
+
+def test_steps_of_environments(tmp_path):
+    env = TouchEnv(small_task(tmp_path), 2)
+    with pytest.raises(SimulationError, match=r"action is of torch\.int64, expected numbers from -1 to 1"):
+        env.step(torch.zeros(2, env.num_actions, dtype=torch.int64))
+    action = np.linspace(-1, 1, 2 * env.num_actions, dtype=np.float32).reshape(2, -1)
+    made = env.step(action)
+    env.reset(seed=0)
+    again = TouchEnv(small_task(tmp_path), 2, seed=0)
+    again.reset(seed=0)
+    assert made.reward.shape == (2,)
+    torch.testing.assert_close(env.step(action).obs, again.step(torch.from_numpy(action)).obs)
+
+
+def test_a_device_that_is_not_there():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(TgdslError, match=r'there is no device "cuda": .*; expected "cpu"'):
+        tgdsl.compile(EXAMPLES / "xhand1_palm.yaml", device="cuda")
