@@ -56,6 +56,8 @@ def test_stacked_calls_of_some_channels(tmp_path):
     found = touch.observe(readings)
     np.testing.assert_array_equal(found["policy"].numpy(), features(readings["near"], [2]))
     assert touch.observations["policy"][0].size == found["policy"].shape[1] == 3 * 4
+    (term,) = touch.observations["policy"]
+    assert repr(touch.observations).splitlines()[2].split() == ["policy", term.name, term.type, "0:12"]
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,15 @@ class Outputs(tuple[Any, ...]):
         return text_table(("reading", "kind", "shape", "channels"), rows)
 
 
+class Observations(dict[str, tuple[Any, ...]]):
+    """A dictionary of observation groups' terms that prints as a table, a row per term."""
+
+    def __repr__(self) -> str:
+        each = [(group, term) for group, terms in self.items() for term in terms]
+        rows = [(group, term.name, term.type, f"{term.slice.start}:{term.slice.stop}") for group, term in each]
+        return text_table(("group", "term", "type", "features"), rows)
+
+
 class TaxelTable(np.ndarray):
     """A structured array that prints as a table, a row per taxel; what is taken out of it is an ordinary array."""
 

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tgdsl.console.tables import Observations
 from tgdsl.errors import ObservationError, did_you_mean
 from tgdsl.observations import observations
 from tgdsl.plan.plan import Plan
@@ -39,7 +40,7 @@ class ObservationTerm:
 
 
 def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
-    """Return the terms of each observation group, in the order in which they are concatenated."""
+    """Return the terms of each observation group, in the order in which they are concatenated; it prints as a table."""
     groups: dict[str, list[ObservationTerm]] = {}
     plain = [(term.group, term.reading or term.type) for term in plan.observations]
     for term, (group, name) in zip(plan.observations, plain, strict=True):
@@ -47,7 +48,7 @@ def observation_terms(plan: Plan) -> dict[str, tuple[ObservationTerm, ...]]:
         start = before[-1].slice.stop if before else 0
         shown = name if plain.count((group, name)) == 1 else f"{name}[{term.index}]"
         before.append(ObservationTerm(shown, term.type, term.num_features, slice(start, start + term.num_features)))
-    return {group: tuple(terms) for group, terms in groups.items()}
+    return Observations({group: tuple(terms) for group, terms in groups.items()})
 
 
 def observe(plan: Plan, constants: Constants, readings: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "env feature"]]:

@@ -138,7 +138,11 @@ class Train:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
             total = self.iterations or loaded.spec.train.iterations
             limit = float("inf") if self.minutes is None else 60.0 * self.minutes
-            bar = ProgressBar(total, learner.iteration, env.task.score_unit) if ranks.is_first else None
+            bar = (
+                ProgressBar(total if limit == float("inf") else None, learner.iteration, env.task.score_unit)
+                if ranks.is_first
+                else None
+            )
             try:
                 run.learn(total, limit, bar.show if bar is not None else None)
             finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,16 @@ SAID_EVERY = 10.0
 class ProgressBar:
     """A progress bar of a run; where there is no terminal, a line now and then."""
 
-    def __init__(self, iterations: int, done: int, unit: str):
+    def __init__(self, iterations: int | None, done: int, unit: str):
         """Begin.
 
         Args:
-            iterations: Iterations of the whole run.
+            iterations: Iterations of the whole run; None: time ends it.
             done: How many were made before.
             unit: Unit of the score.
         """
         self._unit, self._total, self._said = unit, iterations, -SAID_EVERY
-        form = "{desc} {n_fmt}/{total_fmt} |{bar}| {postfix}"
+        form = "{desc} {n_fmt}/{total_fmt} |{bar}| {postfix}" if iterations else "{desc} {n_fmt} {postfix}"
         self._bar = tqdm(total=iterations, initial=done, desc="learning", disable=None, leave=False, bar_format=form)
         self._seen: dict[str, float] = {}
 
@@ -40,7 +41,7 @@ class ProgressBar:
             left: Time left [s].
         """
         self._seen |= {name: row[name] for name in ("Episode/return", "Episode/score") if name in row}
-        parts = [f"{left // 3600:.0f}:{left % 3600 // 60:02.0f}:{left % 60:02.0f} left"]
+        parts = [f"{timedelta(seconds=round(left))} left"]
         if self._seen:
             score = f"{self._seen['Episode/score']:.2f} {self._unit}"
             parts = [f"return {self._seen['Episode/return']:.2f}", f"score {score}", *parts]
@@ -51,7 +52,7 @@ class ProgressBar:
             self._bar.update()
         elif row["seconds"] - self._said >= SAID_EVERY:
             self._said = row["seconds"]
-            print(f"{row['iteration']:.0f}/{self._total}: {text}", flush=True)
+            print(f"{row['iteration']:.0f}{f'/{self._total}' if self._total else ''}: {text}", flush=True)
 
     def close(self) -> None:
         """Remove the bar."""
