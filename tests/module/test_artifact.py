@@ -1,6 +1,7 @@
 """Artefacts: the same bytes from the same document, whole or not at all, and refused by name when they are something else."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import subprocess
@@ -58,6 +59,20 @@ def document(tmp_path_factory):
 def artifact(document):
     save_plan(compile_plan(document), document.parent / "hand.safetensors")
     return document.parent / "hand.safetensors"
+
+
+def test_an_artefact_says_what_it_was_made_from(tmp_path):
+    """The robot by the SHA-256 of its file and of all that it includes, the document by that of what it says."""
+    (tmp_path / "scene.xml").write_text(SCENE.replace("<worldbody>", '<include file="more.xml"/><worldbody>', 1))
+    (tmp_path / "more.xml").write_text("<mujocoinclude><option timestep='0.002'/></mujocoinclude>")
+    (tmp_path / "hand.yaml").write_text(DOCUMENT)
+    origin = compile_plan(tmp_path / "hand.yaml").origin
+    content = (tmp_path / "scene.xml").read_bytes() + (tmp_path / "more.xml").read_bytes()
+    assert origin.robot_sha256 == hashlib.sha256(content).hexdigest()
+    (tmp_path / "hand.yaml").write_text("# a remark\n" + DOCUMENT)
+    assert compile_plan(tmp_path / "hand.yaml").origin.document_sha256 == origin.document_sha256
+    (tmp_path / "hand.yaml").write_text(DOCUMENT.replace("1 mm", "1.1 mm"))
+    assert compile_plan(tmp_path / "hand.yaml").origin.document_sha256 != origin.document_sha256
 
 
 def test_the_same_bytes_twice(document, artifact, tmp_path):

@@ -2,14 +2,18 @@
 
 from dataclasses import replace
 
+import mujoco
+import numpy as np
 import pytest
 import torch
+from pressed_pads import compiled
 from searches import paired
 
+from tgdsl.module.example import example_state
 from tgdsl.quantities.contact_depth import search as searching
 from tgdsl.quantities.contact_depth.query import Probes, Target, measure, penetration
 from tgdsl.quantities.contact_depth.search import DEEPEST, deepest, is_searchable, search
-from tgdsl.quantities.contact_depth.search_tables import Deepest, geom_tables
+from tgdsl.quantities.contact_depth.search_tables import BOUND, EVERYWHERE, MARGIN, POS, ROTATION, Deepest, geom_tables
 from tgdsl.quantities.geoms.distance import Geoms
 from tgdsl.quantities.pairs import relate
 from tgdsl.tensors import operations
@@ -98,6 +102,32 @@ def test_the_definition_is_the_deepest_of_all_distances(scene):
         torch.testing.assert_close(part, other)
 
 
+@pytest.mark.parametrize("num_geoms", [(2, 4), (3, 3)], ids=["unlike", "alike"])
+def test_the_spheres_that_hold_geoms_are_mujocos(num_geoms):
+    """Of an object whose geoms are there in some environments, and of one that is alike in all."""
+    shapes, generator = ("box", "capsule", "cylinder", "sphere", "plane", "box"), np.random.default_rng(0)
+    size, pos = generator.uniform(0.01, 0.03, (6, 3)), generator.normal(size=(6, 3))
+    model = mujoco.MjSpec()
+    for shape, own, at in zip(shapes, size, pos, strict=True):
+        model.worldbody.add_geom(type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.upper()}"), size=own, pos=at)
+    radius = np.where(np.array(shapes) == "plane", EVERYWHERE, model.compile().geom_rbound)
+    first, is_absent = num_geoms[0], np.zeros((3, 6), bool)
+    is_absent[1, 0] = is_absent[2, :first] = True
+    objects = []
+    for own, absent in ((slice(first), torch.from_numpy(is_absent[:, :first])), (slice(first, 6), None)):
+        rotation = np.tile(np.eye(3).ravel(), (6, 1))
+        parts = (torch.from_numpy(part[own])[None] for part in (size, pos, rotation))
+        num = len(shapes[own])
+        objects.append(Geoms(shapes[own], (False,) * num, *parts, absent, None, (None,) * num))
+    spheres, geoms = (table.numpy() for table in geom_tables(objects))
+    of_geoms, about_bodies = (np.where(is_absent, -np.inf, reach) for reach in (radius, radius + np.linalg.norm(pos, axis=1)))
+    of_objects = np.stack([own.max(axis=1) for own in np.split(about_bodies, [first], axis=1)], axis=1)
+    for found, exact in ((geoms[..., BOUND], of_geoms), (spheres[..., 0], of_objects)):
+        np.testing.assert_allclose(found, exact, rtol=1e-12, atol=2 * MARGIN)
+        assert (found >= exact).all()
+    assert (spheres[..., 1] == num_geoms).all() and (geoms[..., POS:ROTATION] == pos).all()
+
+
 def test_a_cpu_has_no_kernel_for_it(scene):
     pairs, probes, boxes, pair, reach = scene
     assert search(pairs, probes, [boxes[i] for i in WHICH], {"pair": pair}, reach, ("normal",)) is None
@@ -109,3 +139,25 @@ def test_what_the_kernel_cannot_answer_is_left_to_torch():
     assert not is_searchable(many, {"normal", "distance"})
     assert not is_searchable(many[1:], {"normal"})
     assert not is_searchable([*many, "ellipsoid"], {"normal"})
+
+
+def test_a_module_asks_the_kernel_of_the_tables_that_its_plan_holds(tmp_path, kernel, monkeypatch):
+    """Six boxes about a pad: the kernel reads what distances do, of tables that were made beforehand."""
+    bodies = "".join(f'<body name="b{i}"><freejoint/><geom type="box" size=".02 .01 .0{i + 1}"/></body>' for i in range(6))
+    names = [f"b{i}" for i in range(6)]
+    sensors = {"depth": {"kind": "contact_depth", "feels": names}}
+    touch = compiled(tmp_path, bodies, {name: {"body": name} for name in names}, sensors)
+    state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
+    asked = []
+
+    def spied(pairs, probes, targets, known, reach):
+        asked.append(set(known))
+        return brute_force(pairs, probes, targets, known, reach)
+
+    monkeypatch.setattr(searching, "DEEPEST", replace(DEEPEST, kernel=spied))
+    found = touch(state)["depth"]
+    assert asked == [{"pair", "spheres", "geoms"}]
+    monkeypatch.undo()
+    expected = touch(state)["depth"]
+    assert len(asked) == 1 and (expected > 0).any() and (expected == 0).any()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12)

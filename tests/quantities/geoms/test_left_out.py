@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from pressed_pads import PAD, compiled
@@ -55,3 +56,22 @@ def test_readings_are_the_same_without_geoms_that_no_environment_has(touch, monk
     assert counts and all((kept < num) == (len(set(variants)) < 3) for kept, num in counts)
     monkeypatch.setattr(gathering, "_had_by_some", lambda geoms, is_absent: geoms)
     assert found == bits(touch, state)
+
+
+def test_sizes_of_the_state_are_those_of_whatever_shape_an_environment_has(tmp_path):
+    """A ball and boxes whose sizes are given: distances by hand, to points of a pad 5 cm below."""
+    variants = [{"type": "sphere", "size": [0.02]}, {"type": "box", "size": [0.01, 0.01, 0.01]}]
+    objects = {"item": {"body": "item", "variants": variants, "size": "per_env"}}
+    sensor = {"kind": "surface_distance", "max_range": "20 cm", "feels": ["item"]}
+    touch = compiled(tmp_path, ITEM, objects, {"gap": sensor}, pad=PAD)
+    state = example_state(touch.inputs, 3, 0, torch.float64, 0.02)
+    state.variant = torch.tensor([0, 1, 1])[:, None]
+    size = np.array([[0.03, 0.03, 0.03], [0.01, 0.02, 0.03], [0.015, 0.025, 0.005]])
+    state.object_size = torch.from_numpy(size)[:, None]
+    state.body_pos[:] = 0.0
+    state.body_pos[:, touch.inputs.bodies.index("item"), 2] = 0.06
+    state.body_quat[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    pos = touch.plan.layout.pos - [0, 0, 0.06]
+    beyond = np.maximum(np.abs(pos) - size[1:, None], 0)
+    expected = [np.linalg.norm(pos, axis=1) - 0.03, *np.linalg.norm(beyond, axis=2)]
+    np.testing.assert_allclose(touch(state)["gap"][..., 0], expected, rtol=1e-12)

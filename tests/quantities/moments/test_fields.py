@@ -163,8 +163,16 @@ def test_the_cache_gives_the_same_without_the_work(monkeypatch, tmp_path):
 
 
 def test_a_finer_tolerance_takes_more_bytes_and_has_smaller_errors():
+    """The errors are as large as they are said to be: by the closed form, within a radius of the surface, of another draw."""
     coarse, fine = bake_field([BALL], R, 0.05), bake_field([BALL], R, TOLERANCE)
     assert fine.values.nbytes > coarse.values.nbytes and fine.errors.first_rms < coarse.errors.first_rms
+    assert bake_field([BALL], R, 0.05).errors == coarse.errors  # from the cache
+    way = np.random.default_rng(3).normal(size=(2, 150, 3))
+    way /= np.linalg.norm(way, axis=2, keepdims=True)
+    pos = 0.02 * way[0] + R * np.cbrt(np.linspace(0, 1, 150))[:, None] * way[1]
+    true = sphere_moments(pos)
+    for baked in (coarse, fine):
+        assert (baked.errors.mass_rms, baked.errors.first_rms) == pytest.approx(rms(asked(baked, pos), true), rel=0.25)
 
 
 def test_objects_of_metres_take_no_more_pieces_than_small_ones(monkeypatch):
@@ -257,6 +265,22 @@ def test_gradients_hold_their_own_tolerance():
     assert np.quantile(errors[None], 0.999) > 4 * asked_for
     assert baked.errors.gradient_p999 is not None and baked.errors.gradient_p999 < asked_for
     assert baked.errors.mass_rms < 0.01  # what holds the gradients holds the moments better still
+
+
+def test_gradients_alone_may_ask_for_a_finer_lattice_and_the_budget_counts_it(monkeypatch, tmp_path):
+    """Around a ball, by the closed form; a byte less than that lattice takes is too few, though the one before it is smaller."""
+    monkeypatch.setenv("TGDSL_CACHE", str(tmp_path))
+    monkeypatch.setattr(moments, "CHOICE_POINTS", 100)
+    monkeypatch.setattr(moments, "REPORT_POINTS", 100)
+    ball, pos, asked_for = felt("sphere", [0.005]), places(60, extent=0.014), 0.2
+    true = ball_gradients(pos, 0.005)
+    baked = bake_field([ball], R, 0.2, asked_for)
+    error = np.linalg.norm(gradients(baked, pos)[1] - true, axis=1) / np.linalg.norm(true, axis=1).max()
+    assert error.max() < asked_for
+    assert bake_field([ball], R, 0.2, asked_for).errors == baked.errors  # from the cache
+    needed = baked.values.nbytes
+    with pytest.raises(BakeError, match=rf"needs about .* MiB \({needed} bytes\), and the budget is"):
+        bake_field([ball], R, 0.2, asked_for, budget=needed - 1)
 
 
 def test_gradients_of_sums_are_differences_of_closed_forms():

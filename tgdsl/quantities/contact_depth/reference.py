@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from tgdsl.geometry.reference import TIE, signed_distance
+from tgdsl.geometry.reference import TIE
 from tgdsl.quantities.contact_depth.part import ContactDepthPart
-from tgdsl.quantities.geoms.reference import ReferenceGeom, geoms_of
+from tgdsl.quantities.geoms.reference import ReferenceGeom, distance_to, geoms_of
 from tgdsl.quantities.reference import ReferenceBody, ReferenceScene
 
 Array = np.ndarray
@@ -77,13 +77,8 @@ def penetration(
             body, geoms = target
             felt.rotation[j, k] = body.rotation.T @ link.rotation
             felt.offset[j, k] = body.rotation.T @ (link.pos - body.pos)
-            for geom in geoms:
-                rotation = body.rotation @ geom.rotation
-                local = rotation.T @ (q - body.pos - body.rotation @ geom.pos)
-                phi, gradient = signed_distance(geom.shape, geom.size, local)
-                if phi < felt.distance[j, k] - TIE:
-                    felt.outward[j, k] = into_link @ rotation @ gradient
-                felt.distance[j, k] = min(phi, felt.distance[j, k])
+            felt.distance[j, k], gradient = distance_to(geoms, body.rotation.T @ (q - body.pos))
+            felt.outward[j, k] = into_link @ body.rotation @ gradient
             depth, before = radius[j] - felt.distance[j, k], felt.depth[j]
             felt.depth[j] = max(depth, before)
             if depth > (before + TIE if before > 0 else 0.0):

@@ -71,9 +71,8 @@ def _middle(
     share = pressed / torch.where(total > 0, total, 1.0)
     away = _away(found, planes.vec(map(spread, planes.split(state["body_pos"][:, bodies]))))
     rotation = planes.rot(map(spread, planes.rotation(state["body_quat"][:, bodies])))
-    normal = planes.vec(torch.where(found.is_used, part, 0.0) for part in found.normal)
     center, mean = (
-        planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, own)) for own in (away, normal)
+        planes.vec((share * part).sum(dim=-1) for part in planes.rotate_back(rotation, own)) for own in (away, found.normal)
     )
     return center, mean
 

@@ -301,8 +301,8 @@ def _node_sums(
     order = np.argsort(bricks, kind="stable")
     near = surface.tree.query(origin + cell * index[order], distance_upper_bound=radius)[0] < np.inf
     order = order[near]
-    ends = 1 + np.flatnonzero(np.diff(bricks[order], append=-1))
-    for nodes in np.split(order, ends[:-1]) if len(order) else []:
+    ends = 1 + np.flatnonzero(np.diff(bricks[order]))
+    for nodes in np.split(order, ends) if len(order) else []:
         values[nodes] = moment_sums(surface, origin + cell * index[nodes], radius, channels, len(nodes))
     return values.reshape(*num, channels)
 

@@ -111,9 +111,7 @@ class MomentUse(Generic[Array]):
         metadata=indices(lambda use, part, plan: [[plan.objects[part.tables[i].object].num_pairs] for i in use.tables])
     )
     reach: Array
-    radius_id: Array = field(
-        metadata=indices(lambda use, part, plan: [[max(len(part.tables[i].radii), 1)] for i in use.tables])
-    )
+    radius_id: Array = field(metadata=indices(lambda use, part, plan: [[len(part.tables[i].radii)] for i in use.tables]))
     radius_noise: str
     motion: bool
 

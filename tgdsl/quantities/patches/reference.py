@@ -59,10 +59,9 @@ def reference(part: PatchesPart[np.ndarray], use: int, scene: ReferenceScene) ->
     """Return the patches of a sensor's bodies with the objects of a use."""
     own, found = part.uses[use], {}
     for b, o in own.topology.met:
-        if own.pairs[b, o] < len(scene.contact_pairs):
-            patch = _patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]))
-            if patch is not None:
-                found[b, o] = patch
+        patch = _patch(scene, b, scene.contact_pairs[own.pairs[b, o]].object, int(own.pairs[b, o]))
+        if patch is not None:
+            found[b, o] = patch
     objects = tuple(_object(own, i, scene) for i in range(own.topology.num_objects))
     return ReferencePatches(found, objects, own.topology, own.boxes)
 

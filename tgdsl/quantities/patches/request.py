@@ -7,7 +7,7 @@ the order of the request.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -90,7 +90,7 @@ class ContactPatch(NamedTuple):
     boxes: Float[Tensor, "body 2 3"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class ContactPatches(Request[ContactPatch]):
     """Asks for the patches.
 
@@ -100,9 +100,9 @@ class ContactPatches(Request[ContactPatch]):
         needs_stiffness: Whether each object has to be of a material whose Young's modulus is known.
     """
 
-    slots: int = 4
-    boxes: Float[np.ndarray, "body 2 3"] = field(default_factory=lambda: np.zeros((0, 2, 3)))
-    needs_stiffness: bool = False
+    slots: int
+    boxes: Float[np.ndarray, "body 2 3"]
+    needs_stiffness: bool
 
     @property
     def wants_contacts(self) -> bool:  # type: ignore[override]
