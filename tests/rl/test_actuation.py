@@ -91,6 +91,19 @@ def test_the_stall_torque_is_the_one_that_was_drawn(tmp_path, simulator, strengt
 
 
 @BOTH
+def test_neither_kick_nor_noise_is_beyond_the_strength(tmp_path, simulator):
+    drive = DriveSpec(strength=(0.9, 0.9), kick=(1.2, 1.2), torque_noise=0.5)
+    sim, actuation = hinge(tmp_path, simulator, drive=drive)
+    actuation.command(targets(sim, -1.9))
+    torques = []
+    for _ in range(60):
+        sim.set_state(qpos=np.array([0.0]), qvel=np.array([0.0]))
+        sim.step()
+        torques.append(float(actuation.torque[0, 0]))
+    assert min(torques) == pytest.approx(-0.9 * LIMIT) and max(torques) > -0.7 * LIMIT
+
+
+@BOTH
 def test_a_target_beyond_the_joints_range_is_reached_by_bias_all_the_same(tmp_path, simulator):
     sim, actuation = hinge(tmp_path, simulator, drive=DriveSpec(bias=(0.05, 0.05)))
     sim.set_state(qpos=np.array([1.98]))

@@ -13,7 +13,7 @@ the drive makes a torque of it:
     drive       τ = clip(g_p k_p e − g_d k_d q̇, ± S τ_max)
     breakaway   τ ← κ τ  where |q̇| < `BREAKAWAY_SPEED`
     speed       |τ| ≤ τ_max max(0, 1 − |q̇|/q̇_max)  where τ q̇ > 0    (only with a `top_speed`)
-    noise       τ ← τ + ν τ_max U(−1, 1)
+    noise       τ ← clip(τ + ν τ_max U(−1, 1), ± S τ_max)          neither a kick nor noise is beyond the drive's strength
 
 k_p, k_d and τ_max are those of the robot's position actuators. MuJoCo's own actuator is given the control q + e, and what τ
 differs from its torque is a force on the joint: so what is neither drawn nor chosen costs nothing and stays implicit in
@@ -346,6 +346,7 @@ class Actuation:
             share = self._draws.shares_ahead("torque_noise", self._count, torque.shape[1], self._ahead)
             noise = within(share, -1.0, 1.0)
             torque = torque + self.spec.torque_noise * own["limit"] * noise.to(torque.dtype)
+        torque = _within(torque, drawn["strength"] * own["limit"])
         self._count += 1
         self.torque.copy_(torque)
         arrays["ctrl"][:, self._index["actuator"]] = control
