@@ -208,7 +208,7 @@ def _shared_by_kernel(
     from tgdsl.sensors.force_taxel import footprint_kernel
 
     own = bodies.inverse_radius.flatten()[bodies.row]
-    weight = depth * own + unreached()
+    weight = torch.log2(depth * own + unreached())
     args = radius, levenberg, bodies.first, bodies.box
     shared, sums = footprint_kernel.shared_forces(bodies.place, weight, point, force, torque, normal, *args)
     return Shared(shared, sums[:, :3], sums[:, 3:])

@@ -66,7 +66,7 @@ def shared_forces(
 
     Args:
         pos: Taxel positions in their body's frame [m], inactive ones far away, and −2 times their normals: (taxel, 6).
-        weight: Depth of each probe over its radius, and `unreached()`, (env, taxel) [1].
+        weight: Logarithm to base 2 of the depth of each probe over its radius, and `unreached()`, (env, taxel) [1].
         point: Contact points, three planes (env, body, contact) [m].
         force: Forces on the body [N].
         torque: Torques on the body at the contact points [N·m].
@@ -222,6 +222,22 @@ def _load(at, is_there):
 
 
 @triton.jit
+def _taxel(pos, taxel):
+    """Return position and −2 times the normal of a taxel, read two numbers at a time: the same for all threads."""
+    at = pos.to(tl.pointer_type(tl.int64)) + 3 * taxel
+    x, y = _halves(tl.load(at))  # pyright: ignore[reportGeneralTypeIssues]
+    z, nx = _halves(tl.load(at + 1))
+    ny, nz = _halves(tl.load(at + 2))
+    return (x, y, z), (nx, ny, nz)
+
+
+@triton.jit
+def _halves(pair):
+    """Return the two floats of 64 bits."""
+    return pair.to(tl.int32).to(tl.float32, bitcast=True), (pair >> 32).to(tl.int32).to(tl.float32, bitcast=True)
+
+
+@triton.jit
 def _tile(at, is_there):
     """Return the vectors of a tile of taxels, (1, taxel)."""
     return _load(at, is_there)[None, :], _load(at + 1, is_there)[None, :], _load(at + 2, is_there)[None, :]
@@ -251,12 +267,13 @@ def _arm(place, point):
 
 @triton.jit
 def _pull(arm, facing, weight, slope, top, inverse):
-    """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m."""
+    """Return κ, and w exp(β · g) / 2ᵗᵒᵖ of contacts and taxels; `facing` is −2 n · m, `weight` a logarithm."""
     near = 1.0 - inverse * inverse * dot(arm, arm)
     near = tl.minimum(near, near * facing, propagate_nan=tl.PropagateNan.ALL)  # what is negative remains so
     near = tl.maximum(near, 0.0, propagate_nan=tl.PropagateNan.ALL)
-    exponent = tl.minimum(dot(slope, arm) - top, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
-    return near, weight * near * near * tl.exp2(exponent)
+    exponent = weight + slope[0] * arm[0] + slope[1] * arm[1] + slope[2] * arm[2] - top
+    exponent = tl.minimum(exponent, LIMIT, propagate_nan=tl.PropagateNan.ALL)  # what is larger is out of reach
+    return near, near * near * tl.exp2(exponent)
 
 
 @triton.jit
@@ -291,9 +308,9 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
     nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
-        at = pos + 6 * taxel
-        arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
-        facing = dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
+        place, inward = _taxel(pos, taxel)
+        arm = _arm(place, point)
+        facing = dot(inward, normal)
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, facing, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
