@@ -5,6 +5,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
@@ -15,6 +16,7 @@ import tgdsl
 from tgdsl.errors import RobotError
 from tgdsl.formats.model import Model
 from tgdsl.formats.robot import load_model
+from tgdsl.scene.scene import scene_model
 
 INERTIAL = "<inertial><mass value='.1'/><inertia ixx='1e-5' iyy='1e-5' izz='1e-5' ixy='0' ixz='0' iyz='0'/></inertial>"
 READ_BY_TRIMESH = "meshes read by trimesh, without textures"
@@ -183,3 +185,45 @@ def test_mjcf_that_names_them_says_what_to_do(tmp_path):
         model_of(tmp_path, "<geom type='mesh' mesh='a'/>", "<mesh file='a.glb'/>")
     how = "convert them, such as by trimesh.load_scene(FILE).to_mesh().export(OTHER)"
     assert str(caught.value) == f"{tmp_path / 'robot.xml'}: MJCF's meshes are files of .stl, .obj, .msh, found a.glb; {how}"
+
+
+def two_boxes(mark: str) -> str:
+    """An OBJ file of two boxes of 1 cm side by side, each an object or group of its own."""
+    text, first = "# by hand\n", 1
+    for i in range(2):
+        box = trimesh.creation.box((0.01, 0.01, 0.01))
+        box.apply_translation((0.03 * i, 0, 0))
+        text += f"{mark} box {i}\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices)
+        text += "".join(f"f {' '.join(str(corner + first) for corner in face)}\n" for face in box.faces)
+        first += len(box.vertices)
+    return text
+
+
+@pytest.mark.filterwarnings("ignore::tgdsl.errors.UnfeltWarning")  # those between the boxes are within their convex hull
+@pytest.mark.parametrize("mark", ["o", "g"])
+def test_an_obj_file_of_several_objects_is_read_whole(tmp_path, mark):
+    """MuJoCo by itself reads the first: half of the faces, and half of the surface that taxels would be sampled on."""
+    (tmp_path / "two.obj").write_text(two_boxes(mark))
+    scene = f"""<mujoco><asset><mesh file="{tmp_path / "two.obj"}"/></asset><worldbody>
+      <body name="hand"><geom type="mesh" mesh="two"/></body></worldbody></mujoco>"""
+    assert mujoco.MjModel.from_xml_string(scene).mesh_facenum.tolist() == [12]
+    (tmp_path / "scene.xml").write_text(scene)
+    with pytest.warns(UserWarning, match=r"reads the first object of an OBJ file alone; .* read whole: two\.obj \(2\)"):
+        model = load_model(tmp_path / "scene.xml")
+    assert model.compiled.mesh_facenum.tolist() == [24]
+    surface = model.surface(model.rigid_geoms([model.compiled.body("hand").id]))
+    assert trimesh.Trimesh(surface.vertices, surface.faces).area == pytest.approx(2 * 6 * 0.01**2)
+    with pytest.warns(UserWarning, match="read whole"):
+        touch = tgdsl.compile(
+            {
+                "tgdsl": 1,
+                "robot": {
+                    "model": str(tmp_path / "scene.xml"),
+                    "layout": {"resolutions": {"r": {"hand": {"method": "poisson", "count": 200, "radius": 0.001}}}},
+                },
+                "objects": {"ball": {"geom": {"type": "sphere", "size": [0.01]}, "pos": [0, 0, 1]}},
+                "sensors": {"s": {"kind": "contact_depth", "links": "hand", "feels": ["ball"]}},
+            }
+        )
+    assert abs((touch.plan.layout.pos[:, 0] > 0.015).mean() - 0.5) < 0.1
+    assert scene_model(touch.plan.scene).mesh_facenum.tolist() == [24]

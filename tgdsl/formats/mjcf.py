@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import re
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 
+from tgdsl.errors import listed
 from tgdsl.files.write import atomic_write_all
 from tgdsl.formats.mesh_files import refuse_unreadable
 from tgdsl.formats.model import Model
-from tgdsl.scene.scene import readable
+from tgdsl.scene.scene import num_objects, readable
 
 
 def read_mjcf(path: Path) -> Model:
@@ -32,13 +34,18 @@ def read_mjcf(path: Path) -> Model:
 
 def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
     """Rewrite in memory those of a model's own mesh files that MuJoCo cannot read; return the files by their new names."""
-    files = {}
+    files, whole = {}, []
     for mesh in spec.meshes:
         file = Path(spec.modelfiledir, spec.meshdir, mesh.file)
         if file.is_file() and (content := readable(mesh.file, original := file.read_bytes())) is not original:
-            key = f"{hashlib.sha256(content).hexdigest()}.stl"  # MuJoCo knows files in memory by their names, without folders
+            if (num := num_objects(original)) > 1:
+                whole.append(f"{file.name} ({num})")
+            key = f"{hashlib.sha256(content).hexdigest()}{file.suffix.lower()}"  # MuJoCo knows files in memory by their names, without folders
             spec.assets[key], files[key] = content, file
             mesh.name, mesh.file = mesh.name or file.stem, key
+    if whole:
+        what = "MuJoCo reads the first object of an OBJ file alone; here those with several are read whole"
+        warnings.warn(f"{what}: {listed(whole)}; other programs simulate the first of them", stacklevel=5)
     return files
 
 

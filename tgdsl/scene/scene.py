@@ -22,6 +22,7 @@ from tgdsl.scene.mujoco_warnings import muted_mujoco
 from tgdsl.scene.options import Options, set_options
 
 _STL_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+_OBJ_NAME, _OBJ_FACE = re.compile(rb"^[ \t]*[og](?:[ \t].*)?$", re.MULTILINE), re.compile(rb"^[ \t]*f[ \t]", re.MULTILINE)
 OFF_CENTER = 2e-6
 """Distance [m] of a body's centre of mass from its origin at which MuJoCo takes it for off the origin."""
 
@@ -39,7 +40,11 @@ def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
 
 
 def readable(name: str, content: bytes) -> bytes:
-    """Return a file as MuJoCo reads it: an STL file that is text in binary, any other as it is."""
+    """Return a file as MuJoCo reads it: an STL file that is text in binary, an OBJ file of several objects as one, of which
+    MuJoCo would read the first alone; any other as it is.
+    """
+    if Path(name).suffix.lower() == ".obj":
+        return _OBJ_NAME.sub(b"", content) if num_objects(content) > 1 else content
     if Path(name).suffix.lower() != ".stl" or content.lstrip()[:5].lower() != b"solid":
         return content
     if len(content) == 84 + 50 * int.from_bytes(content[80:84], "little"):
@@ -51,6 +56,11 @@ def readable(name: str, content: bytes) -> bytes:
     triangles = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("extra", "<u2")])
     triangles["corners"] = corners
     return bytes(80) + len(corners).to_bytes(4, "little") + triangles.tobytes() if len(corners) else content
+
+
+def num_objects(content: bytes) -> int:
+    """Return how many objects or groups of an OBJ file have faces."""
+    return sum(_OBJ_FACE.search(part) is not None for part in _OBJ_NAME.split(content))
 
 
 def scene_model(scene: SceneFile) -> mujoco.MjModel:
