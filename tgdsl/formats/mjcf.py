@@ -40,7 +40,8 @@ def rewrite_meshes(spec: mujoco.MjSpec) -> dict[str, Path]:
         if file.is_file() and (content := readable(mesh.file, original := file.read_bytes())) is not original:
             if (num := num_objects(original)) > 1:
                 whole.append(f"{file.name} ({num})")
-            key = f"{hashlib.sha256(content).hexdigest()}{file.suffix.lower()}"  # MuJoCo knows files in memory by their names, without folders
+            # MuJoCo knows files in memory by their names, without folders.
+            key = f"{hashlib.sha256(content).hexdigest()}{file.suffix.lower()}"
             spec.assets[key], files[key] = content, file
             mesh.name, mesh.file = mesh.name or file.stem, key
     if whole:

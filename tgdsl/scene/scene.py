@@ -40,9 +40,7 @@ def _spec(scene: SceneFile, assets: Mapping[str, bytes]) -> mujoco.MjSpec:
 
 
 def readable(name: str, content: bytes) -> bytes:
-    """Return a file as MuJoCo reads it: an STL file that is text in binary, an OBJ file of several objects as one, of which
-    MuJoCo would read the first alone; any other as it is.
-    """
+    """Return a file as MuJoCo reads it: text STL in binary, an OBJ file of several objects, or groups, as one; others as is."""
     if Path(name).suffix.lower() == ".obj":
         return _OBJ_NAME.sub(b"", content) if num_objects(content) > 1 else content
     if Path(name).suffix.lower() != ".stl" or content.lstrip()[:5].lower() != b"solid":
