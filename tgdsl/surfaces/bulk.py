@@ -77,7 +77,7 @@ def _of_mesh(own: SurfaceGeom) -> Bulk:
 
 def _enclosed(surface: Surface) -> tuple[float, float]:
     """Return volume and area within and of a surface whose holes are closed by triangles, by the divergence theorem."""
-    vertices, faces = merged(surface)
+    vertices, faces, _ = merged(surface)
     vertices, caps = hole_caps(vertices, faces)
     a, b, c = (vertices - vertices.mean(axis=0))[np.concatenate([faces, caps])].swapaxes(0, 1)
     normals = np.cross(b - a, c - a)

@@ -23,7 +23,7 @@ from scipy.special import elliprg
 from tgdsl.geometry.planes import vec
 from tgdsl.geometry.shapes import SHAPES
 from tgdsl.surfaces.geom import SurfaceGeom
-from tgdsl.surfaces.solid import Solid, bisected
+from tgdsl.surfaces.solid import Solid
 
 SECTIONS = 128
 """Least number of sides of what stands for a circle before its points are moved onto the true surface."""
@@ -142,7 +142,7 @@ class _Geom:
     @staticmethod
     def of(felt: SurfaceGeom, spacing: float) -> _Geom:
         geom = felt.geom
-        solid = None if felt.surface is None else Solid(felt.surface, leaf=spacing / CUT)
+        solid = None if felt.surface is None else Solid(felt.surface)
         corners = _triangles(felt.shape, geom.size, spacing) if solid is None else solid.corners
 
         def distance(pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +192,7 @@ def _outer(i: int, solids: Sequence[_Geom], spacing: float) -> tuple[np.ndarray,
         is_done = is_out & ~is_split
         done = corners[is_done]
         kept.append((done, pos[is_done], normal[is_done], own.stretch * _areas(done)))
-        corners = bisected(corners[is_split])
+        corners = _bisected(corners[is_split])
     return tuple(np.concatenate(part) for part in zip(*kept, strict=True))
 
 
@@ -206,6 +206,15 @@ def _hidden(own: _Geom, other: _Geom, is_earlier: bool, corners: Float[np.ndarra
         hidden = other.is_inside(pos + STEP * normal)
         found.append(hidden | other.is_inside(pos - STEP * normal) if is_earlier else hidden)
     return np.array(found)
+
+
+def _bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
+    """Return the two halves of each triangle by longest-edge bisection."""
+    length = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(corners, turn[:, :, None], axis=1).swapaxes(0, 1)
+    middle = (a + b) / 2
+    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
 def _morton(pos: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:

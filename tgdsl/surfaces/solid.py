@@ -1,9 +1,9 @@
-"""Triangle surfaces as solids: signed distance to the outer surface, closed boundary loops, sharp edges.
+"""Triangle surfaces as solids: signed distance to the outer surface, sharp edges.
 
 Distances and winding numbers are libigl's. `igl.signed_distance` takes as long (2.8 s for 860,000 points, signs the same), but
-builds its trees anew at each call, ignores holes, and measures to faces inside other components too.
+builds its trees anew at each call.
 
-Shapes: `n` points, `v` vertices, `f` and `g` faces, `x`, `y`, `z` nodes along the axes.
+Shapes: `n` points, `v` vertices, `f` faces, `x`, `y`, `z` nodes along the axes.
 """
 
 from __future__ import annotations
@@ -14,17 +14,12 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from tgdsl.errors import BakeError
-from tgdsl.surfaces.holes import hole_caps, merged
+from tgdsl.surfaces.outer import is_inside, outer
 from tgdsl.surfaces.surface import Surface
 
 SHARP = np.deg2rad(30.0)
 """Angle between the normals of two faces from which their edge is sharp [rad]."""
-MAX_COMPONENTS = 64
-"""Largest number of connected components of which those inside others are looked for."""
 CHUNK = 1 << 18
 """Points that are asked for at once."""
 
@@ -70,73 +65,25 @@ class Solid:
     """The solid that a surface bounds: distances, random points and sharp edges.
 
     Attributes:
-        corners: Corners of the faces that separate inside from outside [m].
-        is_watertight: As in `Baked`.
+        corners: Corners of the faces that separate inside from outside, and of sheets [m].
+        flaws: As in `Outer`.
     """
 
-    def __init__(self, surface: Surface, leaf: float):
-        vertices, faces = merged(surface)
-        vertices, caps = hole_caps(vertices, faces)
-        self.is_watertight = not len(caps)
-        faces, caps = (part[_has_area(vertices[part])] for part in (faces, caps))
-        if not len(faces):
-            raise BakeError("a surface to bake needs a face with an area")
-        self._closed = vertices, np.ascontiguousarray(np.concatenate([faces, caps]))
-        before, behind = self._sides(vertices[caps])
-        faces = np.concatenate([faces, caps[self.is_inside(before) != self.is_inside(behind)]])
-        self._creases = _creases(vertices, faces)
-        self.leaf = max(leaf, 1e-3 * float(np.linalg.norm(np.ptp(vertices, axis=0))))
-        self.corners = self._outer(vertices, faces, self.leaf)
-        self._soup = self.corners.reshape(-1, 3), np.arange(3 * len(self.corners)).reshape(-1, 3)
-        self._tree = _tree(*self._soup)
+    def __init__(self, surface: Surface):
+        found = outer(surface)
+        self.corners, self.flaws = found.vertices[found.faces], found.flaws
+        self._creases = _creases(found.vertices, found.uncut)
+        self._faces = found.vertices, found.faces
+        self._tree = _tree(*self._faces)
 
     def is_inside(self, pos: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return which points are inside."""
-        if not len(pos):
-            return np.zeros(0, bool)
-        winding = np.abs(np.atleast_1d(igl.fast_winding_number(*self._closed, np.ascontiguousarray(pos))))
-        doubtful = np.flatnonzero(np.abs(winding - 0.5) < 0.1)
-        if len(doubtful):
-            winding[doubtful] = np.abs(igl.winding_number(*self._closed, np.ascontiguousarray(pos[doubtful])))
-        return winding >= 0.5
-
-    def _sides(self, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return points just before and behind the middle of triangles."""
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        step = 1e-5 * np.linalg.norm(np.ptp(self._closed[0], axis=0)) * normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        return corners.mean(axis=1) + step, corners.mean(axis=1) - step
-
-    def _outer(self, vertices: np.ndarray, faces: np.ndarray, leaf: float) -> np.ndarray:
-        """Return the corners of the outer faces; those that meet another component are bisected down to `leaf` [m]."""
-        edges = coo_array((np.ones(2 * len(faces)), (faces[:, :2].ravel(), faces[:, 1:].ravel())), (len(vertices),) * 2)
-        component_of_face = connected_components(edges, directed=False)[1][faces[:, 0]]
-        components = np.unique(component_of_face)
-        if not 1 < len(components) <= MAX_COMPONENTS:
-            return vertices[faces]
-        outer = []
-        for component in components:
-            others = np.ascontiguousarray(faces[component_of_face != component])
-            tree, whole = _tree(vertices, others), vertices[faces[component_of_face == component]]
-            corners, owner, pieces, owners = whole, np.arange(len(whole)), [], []
-            is_cut = np.zeros(len(whole), bool)
-            while len(corners):
-                middle = corners.mean(axis=1)
-                radius = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-                is_apart = np.reshape(tree.squared_distance(vertices, others, middle)[0], -1) > radius**2
-                is_done = is_apart | (radius <= leaf / 2)
-                before, behind = self._sides(corners[is_done])
-                is_inner = self.is_inside(before) & self.is_inside(behind)
-                is_cut[owner[is_done][is_inner]] = True
-                pieces.append(corners[is_done][~is_inner])
-                owners.append(owner[is_done][~is_inner])
-                corners, owner = bisected(corners[~is_done]), np.tile(owner[~is_done], 2)
-            outer += [whole[~is_cut], np.concatenate(pieces)[is_cut[np.concatenate(owners)]]]
-        return np.concatenate(outer)
+        return is_inside(*self._faces, pos)
 
     def distance(self, pos: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
         """Return signed distance [m] and its gradient; on the surface the gradient is 0."""
         pos = np.ascontiguousarray(pos)
-        squared, _, nearest = self._tree.squared_distance(*self._soup, pos)
+        squared, _, nearest = self._tree.squared_distance(*self._faces, pos)
         length = np.sqrt(np.asarray(squared)).reshape(-1)
         signed = np.where(self.is_inside(pos), -length, length)
         way = pos - np.asarray(nearest).reshape(-1, 3)
@@ -151,8 +98,8 @@ class Solid:
         length = np.empty(lattice.num_nodes)
         for start in range(0, len(length), CHUNK):
             pos = lattice.pos(np.arange(start, min(start + CHUNK, len(length))))
-            length[start : start + CHUNK] = np.sqrt(np.reshape(self._tree.squared_distance(*self._soup, pos)[0], -1))
-        is_far = (length > lattice.cell / 2 + self.leaf).reshape(lattice.shape)
+            length[start : start + CHUNK] = np.sqrt(np.reshape(self._tree.squared_distance(*self._faces, pos)[0], -1))
+        is_far = (length > 0.51 * lattice.cell).reshape(lattice.shape)
         regions = np.zeros(lattice.shape, np.int32)
         label(is_far, output=regions)
         regions = regions.reshape(-1)
@@ -177,22 +124,6 @@ def _tree(vertices: np.ndarray, simplices: np.ndarray) -> igl.AABB:
     tree = igl.AABB()
     tree.init(vertices, simplices)
     return tree
-
-
-def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> np.ndarray:
-    """Return which triangles are higher than 1e-9 of their longest side: needles are, slivers of zero area are not."""
-    sides = corners - np.roll(corners, 1, axis=1)
-    longest = (sides**2).sum(axis=2).max(axis=1, initial=0)
-    return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > 1e-9 * longest
-
-
-def bisected(corners: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "g 3 3"]:
-    """Return the two halves of each triangle by longest-edge bisection."""
-    length = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-    turn = (length.argmax(axis=1)[:, None] + np.arange(3)) % 3
-    a, b, c = np.take_along_axis(corners, turn[:, :, None], axis=1).swapaxes(0, 1)
-    middle = (a + b) / 2
-    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
 def _creases(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,12 +1,7 @@
 """Signed distance of a triangle surface, sampled on a grid that is as coarse as the asked tolerance allows.
 
-Distances are libigl's (exact, by a tree of boxes: `AABB`); a point is inside where the winding number is nearer to ±1 or
-beyond than to 0 (Jacobson, Kavan and Sorkine-Hornung, *Robust inside-outside segmentation using generalized winding numbers*,
-SIGGRAPH 2013; fast: Barill et al., SIGGRAPH 2018). `igl.signed_distance` itself scales the distance by the winding number,
-whose rounding costs it 12 µm on a 4 cm cube. Vertices at one place are one, triangles without area do not count, and each
-loop of open edges gets a lid, a fan around the mean of its corners, so that even an open surface has a continuous distance.
-Surfaces that lie inside are no surfaces: inner shells of the same orientation and overlapping parts make one solid, an inner
-shell of opposite orientation a cavity.
+Distances are libigl's (exact, by a tree of boxes: `AABB`), to the outer surface (`surfaces.outer`). `igl.signed_distance`
+itself scales the distance by the winding number, whose rounding costs it 12 µm on a 4 cm cube.
 
 Shapes: `n` points, `v` vertices, `f` faces, `x`, `y`, `z` nodes along the axes.
 """
@@ -27,7 +22,7 @@ from tgdsl.geometry.grid import METHODS, one_grid
 from tgdsl.surfaces.solid import Lattice, Solid
 from tgdsl.surfaces.surface import Surface
 
-FORMAT = b"tgdsl grid 3"
+FORMAT = b"tgdsl grid 4"
 CHOICE_POINTS, REPORT_POINTS = 4096, 16384
 HEADROOM, CHOICE_PERCENTILE = 0.95, 99.3
 """The choice holds the tolerance with something to spare, nearly two standard deviations of a percentile of so few points, so
@@ -75,7 +70,7 @@ class Baked:
         cell: Spacing of the nodes [m].
         method: Name of the function of `tgdsl.geometry.grid` that interpolates: trilinear or tricubic.
         errors: What the grid costs in accuracy.
-        is_watertight: Whether every edge joined faces of one orientation; if not, lids were added.
+        flaws: What of the surface its user should know: see `Outer`.
     """
 
     values: Float[np.ndarray, "x y z"]
@@ -83,7 +78,7 @@ class Baked:
     cell: float
     method: str
     errors: Errors
-    is_watertight: bool
+    flaws: tuple[str, ...]
 
 
 def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int = 64 * 2**20) -> Baked:
@@ -95,7 +90,7 @@ def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int =
     At each cell size the cheaper trilinear lookup is tried first. Results are kept in the user's cache folder.
 
     Args:
-        surface: The closed surface, in the frame that the grid is to have.
+        surface: The surface, in the frame that the grid is to have.
         margin: Width of the band and of the grid's rim around the surface [m]: the radius of the largest probe.
         tolerance: Largest distance error [m], in the sense above.
         budget: Largest size of the values [bytes].
@@ -109,7 +104,7 @@ def bake(surface: Surface, margin: float, tolerance: float = 5e-5, budget: int =
     arrays = [limits, np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
 
     def make() -> Baked:
-        return _bake(Solid(surface, leaf=2 * tolerance), margin, tolerance, budget)
+        return _bake(Solid(surface), margin, tolerance, budget)
 
     return cache.cached(cache.digest(FORMAT, arrays), make, _packed, _unpacked)
 
@@ -128,7 +123,7 @@ def _unpacked(found: Mapping[str, np.ndarray]) -> Baked:
     if values.dtype != np.float32 or not np.isfinite(values).all() or method not in METHODS:
         raise ValueError("a damaged grid")
     report, cell = Errors(int(count), *errors), float(found["cell"])
-    return Baked(values, found["origin"], cell, method, report, bool(found["is_watertight"]))
+    return Baked(values, found["origin"], cell, method, report, tuple(found["flaws"].tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +155,7 @@ def _bake(solid: Solid, margin: float, tolerance: float, budget: int) -> Baked:
     values = solid.node_distance(lattice)
     held_back = _Points.around(solid, margin, REPORT_POINTS, seed=2)
     errors = _errors(held_back, values, lattice, method)
-    return Baked(values, lattice.origin, lattice.cell, method, errors, solid.is_watertight)
+    return Baked(values, lattice.origin, lattice.cell, method, errors, solid.flaws)
 
 
 def _choose(solid: Solid, points: _Points, margin: float, tolerance: float, budget: int) -> tuple[Lattice, str]:

@@ -1,4 +1,7 @@
-"""From geoms to their table: meshes become grids of signed distance, or stay triangles; primitives need neither."""
+"""From geoms to their table: the outer surfaces of meshes become grids of signed distance, or stay triangles.
+
+Primitives need neither.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,15 @@ import igl
 import numpy as np
 import trimesh
 
+from tgdsl.files import cache
 from tgdsl.quantities.geoms.bake import bake
 from tgdsl.quantities.geoms.tables import GeomTable, GridTable, TriangleTable
 from tgdsl.surfaces.geom import SurfaceGeom
+from tgdsl.surfaces.outer import Outer, outer
 from tgdsl.surfaces.sensed import DistanceOptions
+from tgdsl.surfaces.surface import Surface
 
+OUTER_FORMAT = b"tgdsl outer surface 1"
 HULL_POINTS = 2000
 """Points of a convex hull whose distance to the mesh is looked at."""
 
@@ -47,18 +54,18 @@ def geom_distance(felt: SurfaceGeom, options: DistanceOptions, margin: float, na
         name: What warnings call the object or link: "object cube".
 
     Raises:
-        BakeError: If no grid within the budget holds the tolerance.
+        BakeError: If no face has an area, or no grid within the budget holds the tolerance.
     """
     if felt.surface is None:
         return GeomDistance(felt, felt.shape, {}, {})
     _warn_of_hull(felt, margin, name)
     if options.query == "raycast":
-        arrays = {"vertices": felt.surface.vertices, "faces": felt.surface.faces, "max_distance": np.asarray(2.0 * margin)}
+        triangles = _outer(felt.surface)
+        _warn_of_flaws(triangles.flaws, felt, name)
+        arrays = {"vertices": triangles.vertices, "faces": triangles.faces, "max_distance": np.asarray(2.0 * margin)}
         return GeomDistance(felt, "raycast", arrays, {})
     baked = bake(felt.surface, margin, options.tolerance, options.max_bytes)
-    if not baked.is_watertight:
-        what = f"{name}: {felt.geom.shown} is not closed; what is inside is decided by its winding number"
-        warnings.warn(what, stacklevel=2)
+    _warn_of_flaws(baked.flaws, felt, name)
     arrays = {"values": baked.values, "origin": baked.origin, "cell": np.asarray(baked.cell)}
     accuracy = {key: float(value) for key, value in dataclasses.asdict(baked.errors).items()}
     return GeomDistance(felt, baked.method, arrays, {**accuracy, "tolerance": options.tolerance, "cell": baked.cell})
@@ -131,6 +138,22 @@ def _surface(column: Sequence[GeomDistance | None]) -> GridTable[np.ndarray] | T
         cell=np.array([own["cell"] for own in owned]),
         counts=(x, y, z),
     )
+
+
+def _outer(surface: Surface) -> Outer:
+    """Return the outer surface of a mesh; it is kept in the user's cache folder."""
+
+    def unpacked(found: Mapping[str, np.ndarray]) -> Outer:
+        return Outer(found["vertices"], found["faces"], found["uncut"], tuple(found["flaws"].tolist()))
+
+    arrays = [np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)]
+    key = cache.digest(OUTER_FORMAT, arrays)
+    return cache.cached(key, lambda: outer(surface), lambda made: {k: np.asarray(v) for k, v in vars(made).items()}, unpacked)
+
+
+def _warn_of_flaws(flaws: Sequence[str], felt: SurfaceGeom, name: str) -> None:
+    for flaw in flaws:
+        warnings.warn(f"{name}: {felt.geom.shown} {flaw}", stacklevel=3)
 
 
 def _warn_of_hull(felt: SurfaceGeom, margin: float, name: str) -> None:
