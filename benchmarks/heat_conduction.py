@@ -7,10 +7,11 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches.cells import cosines, eigenvalues
+from tgdsl.quantities.patches.cells import modes
 from tgdsl.sensors.temperature_grid import diffusion
 
 LINKS, BLOCK = 5, 5
@@ -45,11 +46,14 @@ class Exact(torch.nn.Module):
         super().__init__()
         count = torch.full((len(rate),), num).numpy()
         self.rate = rate[None] * num**2
-        self.cosines, self.values = (torch.from_numpy(part).float() for part in (cosines(count), eigenvalues(count)))
+        vectors, values = (torch.from_numpy(part).float() for part in modes(count, np.zeros((len(rate), num))))
+        totals = torch.zeros_like(values)
+        totals[:, 0] = num**0.5
+        self.modes = diffusion.Modes(vectors, totals, values)
 
     def forward(self, cells: Tensor) -> Tensor:
         """Return the cells after a step."""
-        return cells + diffusion.spread(cells, [diffusion.along_axis(self.rate, self.cosines, self.values)] * 3)
+        return cells + diffusion.spread(cells, [diffusion.along_axis(self.rate, self.modes)] * 3).gained
 
 
 def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str, Any]]:
@@ -82,7 +86,9 @@ def timed(numbers: Sequence[int], num_envs: int, repeats: int) -> list[dict[str,
 def check(mirrored: Mirrored, exact: Exact, cells: Tensor, rate: Tensor) -> None:
     """See that the mirrored step is that of `semi_implicit`, and that `exact` keeps the sum."""
     num = mirrored.num
-    table = torch.from_numpy(cosines(torch.full((LINKS,), num).numpy())).float()
-    expected = cells + diffusion.semi_implicit(cells, rate[:, None].expand(-1, 3), (table, table, table))
+    k = torch.pi * torch.arange(num)
+    smooth = (exact.modes._replace(exponent=(k * k).expand(LINKS, -1)),) * 3
+    x = diffusion.exponents(rate[None, :, None].expand(-1, -1, 3), smooth)
+    expected = cells + diffusion.semi_implicit(cells, x, smooth).gained
     torch.testing.assert_close(mirrored(cells), expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(exact(cells).sum(dim=(2, 3, 4)), cells.sum(dim=(2, 3, 4)), rtol=0, atol=1e-4 * num**1.5)

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tgdsl.quantities.patches.cells import tables
+from tgdsl.quantities.patches.cells import is_cell, tables
 from tgdsl.quantities.patches.request import ContactPatch, HeatOfObjects
 from tgdsl.quantities.patches.topology import Topology
+from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 from tgdsl.sensors.temperature_grid.rows import rows_of
 
 NUM_ENVS = 7
@@ -45,19 +46,26 @@ def arguments(name: str, dtype: torch.dtype, num_envs: int = NUM_ENVS) -> tuple:
     low = rng.uniform(-0.02, 0.0, (num, 3))
     boxes = np.stack([low, low + rng.uniform(0.01, 0.03, (num, 3))], axis=1)
     count, size = np.array(case.count), boxes[:, 1] - boxes[:, 0]
-    found = tables(count, size)
-    there = found["outer"] > 0
+    there = is_cell(count)
+    given = {"emissivity": rng.uniform(0.3, 0.9, num), "convection": 20.0, "source": rng.uniform(0, 0.5, there.shape) * there}
+    given = {key: value for key, value in given.items() if key in case.terms}
+    conductivity, cell = rng.uniform(0.2, 50.0, num), size / count
+    radiated = 4 * stefan_boltzmann() * given.get("emissivity", np.zeros(num)) * (22.0 + zero_celsius()) ** 3
+    total = (radiated + given.get("convection", 0.0))[:, None]
+    film = total / (1 + total * cell / (2 * conductivity[:, None]) * (1 - 2 / (3 * count)))
+    found = tables(count, size, loss=film * cell / conductivity[:, None])
+    if film.any():
+        found |= {"film": film, "film_radiated": radiated / total[:, 0]}
     constants = {key: tensor(value) for key, value in found.items()} | {
         "box": tensor(np.concatenate([low, size / count, count], axis=1)),
-        "conductivity": tensor(rng.uniform(0.2, 50.0, num)),
+        "conductivity": tensor(conductivity),
         "volumetric_heat": tensor(rng.uniform(1e6, 3e6, num)),
         "ambient": tensor(22.0),
         "compliance": tensor(rng.uniform(1e-8, 1e-6, num)),
         "curvature": tensor(rng.uniform(50, 200, num)),
         "contact_conductance": tensor(2000.0),
     }
-    given = {"emissivity": rng.uniform(0.3, 0.9, num), "convection": 20.0, "source": rng.uniform(0, 0.5, there.shape) * there}
-    constants |= {key: tensor(given[key]) for key in case.terms}
+    constants |= {key: tensor(value) for key, value in given.items()}
     if "source" in constants:
         constants["power"] = constants["source"].sum(dim=(1, 2, 3))
     where = Topology(num, ((1, 1, 1),) * objects, (), tuple(range(objects)), (-1,) * objects, tuple(np.ndindex(num, objects)))

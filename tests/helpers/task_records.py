@@ -19,7 +19,7 @@ class Recorder:
         episodes: Of each environment, its episodes so far: records of instants, of terms, and of what ended.
     """
 
-    def __init__(self, env: TouchEnv, more: Callable[[], Record] = dict):
+    def __init__(self, env: TouchEnv, more: Callable[[Now], Record] = lambda now: {}):
         """Begin with a new episode in every environment.
 
         Args:
@@ -36,7 +36,7 @@ class Recorder:
         """Make a step and note it."""
         task, seen = self.env.task, []
         whole = task.advance
-        task.advance = lambda now: (whole(now), seen.append(instant(now) | self._more()))[0]  # type: ignore[method-assign]
+        task.advance = lambda now: (whole(now), seen.append(instant(now) | self._more(now)))[0]  # type: ignore[method-assign]
         try:
             made = self.env.step(action)
         finally:
@@ -50,7 +50,7 @@ class Recorder:
         self._begin(torch.nonzero(made.info.ended).flatten().tolist())
 
     def _begin(self, envs: Sequence[int]) -> None:
-        now = instant(self.env.now) | self._more()
+        now = instant(self.env.now) | self._more(self.env.now)
         for env in envs:
             self.episodes[env].append(([{name: value[env] for name, value in now.items()}], []))
 

@@ -305,9 +305,7 @@ def _kinds(document: Loaded) -> dict[str, str]:
     return {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
 
 
-def _sensors_of(
-    loaded: LoadedTask, kinds: Mapping[str, str], wanted: Sequence[tuple[str, tuple[str, ...]]]
-) -> dict[str, str]:
+def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Sequence[tuple[str, tuple[str, ...]]]) -> dict[str, str]:
     """Return the document's only sensor of each kind that is wanted.
 
     Args:

@@ -87,7 +87,7 @@ def test_episodes_begin_with_keyframes(env):
 def test_rewards_ends_and_scores_equal_the_reference():
     env = grip(**ODD)
     assert_started(env, 6.0)
-    recorder = Recorder(env, lambda: command(env))
+    recorder = Recorder(env, lambda now: command(env))
     for i, action in enumerate(random_actions(env, 60)):
         recorder.step(torch.ones_like(action) if i % 30 > 20 else action)
     assert sum(len(episodes) for episodes in recorder.episodes) > 2 * NUM
@@ -100,7 +100,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
 @pytest.mark.slow
 def test_the_document_as_it_is_equals_the_reference():
     env = TouchEnv(DOCUMENT, NUM, threads=1)
-    recorder = Recorder(env, lambda: command(env))
+    recorder = Recorder(env, lambda now: command(env))
     for action in random_actions(env, 150):
         recorder.step(action)
     assert {"force_near", "force_far", "object_angle", "action_rate", "work"} <= assert_reference(recorder, by_command)

@@ -74,8 +74,8 @@ def hottest(env):
     return env.now.readings["heat"].amax(dim=(1, 2))
 
 
-def cells(env):
-    return {"heat": env.now.readings["heat"][:, :, 0].double().numpy().copy()}
+def cells(now):
+    return {"heat": now.readings["heat"][:, :, 0].double().numpy().copy()}
 
 
 ODD = {
@@ -89,7 +89,7 @@ ODD = {
 def test_rewards_ends_and_scores_equal_the_reference():
     """Balls of the lower row get lower than 12 cm, and so are lost; those of the upper one stay, and are pressed on."""
     env = bin_of_balls(8, **ODD)
-    recorder = Recorder(env, lambda: cells(env))
+    recorder = Recorder(env, cells)
     for i, action in enumerate(random_actions(env, 40)):
         if i % 12 == 2:
             put_on(env, [0] * 8, press=0.03)
@@ -102,7 +102,7 @@ def test_rewards_ends_and_scores_equal_the_reference():
 @pytest.mark.slow
 def test_the_document_as_it_is_equals_the_reference():
     env = TouchEnv(DOCUMENT, 8, threads=1)
-    recorder = Recorder(env, lambda: cells(env))
+    recorder = Recorder(env, cells)
     for action in random_actions(env, 100):
         recorder.step(action)
     assert {"approach", "action_rate", "work"} <= assert_reference(recorder, reference)

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from held import assert_holds
+from scipy.linalg import expm
 
+from tgdsl.fields.materials import MATERIALS
 from tgdsl.report.oracles import heat
-from tgdsl.report.oracles.setups.boxes import begin, cells_of, heat_module, heat_state
+from tgdsl.report.oracles.setups.boxes import begin, cells_of, face_contacts, heat_module, heat_state
 
 
 def test_aluminium_on_warm_rubber_warms_as_two_solids_do():
@@ -101,6 +103,74 @@ def test_nothing_leaves_the_range_of_what_there_is(tmp_path, cells, dtype):
                 readings = module(state)
                 every = torch.cat([readings["heat"][0, :, 0], readings["heat/objects"][0, :, 0]])
                 assert float(every.min()) >= -20.0 - slack and float(every.max()) <= 80.0 + slack
+
+
+@pytest.mark.parametrize(("cell", "num"), [(1e-3, 80), (2.5e-4, 200), (1.25e-4, 320)])
+def test_two_solids_exchange_what_they_must_however_long_a_step_is(cell, num):
+    """αΔt/Δ² = 0.5, 8 and 31: their contact sees what the cells conduct within a step."""
+    assert_holds(heat.two_solids(cell, num))
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.004, 0.02])
+def test_two_solids_exchange_what_their_cells_equations_say(tmp_path, dt):
+    """Twice 8 cells of 2 mm, against the exponential of all of them: αΔt/Δ² from 0.02 to 0.5."""
+    own, cell, num, area = MATERIALS["aluminium"], 0.002, 8, 4e-4
+    sides = [0.02, 0.02, num * cell]
+    slab = {"material": "aluminium", "temperature": 45.0, "cells": [1, 1, num]}
+    module = heat_module(
+        tmp_path, {"tip": sides}, {"cells": [1, 1, num], "material": "aluminium", "contact_area": area}, {"slab": (sides, slab)}
+    )
+    state = heat_state(module, dt, {("tip", "slab"): face_contacts(sides, -0.5 * sides[2])})
+    state.body_pos[:, module.inputs.bodies.index("slab"), 2] = -sides[2]
+    begin(module, state)
+    found = sum(float(module(state)["heat/heat"][0, 0, 4]) for _ in range(round(0.4 / dt)))
+    coupled = np.diff(np.eye(2 * num), axis=0)
+    rate = own.conductivity / (own.density * own.specific_heat * cell**2)
+    after = expm(-0.4 * rate * coupled.T @ coupled) @ np.repeat([0.0, 23.0], num)
+    assert found == pytest.approx(after[:num].sum() * own.density * own.specific_heat * cell * area, rel=0.003)
+
+
+@pytest.mark.parametrize(("num", "dt"), [(4, 1.0), (8, 0.2), (12, 1.0)])
+def test_a_spot_conducts_in_long_steps_what_it_does_in_short_ones(num, dt):
+    """αΔt/Δ² from 3 to 35: heat spreads from the cells below it in all directions."""
+    assert_holds(heat.spot_in_long_steps(num, dt))
+
+
+@pytest.mark.parametrize("area", [1e-6, 1e-4])
+def test_contacts_that_jump_keep_temperatures_near_the_range(tmp_path, area):
+    """A hot and a cold body that touch elsewhere at each call of some length: within 5 % of what there is, 0.1 W/(m·K) or 400."""
+    rng = np.random.default_rng(0)
+    for k in (0.1, 400.0):
+        sensor = {"cells": [3, 4, 3], "material": {"like": "steel", "conductivity": k}, "contact_area": area}
+        bodies = {
+            "hot": (None, {"material": "copper", "temperature": 80.0}),
+            "cold": (None, {"material": "copper", "temperature": -20.0}),
+        }
+        module = heat_module(tmp_path, {"tip": [0.01, 0.012, 0.008]}, sensor, bodies)
+        module(heat_state(module, 0.01))
+        for _ in range(60):
+            contacts = {
+                ("tip", name): [(tuple(rng.uniform(-5e-3, 5e-3, 3)), tuple(np.eye(3)[rng.integers(3)]), 1.0)] for name in bodies
+            }
+            found = module(heat_state(module, float(rng.choice([1e-3, 0.01, 0.1, 1.0])), contacts))["heat"]
+            assert float(found.min()) > -25.0 and float(found.max()) < 85.0
+
+
+def test_a_link_that_is_pinched_does_not_swing(tmp_path):
+    """Between a hot and a cold body, all of it within one step's reach: each contact counts what the other does."""
+    bodies = {
+        "hot": (None, {"material": "copper", "temperature": 80.0}),
+        "cold": (None, {"material": "copper", "temperature": -20.0}),
+    }
+    module = heat_module(
+        tmp_path, {"tip": [0.01] * 3}, {"cells": [2, 2, 2], "material": "copper", "contact_area": 1e-4}, bodies
+    )
+    contacts = {("tip", name): [((0, 0, z), (0, 0, -z / abs(z)), 1.0)] for name, z in (("hot", 0.005), ("cold", -0.005))}
+    means = []
+    for _ in range(8):
+        means.append(float(module(heat_state(module, 5.0, contacts))["heat"].mean()))
+    apart = np.abs(np.array(means) - 30.0)
+    assert apart[0] == 8.0 and (np.diff(apart) < 1e-9).all() and apart[-1] < 0.1
 
 
 def test_reading_more_often_differs_by_the_step(tmp_path):

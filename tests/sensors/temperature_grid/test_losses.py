@@ -2,17 +2,21 @@
 
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from held import assert_holds
 
+from tgdsl.fields.materials import MATERIALS
 from tgdsl.report.oracles import cooling
 from tgdsl.report.oracles.cooling import SIDES
-from tgdsl.report.oracles.setups.boxes import heat_module, heat_state
+from tgdsl.report.oracles.setups.boxes import cells_of, heat_module, heat_state
 
 COMPARED = (
     cooling.newton, partial(cooling.newton, torch.float32), cooling.exposed_faces, cooling.radiation, cooling.both_losses,
-    cooling.order_of_losses, cooling.hot_block,
+    cooling.order_of_losses, cooling.hot_block, partial(cooling.slab, 40, 1), partial(cooling.slab, 40, 7),
+    *(partial(cooling.cube, num) for num in (1, 2, 3, 4, 12)), *(partial(cooling.cube, 2, name) for name in ("abs", "skin")),
+    *(partial(cooling.flux_through, dt) for dt in (1.0, 20.0)), *(partial(cooling.flux_radiated, dt) for dt in (5.0, 50.0)),
 )  # fmt: skip
 
 
@@ -46,3 +50,33 @@ def test_after_a_reset_a_slow_element_reads_the_truth(tmp_path):
     after = module(state)["heat"]
     assert (after[1] == 60.0).all()
     assert (after[[0, 2]] < before[[0, 2]]).all()
+
+
+def test_cells_lose_nothing_beyond_the_box(tmp_path):
+    """Of links with fewer cells than another there are none in the rows' padding; what faces lose is what the cells lost."""
+    sensor = {"spacing": "4 mm", "material": "skin", "temperature": 60.0, "convection": 30.0, "emissivity": 0.8}
+    module = heat_module(tmp_path, {"a": [0.012, 0.008, 0.004], "b": [0.008, 0.016, 0.012]}, sensor)
+    state, lost = heat_state(module, 2.0), 0.0
+    begun = module(state)["heat/heat"][0, :, 0].clone()
+    for _ in range(20):
+        heat = module(state)["heat/heat"][0]
+        lost = lost + heat[:, 2:4].sum(dim=1)
+    cells = cells_of(module)[0]
+    assert (cells[0, :, 2:] == 0).all() and (cells[0, :, :, 1:] == 0).all() and (cells[1, 2:] == 0).all()
+    assert (lost < -1.0).all()
+    torch.testing.assert_close(heat[:, 0] - begun, lost, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("sides", [(0.02, 0.02, 0.02), (0.04, 0.02, 0.01)])
+def test_an_object_of_one_temperature_cools_as_one_cell(tmp_path, sides):
+    """Half a cube of its volume stands between what it holds and the air, as one cell of such a cube."""
+    width = float(np.prod(sides)) ** (1 / 3)
+    area = 2 * (sides[0] * sides[1] + sides[1] * sides[2] + sides[2] * sides[0])
+    rubber = MATERIALS["rubber"]
+    sensor = {"cells": [1, 1, 1], "material": "steel", "convection": 15.0, "contact_area": "1 mm2"}
+    module = heat_module(tmp_path, {"tip": [0.01] * 3}, sensor, {"ball": (sides, {"material": "rubber", "temperature": 62.0})})
+    state = heat_state(module, 10.0)
+    for _ in range(31):
+        found = module(state)["heat/objects"][0, 0, 0].item() - 22.0
+    rate = area / (1 / 15.0 + width / (6 * rubber.conductivity)) / (rubber.density * rubber.specific_heat * width**3)
+    assert found == pytest.approx(40.0 * np.exp(-rate * 300.0), rel=1e-9)

@@ -252,6 +252,66 @@ def two_bodies(steps: int = 1000, dt: float = 0.0005) -> Comparison:
     )
 
 
+def two_solids(cell: float, num: int, dt: float = 0.005, seconds: float = 0.4) -> Comparison:
+    """Return what two solids of aluminium exchange through a face, one cell thick to many, within a step and over many."""
+    made_of, area = MATERIALS["aluminium"], 4e-4
+    sides = [0.02, 0.02, num * cell]
+    slab = {"material": "aluminium", "temperature": 45.0, "cells": [1, 1, num]}
+    sensor = {"cells": [1, 1, num], "material": "aluminium", "contact_area": area}
+    with folder() as where:
+        module = heat_module(where, {"tip": sides}, sensor, {"slab": (sides, slab)})
+    state = heat_state(module, dt, {("tip", "slab"): face_contacts(sides, -0.5 * sides[2])})
+    assert state.body_pos is not None
+    state.body_pos[:, module.inputs.bodies.index("slab"), 2] = -sides[2]
+    begin(module, state)
+    found, steps = 0.0, round(seconds / dt)
+    for _ in range(steps):
+        found += float(module(state)["heat/heat"][0, 0, 4])
+    own = made_of.conductivity * made_of.density * made_of.specific_heat
+    fourier = made_of.conductivity / (made_of.density * made_of.specific_heat) * dt / cell**2
+    return Comparison(
+        f"Heat between two solids, αΔt/Δ² = {fourier:.2g}",
+        "Carslaw and Jaeger 2.14",
+        "Q = A √(kρc) (T₂ − T₁) √(t/π)",
+        KINDS,
+        "heat",
+        "J",
+        cases([f"after {seconds:g} s"]),
+        array(area * np.sqrt(own * steps * dt / np.pi) * 23.0),
+        array(found),
+        rtol=0.01,
+        defects=(13,),
+    )
+
+
+def spot_in_long_steps(num: int, dt: float, seconds: float = 2.0) -> Comparison:
+    """Return what a cube of aluminium takes up through a spot on its face, in long steps against short ones."""
+    sensor = {"cells": [num] * 3, "material": "aluminium", "contact_area": "10 mm2"}
+    with folder() as where:
+        module = heat_module(where, {"tip": [0.02] * 3}, sensor, {"hot": (None, {"material": "copper", "temperature": 80.0})})
+    found = []
+    for step in (dt, 0.002):
+        module.reset()
+        state = heat_state(module, step, {("tip", "hot"): [((0.001, -0.002, 0.01), (0, 0, -1), 1.0)]})
+        begin(module, state)
+        found.append(sum(float(module(state)["heat/heat"][0, 0, 4]) for _ in range(round(seconds / step))))
+    own = MATERIALS["aluminium"]
+    fourier = own.conductivity / (own.density * own.specific_heat) * dt / (0.02 / num) ** 2
+    return Comparison(
+        f"Heat through a spot in long steps, αΔt/Δ² = {fourier:.2g}",
+        "the same cells in steps of 2 ms",
+        "Q",
+        KINDS,
+        "heat",
+        "J",
+        cases([f"after {seconds:g} s"]),
+        array(found[1]),
+        array(found[0]),
+        rtol=0.05,
+        defects=(13,),
+    )
+
+
 def half_space(count: int) -> np.ndarray:
     """Return the Green's function of the surface layer of a half-space of unit cubes that conduct 1 [1]."""
     nodes, weights = np.polynomial.legendre.leggauss(300)
@@ -363,4 +423,6 @@ ORACLES: tuple[Oracle, ...] = (
     *(partial(greens_function, is_far) for is_far in (False, True)),
     *(partial(circular_spot, cell) for cell in (0.5, 1.0, 4.0)),
     two_lumps,
+    *(partial(two_solids, cell, num) for cell, num in ((1e-3, 80), (2.5e-4, 200), (1.25e-4, 320))),
+    partial(spot_in_long_steps, 8, 0.2),
 )

@@ -1,4 +1,4 @@
-"""A step of all that holds heat: contact, losses, sources and conduction, one after the other.
+"""A step of all that holds heat, kept as compensated sums, and its start.
 
 Shapes: `env` environments, `row` links, then objects that are divided into cells; `object` objects; `x`, `y`, `z` cells.
 """
@@ -43,7 +43,7 @@ class Heat(NamedTuple):
 
 def advanced(patches: ContactPatch, context: Context, constants: Constants, state: State) -> Heat:
     """Return what there is at a call; at the first one after a reset that is the start."""
-    rows = rows_of(constants, patches, "is_spectral" in constants)
+    rows = rows_of(constants, patches, any(f"is_{name}" in constants for name in ("spectral", "semi_implicit", "paper")))
     where, lumped, grids = patches.topology, list(patches.topology.lumped), list(patches.topology.grids)
     cells, cells_low = state["cells"], state["cells_low"]
     objects = objects_low = cells.new_zeros((len(cells), 0, 1, 1, 1))

@@ -3,11 +3,11 @@
     C_i (θ'_i − θ_i) = Δt Σ_n g_in (φ'_n − θ'_i)                                            each cell i
     K_n (φ'_n − φ_n) = Δt Σ_i g_in (θ'_i − φ'_n)                                            each node n     [J]
 
-with heat capacities C and K [J/K], conductances g [W/K], temperatures θ and φ; nodes are bodies of one temperature, and
-interfaces with K = 0. Solved for θ' cell by cell, what is left is a small system of the nodes, whose matrix has a dominant
-diagonal and no positive number beside it: temperatures after the step are means of those before, for any Δt, k and area. What
-flows is w_in (φ'_n − θ_i) + Σ_m M_nm,i (φ'_n − φ'_m), with w = Δt g C/d, M = Δt² g g/d and d = C + Δt Σ g: differences, in
-which nothing cancels, and equal on both sides.
+with heat capacities C and K [J/K], C that which a cell shows in a step (`response`), conductances g [W/K], temperatures θ and
+φ; nodes are bodies of one temperature, and interfaces with K = 0. Solved for θ' cell by cell, what is left is a small system of
+the nodes, whose matrix has a dominant diagonal and no positive number beside it: temperatures after the step are means of those
+before, for any Δt, k and area. What flows is w_in (φ'_n − θ_i) + Σ_m M_nm,i (φ'_n − φ'_m), with w = Δt g C/d, M = Δt² g g/d and
+d = C + Δt Σ g: differences, in which nothing cancels, and equal on both sides.
 
 Shapes: `env` environments, `row` rows of cells, `side` sides of patches on each, `node` nodes.
 """
@@ -50,15 +50,14 @@ def step(cells: Tensor, nodes: Tensor, capacity: Tensor, inverse: Tensor, flow: 
     Args:
         cells: θ (env, row, x, y, z) [K].
         nodes: φ of the bodies of one temperature, the first of the nodes (env, body) [K].
-        capacity: C of a row's cells (env, row) [J/K].
+        capacity: C of cells (env, row, x, y, z) [J/K].
         inverse: 1/K of these bodies (env, body) [K/J].
         flow: Δt g (env, row, side, x, y, z) [J/K].
         sides: Which side is at which node.
     """
     num_bodies, num_nodes = nodes.shape[-1], sides.tables["at_node"].shape[0]
-    heat = capacity[..., None, None, None]
-    total = heat + flow.sum(dim=2)
-    weight = flow * (heat / total)[:, :, None]
+    total = capacity + flow.sum(dim=2)
+    weight = flow * (capacity / total)[:, :, None]
     flat = cells[:, :, None]
     held = _at_nodes(sides, weight.sum(dim=(-3, -2, -1)))
     pulled = held, _at_nodes(sides, (weight * flat).sum(dim=(-3, -2, -1)))

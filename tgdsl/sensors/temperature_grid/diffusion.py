@@ -1,16 +1,25 @@
-"""Conduction within links: what a step adds to the cells of a box.
+"""Conduction within links, with what their faces lose: what a step adds to the cells of a box, and makes of a constant source.
 
-Along an axis with n cells of size Δ and insulated ends a step multiplies mode k, cos((i + ½)kπ/n), by e^(−aμ_k), with
-a = αΔt/Δ² and μ_k = 4 sin²(kπ/2n) [1]: see `cells`. Axes commute, so what a step adds is (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) − I,
-G = Cᵀ diag(e^(−aμ) − 1) C of an axis. Axes whose cells are few are taken together as one dense operator, and those groups one
-after the other. An operator acts on what cells differ from their mean, and from what it adds the mean is taken off: what leaves
-some cells enters others, but for rounding of what flows.
+    θ̇ = −(M_x + M_y + M_z) θ + s,   M_a = α/Δ_a² (−D² + diag(b)),   b = u Δ_a/k at exposed faces                [K/s]
 
-`spectral` has (kπΔ/L)² in the exponent in place of μ_k: the decay of the continuous solid's modes. `semi_implicit` divides each
-mode of the box by 1 + αΔt|k|² (the paper).
+with D² the second difference between insulated walls and u [W/(m²·K)] the heat transfer coefficient between a cell at the face
+and the surroundings (`losses`). Eigenvectors of M_a and eigenvalues αμ/Δ² are known beforehand (`quantities.patches.cells`). A
+step of Δt is exact in time:
 
-Shapes: `env` environments, or 1 where all are alike; `row` bodies, `x`, `y`, `z` cells; `to`, `from` cells of a group; `wave`
-modes but for the mean.
+    θ ← (I + G_x) ⊗ (I + G_y) ⊗ (I + G_z) θ + Δt φ₁(−x) s,   G = Vᵀ diag(e^(−aμ) − 1) V,   φ₁(−x) = (1 − e^(−x))/x
+
+with a = αΔt/Δ² of an axis and x = Σ aμ of a mode of the box. Axes whose cells are few are taken together as one dense operator,
+and those groups one after the other. An operator acts on what cells differ from their mean and on that mean apart, and what it
+adds is made to sum to what leaves through the faces: heat is neither made nor lost, but for rounding of what flows.
+
+`spectral` has (kπ/n)² in place of the 4 sin²(kπ/2n) in μ_k: the decay of the continuous solid's modes between insulated walls.
+`semi_implicit` divides each mode of the box by 1 + x (the paper), and has 1/(1 + x) in place of φ₁.
+
+Source: Carslaw and Jaeger, *Conduction of Heat in Solids*, 3.9 and 3.11, for modes of a slab that loses heat at its faces;
+Hochbruck and Ostermann, Exponential integrators, *Acta Numerica* 2010, for φ₁.
+
+Shapes: `env` environments, or 1 where all are alike; `row` bodies, `x`, `y`, `z` cells; `to`, `from` cells of a group; `mode`
+modes along an axis.
 """
 
 from __future__ import annotations
@@ -21,40 +30,48 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tgdsl.geometry import planes
-
 Cells = Float[Tensor, "env row x y z"]
 MOST_DENSE = {"cpu": 100, "cuda": 8}
 """Cells of a group: a product of matrices takes less time than two smaller ones; a GPU sums in single precision, by threads."""
+
+
+class Modes(NamedTuple):
+    """Modes along an axis: vectors (row, mode, cell); sums over the cells, and by what a is multiplied, (row, mode) each."""
+
+    vectors: Float[Tensor, "row mode cell"]
+    totals: Float[Tensor, "row mode"]
+    exponent: Float[Tensor, "row mode"]
 
 
 class Axis(NamedTuple):
     """What a step adds along one axis, or along some that follow one another.
 
     Attributes:
-        gains: (env, row, to, from) [1].
+        gains: G, symmetric (env, row, to, from) [1].
+        leaves: Sums of its columns, what is added to all cells of what one holds (env, row, from) [1].
         is_there: 1 for the cells that a row has (row, cell).
     """
 
     gains: Float[Tensor, "env row to from"]
+    leaves: Float[Tensor, "env row from"]
     is_there: Float[Tensor, "row cell"]
 
 
-def along_axis(rate: Tensor, cosines: Float[Tensor, "row mode cell"], exponent: Float[Tensor, "row wave"]) -> Axis:
-    """Return what a step adds along an axis.
+class Spread(NamedTuple):
+    """What a step does: gains of cells (env, row, x, y, z) [K], and what of their sum came through the faces (env, row) [K]."""
 
-    Args:
-        rate: a = αΔt/Δ² (env, row) [1].
-        cosines: Modes; mode 0 is the mean.
-        exponent: What a is multiplied with in the exponent, of the modes from 1 on: μ, or (kπΔ/L)².
-    """
-    decay = torch.expm1(-rate[..., None] * exponent)
-    waves = cosines[:, 1:]
-    if waves.is_cuda:  # a product of matrices there may be rounded to ten bits, if its user wants that elsewhere
-        gains = ((decay[..., None] * waves)[..., :, None] * waves[..., None, :]).sum(dim=-3)
-    else:
-        gains = (decay[..., None] * waves).transpose(-2, -1) @ waves
-    return Axis(gains, (cosines[:, 0] > 0).to(cosines.dtype))
+    gained: Tensor
+    entered: Tensor
+
+
+def along_axis(rate: Float[Tensor, "env row"], modes: Modes) -> Axis:
+    """Return what a step adds along an axis; the rate is a = αΔt/Δ² [1]."""
+    decay = torch.expm1(-rate[..., None] * modes.exponent)
+    waves, scaled, totals = modes.vectors, decay[..., None] * modes.vectors, decay * modes.totals
+    # On a GPU a product of matrices may be rounded to ten bits, if its user wants that elsewhere.
+    is_summed = waves.is_cuda
+    gains = (scaled[..., :, None] * waves[..., None, :]).sum(dim=-3) if is_summed else scaled.transpose(-2, -1) @ waves
+    return Axis(gains, (totals[..., None] * waves).sum(dim=-2), (waves[:, 0] > 0).to(waves.dtype))
 
 
 def together(first: Axis, second: Axis) -> Axis:
@@ -62,8 +79,10 @@ def together(first: Axis, second: Axis) -> Axis:
     one, other = (torch.eye(axis.gains.shape[-1], dtype=axis.gains.dtype, device=axis.gains.device) for axis in (first, second))
     outer, inner = first.gains[..., :, None, :, None], second.gains[..., None, :, None, :]
     both = outer * (other[:, None, :] + inner) + one[:, None, :, None] * inner
+    mine, its = first.leaves[..., :, None], second.leaves[..., None, :]
+    leaves = mine * (second.is_there[:, None, :] + its) + first.is_there[:, :, None] * its
     is_there = first.is_there[:, :, None] * second.is_there[:, None, :]
-    return Axis(both.flatten(-4, -3).flatten(-2, -1), is_there.flatten(1))
+    return Axis(both.flatten(-4, -3).flatten(-2, -1), leaves.flatten(-2), is_there.flatten(1))
 
 
 def grouped(axes: list[Axis], device: str) -> list[Axis]:
@@ -82,30 +101,32 @@ def grouped(axes: list[Axis], device: str) -> list[Axis]:
     return groups[::-1]
 
 
-def spread(cells: Cells, axes: list[Axis]) -> Cells:
-    """Return what the cells gain in a step [K].
+def spread(cells: Cells, axes: list[Axis]) -> Spread:
+    """Return what a step does to cells.
 
     Args:
         cells: Temperatures [K].
         axes: What it adds along x, y and z; or along groups of them that have all cells together.
     """
     groups, shape, behind = grouped(axes, cells.device.type), cells.shape, 1
-    gained = None
-    for group in reversed(groups):
+    gained, entered = torch.zeros_like(cells), torch.zeros_like(cells[:, :, 0, 0, 0])
+    for i, group in enumerate(reversed(groups)):
         size = group.gains.shape[-1]
-        if size > 1:
-            now = cells if gained is None else cells + gained
-            more = _added(now.reshape(*shape[:2], -1, size, behind), group).reshape(shape)
-            gained = more if gained is None else gained + more
+        now = cells if i == 0 else cells + gained
+        more, through = _added(now.reshape(*shape[:2], -1, size, behind), group)
+        gained, entered = gained + more.reshape(shape), entered + through
         behind *= size
-    return torch.zeros_like(cells) if gained is None else gained
+    return Spread(gained, entered)
 
 
-def _added(cells: Float[Tensor, "env row ahead from behind"], group: Axis) -> Float[Tensor, "env row ahead to behind"]:
-    """Return what a group adds."""
-    there = group.is_there[:, None, :, None]
+def _added(
+    cells: Float[Tensor, "env row ahead from behind"], group: Axis
+) -> tuple[Float[Tensor, "env row ahead to behind"], Float[Tensor, "env row"]]:
+    """Return what a group adds, and what of the sum came through the faces."""
+    there, leaves = group.is_there[:, None, :, None], group.leaves[:, :, None, :, None]
     share = there / there.sum(dim=2, keepdim=True)
-    apart = cells - (cells * share).sum(dim=3, keepdim=True)
+    mean = (cells * share).sum(dim=3, keepdim=True)
+    apart = cells - there * mean
     if apart.is_cuda:
         gains = group.gains[:, :, None, :, None, :]
         made = (gains * apart.movedim(3, -1)[:, :, :, None]).sum(dim=-1)
@@ -116,7 +137,10 @@ def _added(cells: Float[Tensor, "env row ahead from behind"], group: Axis) -> Fl
         made = made.reshape(num_rows, num_envs, ahead, size, 1).transpose(0, 1)
     else:
         made = group.gains[:, :, None] @ apart
-    return made - there * (made * share).sum(dim=3, keepdim=True)
+    made = made + leaves * mean
+    through = (leaves * apart).sum(dim=3, keepdim=True) + mean * leaves.sum(dim=3, keepdim=True)
+    made = made - there * (made * share).sum(dim=3, keepdim=True) + share * through
+    return made, through.sum(dim=(2, 3, 4))
 
 
 def along(matrix: Tensor, cells: Cells, axis: int) -> Cells:
@@ -135,28 +159,49 @@ def along(matrix: Tensor, cells: Cells, axis: int) -> Cells:
     return made.movedim(-1, 2 + axis)
 
 
-def semi_implicit(
-    cells: Cells, rates: Tensor, cosines: tuple[Tensor, ...], least: Tensor | None = None
-) -> Float[Tensor, "env row x y z"]:
-    """Return what the cells gain in a step that divides each mode by 1 + αΔt|k|² [K].
+def by_modes(cells: Cells, factor: Tensor, modes: tuple[Modes, ...]) -> Spread:
+    """Return what the cells gain if modes of the box are multiplied by a factor (env, row, x, y, z), and added.
 
-    Args:
-        cells: Temperatures [K].
-        rates: αΔt/L² along each axis (env, row, 3) [1]; env is 1 where all are alike.
-        cosines: Modes along each axis (row, mode, cell).
-        least: Least αΔt|k|², which the mean has too [1]; default: the mean stays.
+    What of the sum came through the faces is what these modes have of it.
     """
     found = cells
-    for axis, mode in enumerate(cosines):
-        found = along(mode, found, axis)
-    decay = torch.zeros_like(cells[:1])
-    for axis, mode in enumerate(cosines):
-        k = planes.pi() * torch.arange(mode.shape[-2], device=cells.device, dtype=cells.dtype)
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        decay = decay + rates[..., axis, None, None, None] * (k * k).reshape(shape)
-    decay = decay if least is None else torch.maximum(decay, least)
-    found = -found * (decay / (1.0 + decay))
-    for axis, mode in enumerate(cosines):
-        found = along(mode.transpose(-2, -1), found, axis)
-    return found
+    for axis, own in enumerate(modes):
+        found = along(own.vectors, found, axis)
+    found, totals = found * factor, outer([own.totals for own in modes], torch.mul)
+    entered = (found * totals).sum(dim=(-3, -2, -1))
+    for axis, own in enumerate(modes):
+        found = along(own.vectors.transpose(-2, -1), found, axis)
+    there = outer([(own.vectors[:, 0] > 0).to(cells.dtype) for own in modes], torch.mul)
+    excess = found.sum(dim=(-3, -2, -1)) - entered
+    return Spread(found - there * (excess / there.sum(dim=(-3, -2, -1)))[..., None, None, None], entered)
+
+
+def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Cells:
+    """Return x = Σ aμ of the modes of a box, from a of each axis."""
+    return outer([rates[..., axis, None] * own.exponent for axis, own in enumerate(modes)], torch.add)
+
+
+def warmed(source: Cells, x: Cells, modes: tuple[Modes, ...], is_implicit: bool) -> Spread:
+    """Return what the cells gain beyond a constant source's Δt s, as it spreads while it is made: (φ₁ − 1) Δt s.
+
+    Args:
+        source: Δt s [K].
+        x: See `exponents`.
+        modes: Those along x, y and z.
+        is_implicit: Whether φ₁ is 1/(1 + x).
+    """
+    if is_implicit:
+        return by_modes(source, -x / (1.0 + x), modes)
+    safe, series = torch.where(x > 1e-3, x, 1.0), -0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
+    return by_modes(source, torch.where(x > 1e-3, -torch.expm1(-safe) / safe - 1.0, series), modes)
+
+
+def semi_implicit(cells: Cells, x: Cells, modes: tuple[Modes, ...]) -> Spread:
+    """Return what a step does that divides each mode by 1 + x."""
+    return by_modes(cells, -x / (1.0 + x), modes)
+
+
+def outer(parts: list[Tensor], join) -> Tensor:  # type: ignore[no-untyped-def]
+    """Return products or sums of what modes or cells along x, y and z have (…, x, y, z)."""
+    x, y, z = parts
+    return join(join(x[..., :, None, None], y[..., None, :, None]), z[..., None, None, :])

@@ -4,17 +4,19 @@ The box of each link is nx × ny × nz cells of one material, and θ_i = T_i −
 of Δt does, one after the other:
 
 1. contact: C_i θ̇_i = Σ_n g_in (φ_n − θ_i) with the bodies and links that it touches, implicit and for all of them at once
-   (`conduction`); g_in from the patches' areas, both conductivities and the constriction of heat to a small spot (`shares`);
-2. losses: C_i θ̇_i = −A_i [h θ_i + ε σ (T_i⁴ − T_a⁴)] with the exposed area A_i of the cell (`losses`);
-3. a source: C_i θ̇_i = P/N, or q A_i at a face; half of it before 4, half after;
-4. conduction within the link: θ̇ = α ∇²θ between insulated walls, α = k/(ρc) (`diffusion`).
+   (`conduction`), of cells that show in a step what they conduct to those around (`response`); g_in from the patches' areas,
+   both conductivities and the constriction of heat to a small spot (`shares`);
+2. radiation beyond its tangent at ambient, εσ (T⁴ − T_a⁴ − 4 T_a³ θ), from the surfaces of cells (`losses`);
+3. at once and exact in time: conduction within the link, θ̇ = α ∇²θ with α = k/(ρc), the losses (h + 4εσ T_a³) θ from its faces,
+   and a source, P/N in each cell or q A_i at a face (`diffusion`).
 
     y ← T + (y − T_before) e^(−Δt/τ) − (T − T_before)(1 − e^(−Δt/τ)) τ/Δt                                  [°C]
 
 is what a sensing element of time constant τ reads of it, exact where T is linear between calls. C_i = ρcV_i is the heat
-capacity of a cell [J/K]. Steps 1, 2 and 4 leave no temperature beyond those of bodies and surroundings before, however long Δt
-is, and the splitting between them is of first order in Δt. The patch of a contact has the area of the polygon of contact
-points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
+capacity of a cell [J/K]. Steps 2 and 3 without a source leave no temperature beyond those of links and surroundings before,
+however long Δt is; nor does 1 where cells that touch differ little from those around. The splitting between them is of first
+order in Δt. Objects with cells have their losses in 2, all of them. The patch of a contact has the area of the polygon of
+contact points, or that of a Hertzian contact under their normal force, A = π (3 F R/4E*)^(2/3), whichever is larger.
 
 What the objects hold is part of the sensor's state: one temperature each, of a body that conducts from the patch to its middle
 as a cube of its volume would, or a grid of their own with `cells`. A new episode begins at the temperatures that the document
@@ -39,6 +41,7 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from tgdsl.errors import LowerError
@@ -51,6 +54,7 @@ from tgdsl.sensors.base import Axis, Channel, Constants, Context, Kind, Lowered,
 from tgdsl.sensors.noise import BASE
 from tgdsl.sensors.temperature_grid import grids
 from tgdsl.sensors.temperature_grid.advance import Heat, advanced
+from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
 from tgdsl.sensors.temperature_grid.reference import reference
 from tgdsl.sensors.temperature_grid.spec import TemperatureGridSpec, alternatives
 
@@ -70,18 +74,21 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
             raise LowerError(
                 f'`materials`: no link of the sensor matches "{pattern}"', field="materials", hint=f"it has {known}"
             )
-    constants = tables(count, size, spec.exposed) | {
+    film, radiated = _films(spec, made_of, size / count, count)
+    conductivity = np.array([own.conductivity for own in made_of])
+    constants = tables(count, size, spec.exposed, film * (size / count) / conductivity[:, None]) | {
         "box": np.concatenate([boxes[:, 0], size / count, count], axis=1),
-        "conductivity": np.array([own.conductivity for own in made_of]),
+        "conductivity": conductivity,
         "volumetric_heat": np.array([own.density * own.specific_heat for own in made_of]),
         "ambient": scalar(spec.ambient),
         "start": scalar(spec.start - spec.ambient),
         "is_cell": there.astype(np.float64),
         **_contact(spec, made_of, size),
     }
+    if film.any():
+        constants |= {"film": film, "film_radiated": radiated}
     if spec.emissivity is not None:
-        own = [m.emissivity if spec.emissivity == "material" else spec.emissivity for m in made_of]
-        constants["emissivity"] = np.array(own)
+        constants["emissivity"] = _emissivities(spec, made_of)
     if spec.convection is not None:
         constants["convection"] = scalar(spec.convection)
     if spec.source is not None:
@@ -117,6 +124,27 @@ def lower(spec: TemperatureGridSpec, layout: Layout, surface_of: SurfaceOf) -> L
         reports=reports,
         report_rows=report_rows,
     )
+
+
+def _emissivities(spec: TemperatureGridSpec, made_of: list[Material]) -> Float[np.ndarray, " row"]:
+    """Return ε of each link; 0 where nothing radiates."""
+    if spec.emissivity is None:
+        return np.zeros(len(made_of))
+    return np.array([own.emissivity if spec.emissivity == "material" else spec.emissivity for own in made_of])
+
+
+def _films(
+    spec: TemperatureGridSpec, made_of: list[Material], step: Float[np.ndarray, "row 3"], count: Int[np.ndarray, "row 3"]
+) -> tuple[Float[np.ndarray, "row 3"], Float[np.ndarray, " row"]]:
+    """Return u₀ of each link's faces across each axis [W/(m²·K)], and the share of it that is radiation: see `losses`."""
+    if spec.model == "paper":
+        return np.zeros(step.shape), np.zeros(len(step))
+    k = np.array([own.conductivity for own in made_of])[:, None]
+    radiated = 4.0 * stefan_boltzmann() * _emissivities(spec, made_of) * (spec.ambient + zero_celsius()) ** 3
+    total = radiated + (spec.convection or 0.0)
+    num_ends = np.array([sum(face[1] == axis for face in spec.exposed) for axis in "xyz"])
+    resistance = step / (2.0 * k) * (1.0 - num_ends / (3.0 * count))
+    return total[:, None] / (1.0 + total[:, None] * resistance), radiated / np.where(total > 0, total, 1.0)
 
 
 def _needs_stiffness(spec: TemperatureGridSpec, made_of: list[Material]) -> bool:

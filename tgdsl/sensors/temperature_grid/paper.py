@@ -23,7 +23,7 @@ from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid import diffusion
 from tgdsl.sensors.temperature_grid.losses import stefan_boltzmann, zero_celsius
-from tgdsl.sensors.temperature_grid.rows import Rows, num_cells
+from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, of_cells
 
 
 def least_squared_wavenumber() -> float:
@@ -45,9 +45,9 @@ def stepped(
         dt: Δt [s].
     """
     alpha = rows.diffusivity * dt
-    rates = torch.stack([alpha / (side * side) for side in rows.boxes.size], dim=-1)
-    least = alpha[..., None, None, None] * least_squared_wavenumber()
-    spread = diffusion.semi_implicit(cells, rates, rows.cosines, least)
+    x = diffusion.exponents(dt * torch.stack(rows.rates, dim=-1), rows.modes)
+    x = torch.maximum(x, alpha[..., None, None, None] * least_squared_wavenumber())
+    spread = diffusion.semi_implicit(cells, x, rows.modes).gained
     heat = rows.conductivity / rows.diffusivity
     made = torch.zeros_like(cells)
     if "paper_source" in constants:
@@ -57,7 +57,11 @@ def stepped(
     if patches.topology.num_objects:
         touched = _touched(now, objects, rows, patches, constants, dt)
     now = now + touched
-    outer, scale = (rows.outer > 0).to(cells.dtype), (dt / heat)[..., None, None, None]
+    ends = (of_cells(part, axis) for axis, part in enumerate(rows.ends))
+    outer, scale = (
+        (sum(ends, torch.zeros_like(cells[:1])) > 0).to(cells.dtype) * is_there(rows),
+        (dt / heat)[..., None, None, None],
+    )
     radiated = blown = torch.zeros_like(cells)
     if rows.emissivity is not None:
         around = constants["ambient"] + zero_celsius()

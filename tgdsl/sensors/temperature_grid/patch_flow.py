@@ -18,8 +18,9 @@ from torch.nn.functional import pad
 from tgdsl.geometry import planes
 from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
+from tgdsl.sensors.temperature_grid.response import Response, response
 from tgdsl.sensors.temperature_grid.rows import Rows, num_cells
-from tgdsl.sensors.temperature_grid.shares import conductances
+from tgdsl.sensors.temperature_grid.shares import of_squares, squares
 
 
 def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
@@ -32,20 +33,30 @@ def patch_area(patches: ContactPatch, constants: Constants) -> Tensor:
     return torch.maximum(patches.polygon, planes.pi() * planes.power(cubed, 2.0 / 3.0))
 
 
-def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants) -> Tensor:
-    """Return the conductance between each side and each cell of its row (env, row, side, x, y, z) [W/K]."""
+def patch_flow(patches: ContactPatch, rows: Rows, constants: Constants, x: Tensor) -> tuple[Tensor, Response]:
+    """Return the conductance between each side and each cell of its row (env, row, side, x, y, z) [W/K], and how it responds.
+
+    Args:
+        patches: Which there are.
+        rows: What the rows are made of.
+        constants: What `lower` folded.
+        x: What the rows' modes decay by in the step.
+    """
     area = patch_area(patches, constants)
     pos, normal = (planes.vec(_of_sides(patches, part) for part in vector) for vector in (patches.pos, patches.normal))
     if patches.object_pos is not None and patches.object_normal is not None:
         is_object = patches.sides["is_object"] > 0
         pos = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_pos), pos)
         normal = planes.where(is_object, planes.vec(_of_sides(patches, part) for part in patches.object_normal), normal)
-    found = conductances(_of_sides(patches, area), pos, normal, rows.conductivity, rows.boxes, num_cells(rows))
+    of_sides = _of_sides(patches, area)
+    parts = squares(of_sides, pos, normal, rows.boxes, num_cells(rows))
+    found = of_squares(of_sides, normal, rows.conductivity, rows.boxes, parts)
+    responds = response(parts, of_sides > 0, x, rows.modes, "is_semi_implicit" in constants)
     series = resistance(area, patches, patches.topology.lumped, constants)
     if series is None:
-        return found
+        return found, responds
     whole = found.sum(dim=(-3, -2, -1))
-    return found / (1.0 + whole * _of_sides(patches, series))[..., None, None, None]
+    return found / (1.0 + whole * _of_sides(patches, series))[..., None, None, None], responds
 
 
 def _of_sides(patches: ContactPatch, plane: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm
@@ -14,7 +14,7 @@ from tgdsl.quantities.patches.reference import Patch, ReferenceObject, Reference
 from tgdsl.quantities.reference import References
 from tgdsl.sensors.base import ReferenceContext, ReferenceState
 from tgdsl.sensors.temperature_grid.grids import counts
-from tgdsl.sensors.temperature_grid.spec import FACES, TemperatureGridSpec
+from tgdsl.sensors.temperature_grid.spec import FACES, Face, TemperatureGridSpec
 
 SIGMA, KELVIN = 5.670374419e-8, 273.15
 
@@ -27,30 +27,41 @@ class Block:
     capacity: float
     conductivity: float
     emissivity: float
-    outer: np.ndarray
+    exposed: tuple[Face, ...]
     corner: np.ndarray
     size: np.ndarray
     count: tuple[int, int, int] | None
     name: str = ""
+    area: float = 0.0
+    volume: float = 0.0
 
     @property
     def step(self) -> np.ndarray:
         """Sides of a cell [m]."""
         return self.size / np.array(self.count)
 
-    def laplacian(self) -> np.ndarray:
-        """Return α∇² of the cells with insulated walls (cell, cell) [1/s]."""
+    def operators(self, film: np.ndarray | None = None) -> list[np.ndarray]:
+        """Return −α∇² along each axis (cell, cell), with what exposed ends lose through a film by axis [W/(m²·K)], [1/s]."""
         assert self.count is not None
-        alpha, number = self.conductivity * self.step.prod() / self.capacity, np.arange(self.above.size).reshape(self.count)
-        matrix = np.zeros((self.above.size,) * 2)
-        for axis in range(3):
-            first, second = (
-                np.take(number, range(*ends), axis=axis).ravel() for ends in ((self.count[axis] - 1,), (1, self.count[axis]))
-            )
-            for i, j in zip(first, second, strict=True):
-                rate = alpha / self.step[axis] ** 2
-                matrix[[i, i, j, j], [i, j, i, j]] += rate * np.array([-1, 1, 1, -1])
-        return matrix
+        alpha, found = self.conductivity * self.step.prod() / self.capacity, []
+        for axis, n in enumerate(self.count):
+            matrix, rate = np.zeros((n, n)), alpha / self.step[axis] ** 2
+            for i in range(n - 1):
+                matrix[i : i + 2, i : i + 2] += rate * np.array([[1, -1], [-1, 1]])
+            if film is not None:
+                for end in self.ends(axis):
+                    matrix[end, end] += film[axis] * self.step.prod() / self.step[axis] / self.capacity
+            found.append(matrix)
+        return found
+
+    def ends(self, axis: int) -> list[int]:
+        """Return the first or the last cell along an axis, or both, as its faces are exposed."""
+        return [0 if face[0] == "-" else -1 for face in self.exposed if face[1] == "xyz"[axis]]
+
+    def resistance(self, axis: int) -> float:
+        """Return that between what a cell holds and its face across an axis [m²·K/W]: the equation of `losses`."""
+        assert self.count is not None
+        return self.step[axis] / (2 * self.conductivity) * (1 - len(self.ends(axis)) / (3 * self.count[axis]))
 
 
 def reference(
@@ -86,8 +97,9 @@ def _links(spec: TemperatureGridSpec, layout: Layout, found: ReferencePatches) -
             0.0 if spec.emissivity is None else made_of.emissivity if spec.emissivity == "material" else spec.emissivity
         )
         heat = made_of.density * made_of.specific_heat * step.prod()
-        outer = _outer(shape, step, spec.exposed)
-        links.append(Block(np.zeros(shape), heat, made_of.conductivity, emissivity, outer, box[0], size, shape, link.name))
+        links.append(
+            Block(np.zeros(shape), heat, made_of.conductivity, emissivity, spec.exposed, box[0], size, shape, link.name)
+        )
     return links
 
 
@@ -95,12 +107,10 @@ def _object(spec: TemperatureGridSpec, own: ReferenceObject, cells: tuple[int, i
     emissivity = 0.0 if spec.emissivity is None else own.emissivity
     if not is_grid:
         heat = own.volumetric_heat * own.volume
-        return Block(np.zeros(1), heat, own.conductivity, emissivity, np.array([own.area]), own.corner, own.size, None)
-    step = own.size / np.array(cells)
-    outer = _outer(cells, step, FACES)
-    return Block(
-        np.zeros(cells), own.volumetric_heat * step.prod(), own.conductivity, emissivity, outer, own.corner, own.size, cells
-    )
+        shape = own.corner, own.size, None
+        return Block(np.zeros(1), heat, own.conductivity, emissivity, (), *shape, area=own.area, volume=own.volume)
+    heat = own.volumetric_heat * (own.size / np.array(cells)).prod()
+    return Block(np.zeros(cells), heat, own.conductivity, emissivity, FACES, own.corner, own.size, cells)
 
 
 def _outer(count: tuple[int, ...], step: np.ndarray, faces: tuple[str, ...]) -> np.ndarray:
@@ -148,15 +158,13 @@ def _store(links, objects, found, before) -> dict[str, np.ndarray]:  # type: ign
 
 def _advance(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], objects: list[Block], dt: float) -> None:
     _touch(spec, found, links, objects, dt)
-    own = [block for i, block in enumerate(objects) if found.topology.links[i] < 0]
-    for block in [*links, *own]:
-        _lose(spec, block, dt)
-    for block in links:
-        made = _source(spec, block) * dt / block.capacity
-        block.above = block.above + 0.5 * made
-        block.above = _diffused(spec, block, dt) + 0.5 * made
-    for block in (block for block in own if block.count is not None):
-        block.above = _diffused(spec, block, dt)
+    films = [_film(spec, block) for block in links]
+    for block, film in zip(links, films, strict=True):
+        _lose(spec, block, dt, film)
+        block.above = _diffused(spec, block, dt, film, source=_source(spec, block) / block.capacity)
+    for block in (block for i, block in enumerate(objects) if found.topology.links[i] < 0):
+        _lose(spec, block, dt, np.zeros(3))
+        block.above = block.above if block.count is None else _diffused(spec, block, dt)
 
 
 def _advance_as_printed(
@@ -181,17 +189,36 @@ def _advance_as_printed(
         block.above = block.above + gains
         hot, around = block.above + spec.ambient + KELVIN, spec.ambient + KELVIN
         flux = block.emissivity * SIGMA * (hot**4 - around**4) + (spec.convection or 0.0) * block.above
-        block.above = block.above - dt * flux / heat * (block.outer > 0)
+        block.above = block.above - dt * flux / heat * (_outer(block.count, np.ones(3), spec.exposed) > 0)  # type: ignore[arg-type]
 
 
-def _lose(spec: TemperatureGridSpec, block: Block, dt: float) -> None:
-    def coefficient(above: np.ndarray) -> np.ndarray:
-        hot, around = above + spec.ambient + KELVIN, spec.ambient + KELVIN
-        return (spec.convection or 0.0) + block.emissivity * SIGMA * (hot + around) * (hot**2 + around**2)
+def _coefficient(spec: TemperatureGridSpec, block: Block, above: np.ndarray | float) -> np.ndarray:
+    hot, around = np.asarray(above) + spec.ambient + KELVIN, spec.ambient + KELVIN
+    return (spec.convection or 0.0) + block.emissivity * SIGMA * (hot + around) * (hot**2 + around**2)
 
-    rate = block.outer.reshape(block.above.shape) * dt / block.capacity
-    middle = block.above * np.exp(-0.5 * rate * coefficient(block.above))
-    block.above = block.above * np.exp(-rate * coefficient(middle))
+
+def _film(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
+    """Return u₀ by axis [W/(m²·K)]: what surfaces near ambient lose to it."""
+    total = float(_coefficient(spec, block, 0.0))
+    return np.array([total / (1 + total * block.resistance(axis)) for axis in range(3)])
+
+
+def _lose(spec: TemperatureGridSpec, block: Block, dt: float, film: np.ndarray) -> None:
+    """Take off what is lost beyond a film by axis."""
+    if block.count is None:
+        width = block.volume ** (1 / 3) if np.isfinite(block.volume) else 1.0
+        faces = [(np.array([block.area]), width / (6 * block.conductivity), 0.0)]
+    else:
+        across = [tuple(face for face in block.exposed if face[1] == axis) for axis in "xyz"]
+        faces = [(_outer(block.count, block.step, own), block.resistance(axis), film[axis]) for axis, own in enumerate(across)]
+    start = _coefficient(spec, block, block.above)
+    rate = sum(area * start / (1 + start * resistance) for area, resistance, _ in faces) / block.capacity
+    middle = block.above * np.exp(-0.5 * rate * dt)
+    rate = np.zeros_like(block.above)
+    for area, resistance, linear in faces:
+        own = _coefficient(spec, block, middle / (1 + start * resistance))
+        rate = rate + area * (own / (1 + own * resistance) - linear) / block.capacity
+    block.above = block.above * np.exp(-rate * dt)
 
 
 def _source(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
@@ -203,25 +230,44 @@ def _source(spec: TemperatureGridSpec, block: Block) -> np.ndarray:
     return np.full(block.count, (spec.source.power or 0.0) / block.above.size)  # type: ignore[arg-type]
 
 
-def _diffused(spec: TemperatureGridSpec, block: Block, dt: float, least: float = 0.0) -> np.ndarray:
-    """Return temperatures after conduction within a box."""
+def _diffused(
+    spec: TemperatureGridSpec,
+    block: Block,
+    dt: float,
+    film: np.ndarray | None = None,
+    source: np.ndarray | float = 0.0,
+    least: float = 0.0,
+) -> np.ndarray:
+    """Return temperatures after conduction within a box, linear losses and a constant source [K/s]."""
+    axes, size = block.operators(film), block.above.size
+    made = source * np.ones(block.count)  # type: ignore[arg-type]
     if spec.scheme == "exact":
-        return (expm(dt * block.laplacian()) @ block.above.ravel()).reshape(block.count)
+        x, y, z = axes
+        one = [np.eye(n) for n in block.count or ()]
+        whole = np.kron(np.kron(x, one[1]), one[2]) + np.kron(np.kron(one[0], y), one[2]) + np.kron(np.kron(one[0], one[1]), z)
+        # With a last row that is 0 and a last number that stays 1 the exponential takes the source along.
+        matrix = np.zeros((size + 1, size + 1))
+        matrix[:size, :size], matrix[:size, size] = -whole, made.ravel()
+        return (expm(dt * matrix) @ np.append(block.above, 1.0))[:size].reshape(block.count)
     alpha = block.conductivity * block.step.prod() / block.capacity
-    modes, squared = block.above, np.zeros(block.count)  # type: ignore[arg-type]
-    bases = []
-    for axis, n in enumerate(block.count or ()):
-        m, i = np.arange(n)[:, None], np.arange(n)[None, :]
-        basis = np.cos(np.pi * m * (i + 0.5) / n)
-        bases.append(basis / np.linalg.norm(basis, axis=1, keepdims=True))
-        modes = np.moveaxis(np.tensordot(bases[-1], modes, axes=(1, axis)), 0, axis)
-        shape = [1, 1, 1]
-        shape[axis] = n
-        squared = squared + (np.pi * np.arange(n) / block.size[axis]).reshape(shape) ** 2
-    squared = np.maximum(squared, least)
-    modes = modes * (np.exp(-alpha * dt * squared) if spec.scheme == "spectral" else 1 / (1 + alpha * dt * squared))
+    bases, decay = [], np.zeros(block.count)  # type: ignore[arg-type]
+    modes, made_of = block.above, made
+    for axis, matrix in enumerate(axes):
+        values, basis = np.linalg.eigh(matrix)
+        bases.append(basis)
+        modes, made_of = (np.moveaxis(np.tensordot(basis.T, part, (1, axis)), 0, axis) for part in (modes, made_of))
+        rate, shape = alpha / block.step[axis] ** 2, [1, 1, 1]
+        shape[axis] = -1
+        wave = np.pi * np.arange(len(values)) / len(values)
+        decay = decay + (values + rate * (wave**2 - 2 * (1 - np.cos(wave)))).reshape(shape)
+    decay = np.maximum(decay, alpha * least) * dt
+    if spec.scheme == "spectral":
+        safe = np.where(decay > 1e-9, decay, 1.0)
+        modes = modes * np.exp(-decay) + dt * made_of * np.where(decay > 1e-9, -np.expm1(-safe) / safe, 1.0 - 0.5 * decay)
+    else:
+        modes = (modes + dt * made_of) / (1 + decay)
     for axis, basis in enumerate(bases):
-        modes = np.moveaxis(np.tensordot(basis.T, modes, axes=(1, axis)), 0, axis)
+        modes = np.moveaxis(np.tensordot(basis, modes, (1, axis)), 0, axis)
     return modes
 
 
@@ -234,6 +280,7 @@ def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block
     gridded = {i: len(links) + n for n, i in enumerate(where.grids)} | {i: own for i, own in enumerate(where.links) if own >= 0}
     size = int(starts[-1]) + len(where.interfaces)
     heat, flow = np.zeros(size), np.zeros((size, size))
+    sides_of: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     above = np.zeros(size)
     for block, start in zip(blocks, starts, strict=False):
         heat[start : start + block.above.size] = block.capacity
@@ -256,6 +303,14 @@ def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block
             at = slice(int(starts[block]), int(starts[block]) + own.size)
             flow[at, node] += own
             flow[node, at] += own
+            place = (patch.pos, patch.normal) if block == b else (patch.object_pos, patch.object_normal)
+            sides_of.setdefault(block, []).append((own, _shares(blocks[block], area, *place)))
+    shown = np.ones(size)
+    for block, own_sides in sides_of.items():
+        film = _film(spec, blocks[block]) if block < len(links) else None
+        at = slice(int(starts[block]), int(starts[block]) + blocks[block].above.size)
+        shown[at] = _response(spec, blocks[block], dt, film, own_sides)
+    heat = heat / shown
     is_held = ~np.isfinite(heat)
     matrix = np.diag(np.where(is_held, 1.0, heat) + dt * flow.sum(axis=1)) - dt * flow
     right = np.where(is_held, 1.0, heat) * above
@@ -263,9 +318,41 @@ def _touch(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block
         matrix[i], right[i] = np.eye(size)[i], above[i]
     idle = np.flatnonzero((heat == 0) & (flow.sum(axis=1) == 0))
     matrix[idle, idle] = 1.0
-    after = np.linalg.solve(matrix, right)
+    after = above + (np.linalg.solve(matrix, right) - above) / shown
     for block, start in zip(blocks, starts, strict=False):
         block.above = after[start : start + block.above.size].reshape(block.above.shape)
+
+
+def _response(
+    spec: TemperatureGridSpec,
+    block: Block,
+    dt: float,
+    film: np.ndarray | None,
+    sides: list[tuple[np.ndarray, np.ndarray]],
+) -> np.ndarray:
+    """Return κ of each cell: the equation of `response`, sides being conductances and shares of cells."""
+    every = np.sum([shares / (shares @ shares) for _, shares in sides], axis=0)
+    assert block.count is not None
+    at_end = _diffused(spec, _like(block, every), dt, film).ravel()
+    evenly = _diffused(spec, _like(block, np.zeros(block.above.size)), dt, film, source=every.reshape(block.count) / dt).ravel()
+    whole, kept, average = (np.zeros(block.above.size) for _ in range(3))
+    for own, shares in sides:
+        left = shares @ at_end
+        whole, kept, average = whole + own, kept + own * left, average + own * (shares @ evenly - 0.5 * left)
+    safe = np.where(whole > 0, whole, 1.0)
+    return np.where(whole > 0, np.maximum(average / safe, kept / safe - block.capacity / (dt * safe)), 1.0)
+
+
+def _like(block: Block, above: np.ndarray) -> Block:
+    """Return a block at other temperatures."""
+    return replace(block, above=above.reshape(block.above.shape))
+
+
+def _shares(block: Block, area: float, pos: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return the shares of cells in a patch, in C order."""
+    half = 0.5 * np.sqrt(area) * np.sqrt(np.maximum(0.0, 1 - normal**2)) / block.step
+    axes = [_axis(c, h, n)[0] for c, h, n in zip((pos - block.corner) / block.step, half, block.count or (), strict=True)]
+    return np.einsum("i,j,k->ijk", *axes).ravel()
 
 
 def _area(spec: TemperatureGridSpec, found: ReferencePatches, links: list[Block], b: int, o: int, patch: Patch) -> float:

@@ -15,6 +15,7 @@ from tgdsl.geometry import planes
 from tgdsl.geometry.planes import Vec
 from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
+from tgdsl.sensors.temperature_grid.diffusion import Modes
 from tgdsl.sensors.temperature_grid.shares import Boxes
 
 
@@ -26,25 +27,35 @@ class Rows(NamedTuple):
         diffusivity: α = k/(ρc) (env, row) [m²/s].
         capacity: Heat capacity of a cell (env, row) [J/K].
         emissivity: ε (env, row) [1]; None if nothing radiates.
-        outer: Exposed area of each cell (row, x, y, z) [m²].
+        ends: How many exposed faces across an axis cells along it have (row, cell).
+        resistance: That between a cell and such a face (env, row) [m²·K/W]: see `losses`.
+        film: What the modes lose at such a face (row,) [W/(m²·K)]; None if nothing.
+        film_radiated: The share of it that is radiation (row,) [1].
         boxes: The boxes.
-        exponent: By what αΔt/Δ² is multiplied in the exponent (row, mode), of modes from 1 on.
-        cosines: Cosine modes along each axis (row, mode, cell).
+        modes: Modes along each axis.
     """
 
     conductivity: Tensor
     diffusivity: Tensor
     capacity: Tensor
     emissivity: Tensor | None
-    outer: Tensor
+    ends: Vec
+    resistance: Vec
+    film: Vec | None
+    film_radiated: Tensor | None
     boxes: Boxes
-    exponent: Vec
-    cosines: Vec
+    modes: tuple[Modes, Modes, Modes]
+
+    @property
+    def rates(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Diffusivity over the square of a cell's side, along each axis (env, row) [1/s]."""
+        x, y, z = (self.diffusivity / (step * step) for step in self.boxes.step)
+        return x, y, z
 
 
 def num_cells(rows: Rows) -> tuple[int, int, int]:
     """Return how many cells there are along each axis, padded."""
-    x, y, z = rows.outer.shape[1:]
+    x, y, z = (ends.shape[-1] for ends in rows.ends)
     return x, y, z
 
 
@@ -72,15 +83,25 @@ def rows_of(constants: Constants, patches: ContactPatch, is_smooth: bool) -> Row
     step = planes.vec(side / n for side, n in zip(sides, count, strict=True))
     boxes = Boxes(planes.split(corner), sides, step, count)
     name = "smooth" if is_smooth else "square"
+    ends = planes.vec(tables[f"ends_{axis}"] for axis in "xyz")
+    resistance = (d / (2.0 * k) * (1.0 - own.sum(dim=-1) / (3.0 * n)) for d, n, own in zip(step, count, ends, strict=True))
+    film, radiated = None, None
+    if "film" in constants:
+        # The modes of objects lose nothing.
+        film = planes.vec(pad(part, (0, len(grids))) for part in planes.split(constants["film"]))
+        radiated = pad(constants["film_radiated"], (0, len(grids)))
+    modes = [Modes(*(tables[f"{part}_{axis}"] for part in ("mode", "total", name))) for axis in "xyz"]
     return Rows(
         conductivity=k,
         diffusivity=k / heat,
         capacity=heat * tables["volume"],
         emissivity=emissivity,
-        outer=tables["outer"],
+        ends=ends,
+        resistance=planes.vec(resistance),
+        film=film,
+        film_radiated=radiated,
         boxes=boxes,
-        exponent=planes.vec(tables[f"{name}_{axis}"] for axis in "xyz"),
-        cosines=planes.vec(tables[f"cosine_{axis}"] for axis in "xyz"),
+        modes=(modes[0], modes[1], modes[2]),
     )
 
 
@@ -88,11 +109,16 @@ def is_there(rows: Rows) -> Tensor:
     """Return 1 for the cells that a row has (row, x, y, z)."""
     parts = []
     for axis, size in enumerate(num_cells(rows)):
-        place = torch.arange(size, device=rows.outer.device)
-        shape = [len(rows.outer), 1, 1, 1]
-        shape[1 + axis] = size
-        parts.append((place[None] < rows.boxes.count[axis][:, None]).to(rows.outer.dtype).reshape(shape))
-    return parts[0] * parts[1] * parts[2]
+        place = torch.arange(size, device=rows.ends[0].device)
+        parts.append((place[None] < rows.boxes.count[axis][:, None]).to(rows.ends[0].dtype))
+    return of_cells(parts[0], 0) * of_cells(parts[1], 1) * of_cells(parts[2], 2)
+
+
+def of_cells(values: Tensor, axis: int) -> Tensor:
+    """Return values of cells along an axis (row, cell), such that they multiply cells (row, x, y, z)."""
+    shape = [len(values), 1, 1, 1]
+    shape[1 + axis] = -1
+    return values.reshape(shape)
 
 
 def padded(cells: Tensor, num_cells: tuple[int, int, int]) -> Tensor:
@@ -107,11 +133,10 @@ def _beside(links: Tensor, objects: Tensor) -> Tensor:
 
 
 def _joined(links: Tensor, objects: Tensor) -> Tensor:
-    """Return two tables one below the other, each padded to the larger shape; a mode that is not there has eigenvalue 1."""
+    """Return two tables one below the other, each padded to the larger shape; what is not there is 0."""
     shape = [max(a, b) for a, b in zip(links.shape[1:], objects.shape[1:], strict=True)]
-    filling = 1.0 if links.ndim == 2 else 0.0
     parts = []
     for table in (links, objects):
         lack = [want - found for want, found in zip(shape, table.shape[1:], strict=True)]
-        parts.append(pad(table, [n for lacking in reversed(lack) for n in (0, lacking)], value=filling))
+        parts.append(pad(table, [n for lacking in reversed(lack) for n in (0, lacking)]))
     return torch.cat(parts)

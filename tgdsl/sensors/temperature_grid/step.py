@@ -1,4 +1,4 @@
-"""A step of all cells and bodies: contact, losses, sources and conduction, one after the other.
+"""A step of all cells and bodies: contact, radiation beyond its tangent, then conduction, linear losses and sources at once.
 
 Shapes: `env` environments, `row` links, then objects that are divided into cells; `node` objects of one temperature; `x`, `y`,
 `z` cells.
@@ -11,11 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tgdsl.geometry import planes
 from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid import conduction, diffusion, losses
 from tgdsl.sensors.temperature_grid.patch_flow import patch_area, patch_flow, resistance
-from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, padded
+from tgdsl.sensors.temperature_grid.response import shown
+from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, of_cells, padded
 from tgdsl.tensors.operations import Operation
 
 LARGEST_BLOCK = 2048
@@ -52,43 +54,67 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     gained, nodes_gained = torch.zeros_like(cells), torch.zeros_like(nodes)
     touched, inverse = torch.zeros_like(cells[:, :, 0, 0, 0]), _of_nodes(patches, _inverse(patches))
     if patches.topology.met:
-        flow = dt * patch_flow(patches, rows, constants)
+        conductance, responds = patch_flow(patches, rows, constants, _exponents(rows, dt))
+        flow = dt * conductance
+        left = shown(responds, flow, rows.capacity)
         sides = conduction.Sides(patches.sides, patches.topology.is_plain)
         # Sums, and no views of what the module overwrites: derivatives are taken of them later.
         before = cells + gained, nodes + nodes_gained
-        gained, nodes_gained = conduction.step(*before, rows.capacity, inverse, flow, sides)
+        gained, nodes_gained = conduction.step(*before, rows.capacity[..., None, None, None] / left, inverse, flow, sides)
+        gained = gained / left
         touched = gained.sum(dim=(-3, -2, -1)) * rows.capacity
     touched_nodes = _joules(nodes_gained, inverse)
     cooling, of_nodes = _surfaces(rows, patches, inverse, constants)
-    lost, share = losses.lost(cells + gained, cooling, dt)
-    nodes_lost, nodes_share = losses.lost(nodes + nodes_gained, of_nodes, dt)
-    gained, nodes_gained = gained + lost, nodes_gained + nodes_lost
-    source = torch.zeros_like(touched)
+    blown = radiated = source = torch.zeros_like(touched)
+    if cooling is not None:
+        lost, share = losses.lost(cells + gained, cooling, dt)
+        gained, glow = gained + lost, lost * share
+        radiated, blown = ((part.sum(dim=(-3, -2, -1)) * rows.capacity) for part in (glow, lost - glow))
+    blown_nodes = radiated_nodes = torch.zeros_like(nodes)
+    if of_nodes is not None:
+        nodes_lost, share = losses.lost(nodes + nodes_gained, of_nodes, dt)
+        nodes_gained, glow = nodes_gained + nodes_lost, nodes_lost * share
+        radiated_nodes, blown_nodes = _joules(glow, inverse), _joules(nodes_lost - glow, inverse)
+    spread, entered = diffused(cells + gained, rows, constants, dt)
+    gained = gained + spread
     if "source" in constants:
-        made = 0.5 * dt * _made(rows, patches, constants) / rows.capacity[..., None, None, None]
-        source = source + 2.0 * made.sum(dim=(-3, -2, -1)) * rows.capacity
-        gained = gained + made
-        gained = gained + diffused(cells + gained, rows, constants, dt) + made
-    else:
-        gained = gained + diffused(cells + gained, rows, constants, dt)
-    radiated = lost * share
-    got = (source, *(part.sum(dim=(-3, -2, -1)) * rows.capacity for part in (radiated, lost - radiated)), touched)
-    radiated_nodes = nodes_lost * nodes_share
-    own = (*(_joules(part, inverse) for part in (radiated_nodes, nodes_lost - radiated_nodes)), touched_nodes)
-    return Stepped(gained, nodes_gained, got, own)
+        made = dt * _made(rows, patches, constants) / rows.capacity[..., None, None, None]
+        source = source + made.sum(dim=(-3, -2, -1)) * rows.capacity
+        more = diffusion.warmed(made, _exponents(rows, dt), rows.modes, "is_semi_implicit" in constants)
+        gained, entered = gained + (made + more.gained), entered + more.entered
+    if rows.film_radiated is not None:
+        linear = entered * rows.capacity
+        radiated, blown = radiated + linear * rows.film_radiated, blown + linear * (1.0 - rows.film_radiated)
+    return Stepped(gained, nodes_gained, (source, radiated, blown, touched), (radiated_nodes, blown_nodes, touched_nodes))
 
 
 def _surfaces(
     rows: Rows, patches: ContactPatch, inverse: Tensor, constants: Constants
-) -> tuple[losses.Surfaces, losses.Surfaces]:
-    """Return what cells and nodes lose heat by."""
+) -> tuple[losses.Surfaces | None, losses.Surfaces | None]:
+    """Return what cells and nodes lose heat by beyond what modes do; None where that is nothing."""
     blown, around = constants.get("convection"), constants["ambient"]
-    area = rows.outer / rows.capacity[..., None, None, None]
-    own_area = _of_nodes(patches, patches.objects.area) * inverse
+    if rows.emissivity is None and blown is None:
+        return None, None
+    faces = []
+    for axis, (ends, inner, step) in enumerate(zip(rows.ends, rows.resistance, rows.boxes.step, strict=True)):
+        per_face = rows.diffusivity / (rows.conductivity * step)
+        area = per_face[..., None, None, None] * of_cells(ends, axis) * is_there(rows)
+        film = radiated = None
+        if rows.film is not None and rows.film_radiated is not None:
+            film, radiated = rows.film[axis][:, None, None, None], rows.film_radiated[:, None, None, None]
+        faces.append(losses.Face(area, inner[..., None, None, None], film, radiated))
+    volume = _of_nodes(patches, patches.objects.volume)
+    is_finite = torch.isfinite(volume)
+    width = planes.power(torch.where(is_finite, volume, 1.0), 1.0 / 3.0)
+    own = losses.Face(
+        _of_nodes(patches, patches.objects.area) * inverse, width / (6.0 * _of_nodes(patches, patches.objects.conductivity))
+    )
     if rows.emissivity is None:
-        return losses.Surfaces(area, None, blown, around), losses.Surfaces(own_area, None, blown, around)
+        # Without radiation the modes of links lose all.
+        cells = losses.Surfaces(tuple(faces), None, blown, around) if patches.topology.grids else None
+        return cells, losses.Surfaces((own,), None, blown, around)
     glowing = rows.emissivity[..., None, None, None], _of_nodes(patches, patches.objects.emissivity)
-    return losses.Surfaces(area, glowing[0], blown, around), losses.Surfaces(own_area, glowing[1], blown, around)
+    return losses.Surfaces(tuple(faces), glowing[0], blown, around), losses.Surfaces((own,), glowing[1], blown, around)
 
 
 def _of_nodes(patches: ContactPatch, of_objects: Tensor) -> Tensor:
@@ -103,16 +129,18 @@ def _made(rows: Rows, patches: ContactPatch, constants: Constants) -> Tensor:
     return torch.cat([made, made.new_zeros((more, *made.shape[1:]))]) if more else made
 
 
-def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> Tensor:
-    """Return what cells gain by conduction within their row [K]."""
-    rate = rows.diffusivity * dt
+def diffused(cells: Tensor, rows: Rows, constants: Constants, dt: Tensor) -> diffusion.Spread:
+    """Return what conduction within rows, and linear losses of their faces, do in a step [K]."""
     if "is_semi_implicit" in constants:
-        rates = torch.stack([rate / (side * side) for side in rows.boxes.size], dim=-1)
-        gained = diffusion.semi_implicit(cells, rates, rows.cosines)
-        there = is_there(rows)
-        return (gained - gained.sum(dim=(-3, -2, -1), keepdim=True) / there.sum(dim=(-3, -2, -1), keepdim=True)) * there
-    tables = zip(rows.boxes.step, rows.cosines, rows.exponent, strict=True)
-    return diffusion.spread(cells, [diffusion.along_axis(rate / (step * step), *own) for step, *own in tables])
+        return diffusion.semi_implicit(cells, _exponents(rows, dt), rows.modes)
+    return diffusion.spread(
+        cells, [diffusion.along_axis(dt * rate, own) for rate, own in zip(rows.rates, rows.modes, strict=True)]
+    )
+
+
+def _exponents(rows: Rows, dt: Tensor) -> Tensor:
+    """Return what modes decay by in a step (env, row, x, y, z) [1]."""
+    return diffusion.exponents(dt * torch.stack(rows.rates, dim=-1), rows.modes)
 
 
 def _inverse(patches: ContactPatch) -> Tensor:
@@ -137,11 +165,12 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     gained, nodes_gained, got, nodes_got = heat_step(
         [cells, nodes],
         [part.expand(len(cells), -1, -1) for part in (area, series, *patches.pos, *patches.normal)],
-        [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), rows.outer],
+        [*(constants[name] for name in ("conductivity", "volumetric_heat", "volume", "box")), *rows.ends],
+        _films(rows),
         constants.get("emissivity"),
         source,
-        [*rows.cosines, *rows.exponent],
-        [objects.volumetric_heat, objects.volume, objects.area, objects.emissivity],
+        [getattr(own, name) for name in ("vectors", "totals", "exponent") for own in rows.modes],
+        [objects.volumetric_heat, objects.volume, objects.area, objects.conductivity, objects.emissivity],
         [dt, constants["ambient"]],
         constants.get("convection"),
     )
@@ -149,6 +178,15 @@ def _by_kernel(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, 
     if source is not None:
         made = made + dt * constants["power"]
     return Stepped(gained, nodes_gained, (made, *got.unbind(1)), nodes_got.unbind(1))
+
+
+def _films(rows: Rows) -> list[Tensor]:
+    """Return resistances between cells and faces, then what modes lose there (row, 6); the share of that which is radiation."""
+    resistance = [part[0] for part in rows.resistance]
+    if rows.film is None or rows.film_radiated is None:
+        idle = torch.zeros_like(resistance[0])
+        return [torch.stack([*resistance, idle, idle, idle], dim=-1), idle]
+    return [torch.stack([*resistance, *rows.film], dim=-1), rows.film_radiated]
 
 
 def _inputs(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, constants: Constants, dt: Tensor) -> list[Tensor]:

@@ -40,6 +40,7 @@ def heat_step(
     state: list[Tensor],
     patches: list[Tensor],
     rows: list[Tensor],
+    films: list[Tensor],
     emissivity: Tensor | None,
     source: Tensor | None,
     modes: list[Tensor],
@@ -53,16 +54,18 @@ def heat_step(
         state: Temperatures of the cells (env, row, x, y, z) and of the nodes (env, node), above ambient [K].
         patches: Area, resistance in series, centre and normal: eight planes (env, row, side).
         rows: Conductivity, heat capacity by volume, and volume of a cell (row,); lowest corner, sides of a cell and number of
-            cells (row, 9); exposed areas (row, x, y, z).
+            cells (row, 9); numbers of exposed faces of cells along each axis (row, cell).
+        films: Resistance between a cell and its faces across each axis, and what modes lose there, (row, 6); the share of that
+            which is radiation (row,).
         emissivity: Of the rows; None if nothing radiates.
         source: What is made in each cell (row, x, y, z) [W].
-        modes: Cosines (row, mode, cell) of three axes, then what αΔt/Δ² is multiplied with (row, mode).
-        objects: Heat capacity by volume, volume, area and emissivity (env or 1, node).
+        modes: Modes (row, mode, cell) of three axes, then their sums, then what αΔt/Δ² is multiplied with, (row, mode) each.
+        objects: Heat capacity by volume, volume, area, conductivity and emissivity (env or 1, node).
         around: Δt and the temperature of the surroundings [°C], scalars.
         convection: Heat transfer coefficient; None if there is none.
     """
     wrapped = wrap_triton(step_kernel)
-    return launch(wrapped, state, patches, rows, emissivity, source, modes, objects, around, convection)
+    return launch(wrapped, state, patches, rows, films, emissivity, source, modes, objects, around, convection)
 
 
 def launch(
@@ -70,6 +73,7 @@ def launch(
     state: Sequence[Tensor],
     patches: Sequence[Tensor],
     rows: Sequence[Tensor],
+    films: Sequence[Tensor],
     emissivity: Tensor | None,
     source: Tensor | None,
     modes: Sequence[Tensor],
@@ -88,12 +92,13 @@ def launch(
     envs = max(1, FEWEST // size)
     strides = [(part.stride(0) if part.shape[0] > 1 else 0, part.stride(1)) for part in objects]
     run[(triton.cdiv(num_envs, envs),)](
-        cells, nodes, *(part.contiguous() for part in patches), *(part.contiguous() for part in rows),
+        cells, nodes, *(part.contiguous() for part in patches), *(part.contiguous() for part in (*rows, *films)),
         dt if emissivity is None else emissivity.contiguous(), dt if source is None else source.contiguous(),
         *(part.contiguous() for part in modes), *objects, *(number for pair in strides for number in pair),
         *around, dt if convection is None else convection, gained, nodes_gained, got, nodes_got, num_envs, num_rows,
         NX=x, NY=y, NZ=z, SIDES=num_sides, ENVS=envs, ROWS=block[0], SIDE=block[1], CELLS=block[2],
         RADIATES=emissivity is not None, BLOWS=convection is not None, HAS_SOURCE=source is not None,
+        FIRST=1 if emissivity is None and convection is None else 0,
         num_warps=max(1, min(8, envs * size // max(OF_WARP[0], min(OF_WARP[1], size)))),
     )  # fmt: skip
     return gained, nodes_gained, got, nodes_got
@@ -108,14 +113,14 @@ def block_of(num_rows: int, num_sides: int, num_cells: int) -> tuple[int, int, i
 @triton.jit
 def step_kernel(
     cells, nodes, area, series, pos_x, pos_y, pos_z, normal_x, normal_y, normal_z,
-    conductivity, heat, cell_volume, boxes, outer, emissivity, source,
-    cosine_x, cosine_y, cosine_z, exponent_x, exponent_y, exponent_z,
-    node_heat, node_volume, node_area, node_emissivity,
-    heat_env, heat_node, volume_env, volume_node, area_env, area_node, emissivity_env, emissivity_node,
+    conductivity, heat, cell_volume, boxes, ends_x, ends_y, ends_z, films, film_radiated, emissivity, source,
+    mode_x, mode_y, mode_z, total_x, total_y, total_z, exponent_x, exponent_y, exponent_z,
+    node_heat, node_volume, node_area, node_conductivity, node_emissivity,
+    heat_env, heat_node, volume_env, volume_node, area_env, area_node, own_k_env, own_k_node, emissivity_env, emissivity_node,
     dt, ambient, convection, gained, nodes_gained, got, nodes_got, num_envs, num_rows,
     NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, SIDES: tl.constexpr,
     ENVS: tl.constexpr, ROWS: tl.constexpr, SIDE: tl.constexpr, CELLS: tl.constexpr,
-    RADIATES: tl.constexpr, BLOWS: tl.constexpr, HAS_SOURCE: tl.constexpr,
+    RADIATES: tl.constexpr, BLOWS: tl.constexpr, HAS_SOURCE: tl.constexpr, FIRST: tl.constexpr,
 ):  # fmt: skip
     """Make a step of some environments."""
     env = tl.program_id(0).to(tl.int64) * ENVS + tl.arange(0, ENVS)
@@ -140,7 +145,7 @@ def step_kernel(
     size = tl.load(area + at_side, is_at_side, 0.0)
     pos = (_at(pos_x, at_side, is_at_side), _at(pos_y, at_side, is_at_side), _at(pos_z, at_side, is_at_side))
     normal = (_at(normal_x, at_side, is_at_side), _at(normal_y, at_side, is_at_side), _at(normal_z, at_side, is_at_side))
-    found = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
+    found, shares, squared = _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there)
     whole = tl.sum(found, axis=0)
     # What is no number stays none: minima and maxima lose it.
     rest = 0.0 * (size + pos[0] + pos[1] + pos[2] + normal[0] + normal[1] + normal[2])
@@ -152,49 +157,91 @@ def step_kernel(
     own_heat = tl.load(node_heat + env[:, None] * heat_env + side[None, :] * heat_node, is_node, 1.0)
     own_volume = tl.load(node_volume + env[:, None] * volume_env + side[None, :] * volume_node, is_node, 1.0)
     inverse = 1.0 / (own_heat * own_volume)
-    touched, own_touched = _touched(before, phi, capacity, inverse, flow, SIDES, ENVS, SIDE)
-    # Losses.
-    now, now_node = before + touched, phi + own_touched
+    # What cells show of the heat that they get: see `response`.
+    rate = k / by_volume * step
+    rates = (rate / (box_x[1] * box_x[1]), rate / (box_y[1] * box_y[1]), rate / (box_z[1] * box_z[1]))
+    waves, powers = (mode_x, mode_y, mode_z), (exponent_x, exponent_y, exponent_z)
+    sums = (total_x, total_y, total_z)
+    over = tl.where(size > 0, 1.0, 0.0) / tl.where(size > 0, squared, 1.0)
+    at_end, evenly = tl.zeros((ENVS, ROWS, SIDE), tl.float32), tl.zeros((ENVS, ROWS, SIDE), tl.float32)
+    if NX * NY * NZ <= UNROLLED:
+        for mode in tl.static_range(0, NX * NY * NZ):
+            at_end, evenly = _left(
+                at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
+            )
+    else:
+        for mode in range(NX * NY * NZ):
+            at_end, evenly = _left(
+                at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ
+            )
+    total = tl.sum(flow, axis=3)
+    is_met = total > 0
+    per_flow = 1.0 / tl.where(is_met, total, 1.0)
+    on_average = tl.sum(flow * (evenly - 0.5 * at_end)[None, :, :, :], axis=3)
+    kept = tl.sum(flow * at_end[None, :, :, :], axis=3) - capacity[None, None, :]
+    larger = 1.0 / tl.where(is_met, tl.maximum(on_average, kept) * per_flow, 1.0)
+    touched, own_touched = _touched(before, phi, capacity[None, None, :] * larger, inverse, flow, SIDES, ENVS, SIDE)
+    touched = touched * larger
+    # Losses beyond what modes lose.
     around, blowing = tl.load(ambient) + ZERO, 0.0
-    glow, own_glow = tl.zeros((ROWS,), tl.float32), tl.zeros((ENVS, SIDE), tl.float32)
-    if RADIATES:
-        glow = SIGMA * tl.load(emissivity + row, is_row, 0.0)
-        own_glow = SIGMA * tl.load(
-            node_emissivity + env[:, None] * emissivity_env + side[None, :] * emissivity_node, is_node, 0.0
-        )
     if BLOWS:
         blowing = tl.load(convection)
-    exposed = tl.load(outer + at, is_at, 0.0) * (step / capacity)[None, :]
-    own_exposed = tl.load(node_area + env[:, None] * area_env + side[None, :] * area_node, is_node, 0.0) * inverse * step
-    lost, share = _lost(now, exposed[:, None, :], glow[None, None, :], blowing, around)
-    own_lost, own_share = _lost(now_node, own_exposed, own_glow, blowing, around)
-    # Source and conduction.
+    lost, share = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((CELLS, ENVS, ROWS), tl.float32)
+    own_lost, own_share = tl.zeros((ENVS, SIDE), tl.float32), tl.zeros((ENVS, SIDE), tl.float32)
+    linear_share = tl.load(film_radiated + row, is_row, 0.0)
+    if RADIATES:
+        glow = SIGMA * tl.load(emissivity + row, is_row, 0.0)
+        face_x = _face(ends_x, films, row, place[0], NX, is_at, by_volume * box_x[1], is_row, 0)
+        face_y = _face(ends_y, films, row, place[1], NY, is_at, by_volume * box_y[1], is_row, 1)
+        face_z = _face(ends_z, films, row, place[2], NZ, is_at, by_volume * box_z[1], is_row, 2)
+        lost, share = _lost(
+            before + touched, face_x, face_y, face_z, linear_share[None, None, :], glow[None, None, :], blowing, around, step
+        )
+    if RADIATES or BLOWS:
+        own_glow = tl.zeros((ENVS, SIDE), tl.float32)
+        if RADIATES:
+            own_glow = SIGMA * tl.load(
+                node_emissivity + env[:, None] * emissivity_env + side[None, :] * emissivity_node, is_node, 0.0
+            )
+        own_exposed = tl.load(node_area + env[:, None] * area_env + side[None, :] * area_node, is_node, 0.0) * inverse
+        own_k = tl.load(node_conductivity + env[:, None] * own_k_env + side[None, :] * own_k_node, is_node, 1.0)
+        width = tl.exp(tl.log(tl.where(inverse > 0, own_volume, 1.0)) * (1.0 / 3.0))
+        body = (own_exposed, width / (6.0 * own_k), 0.0)
+        own_lost, own_share = _lost_by_one(phi + own_touched, body, own_glow, blowing, around, step)
+    # Conduction, with linear losses and a source.
     made = tl.zeros((CELLS, ROWS), tl.float32)
     if HAS_SOURCE:
-        made = tl.load(source + at, is_at, 0.0) * (0.5 * step / capacity)[None, :]
-    rate = k / by_volume * step
-    gain = touched + lost + made[:, None, :]
+        made = tl.load(source + at, is_at, 0.0) * (step / capacity)[None, :]
+    gain = touched + lost
     apart = before + gain
     weight = there.to(tl.float32)
     weight = weight / tl.sum(weight, axis=0)[None, :]
     weight = tl.where(is_row[None, :], weight, 0.0)
-    apart -= tl.sum(apart * weight[:, None, :], axis=0)[None, :, :]
-    spread = tl.zeros((CELLS, ENVS, ROWS), tl.float32)
-    rates = (rate / (box_x[1] * box_x[1]), rate / (box_y[1] * box_y[1]), rate / (box_z[1] * box_z[1]))
-    waves, powers = (cosine_x, cosine_y, cosine_z), (exponent_x, exponent_y, exponent_z)
+    mean = tl.sum(apart * weight[:, None, :], axis=0)
+    apart -= mean[None, :, :]
+    spread, entered = tl.zeros((CELLS, ENVS, ROWS), tl.float32), tl.zeros((ENVS, ROWS), tl.float32)
     if NX * NY * NZ <= UNROLLED:
-        for mode in tl.static_range(1, NX * NY * NZ):
-            spread = _with_mode(spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ)
+        for mode in tl.static_range(FIRST, NX * NY * NZ):
+            spread, entered = _with_mode(
+                spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at, NX, NY, NZ,
+                HAS_SOURCE,
+            )  # fmt: skip
     else:
-        for mode in range(1, NX * NY * NZ):
-            spread = _with_mode(spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX, NY, NZ)
-    spread -= tl.sum(spread * weight[:, None, :], axis=0)[None, :, :] * there.to(tl.float32)[:, None, :]
-    tl.store(gained + at_cell, gain + spread + made[:, None, :], is_at_cell)
+        for mode in range(FIRST, NX * NY * NZ):
+            spread, entered = _with_mode(
+                spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at, NX, NY, NZ,
+                HAS_SOURCE,
+            )  # fmt: skip
+    excess = tl.sum(spread, axis=0) - entered
+    spread -= excess[None, :, :] * weight[:, None, :]
+    tl.store(gained + at_cell, gain + (spread + made[:, None, :]), is_at_cell)
     tl.store(nodes_gained + at_node, own_touched + own_lost, is_node)
     # Accounts.
     at_row, is_at_row = env[:, None] * (3 * num_rows) + row[None, :], is_env[:, None] & is_row[None, :]
-    tl.store(got + at_row, tl.sum(lost * share, axis=0) * capacity[None, :], is_at_row)
-    tl.store(got + at_row + num_rows, tl.sum(lost * (1.0 - share), axis=0) * capacity[None, :], is_at_row)
+    radiated = tl.sum(lost * share, axis=0) + entered * linear_share[None, :]
+    blown = tl.sum(lost * (1.0 - share), axis=0) + entered * (1.0 - linear_share)[None, :]
+    tl.store(got + at_row, radiated * capacity[None, :], is_at_row)
+    tl.store(got + at_row + num_rows, blown * capacity[None, :], is_at_row)
     tl.store(got + at_row + 2 * num_rows, tl.sum(touched, axis=0) * capacity[None, :], is_at_row)
     is_finite = inverse > 0
     own_capacity = tl.where(is_finite, 1.0, 0.0) / tl.where(is_finite, inverse, 1.0)
@@ -224,30 +271,74 @@ def _is_there(box, place):
 
 
 @triton.jit
-def _with_mode(
-    spread, apart, mode, rates, waves, powers, place, row, is_row, is_at, NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr
-):
-    """Return `spread` (C, E, R) with what a mode of `apart` adds in a step."""
+def _left(
+    at_end, evenly, shares, over, mode, rates, waves, powers, place, row, is_row, is_at,
+    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr,
+):  # fmt: skip
+    """Return r_E and r_φ of each side (E, R, S) with what a mode has of them: see `response`."""
     x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
     wave = _wave(waves[0], row, x, place[0], NX, is_at)
     wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
-    power = rates[0] * _power(powers[0], row, x, NX, is_row)
-    power += rates[1] * _power(powers[1], row, y, NY, is_row)
-    power += rates[2] * _power(powers[2], row, z, NZ, is_row)
-    along = tl.sum(apart * wave[:, None, :], axis=0) * _expm1(-power)[None, :]
-    return spread + along[None, :, :] * wave[:, None, :]
+    power = rates[0] * _of_mode(powers[0], row, x, NX, is_row)
+    power += rates[1] * _of_mode(powers[1], row, y, NY, is_row)
+    power += rates[2] * _of_mode(powers[2], row, z, NZ, is_row)
+    own = tl.sum(shares * wave[:, None, :, None], axis=0)
+    every = tl.sum(own * over, axis=2)
+    decay = _expm1(-power)
+    at_end += own * (every * (1.0 + decay)[None, :])[:, :, None]
+    return at_end, evenly + own * (every * (1.0 + _delayed(power, decay))[None, :])[:, :, None]
 
 
 @triton.jit
-def _wave(cosines, row, mode, place, NUM: tl.constexpr, is_at):
+def _with_mode(
+    spread, entered, apart, mean, made, mode, rates, waves, sums, powers, place, row, is_row, is_at,
+    NX: tl.constexpr, NY: tl.constexpr, NZ: tl.constexpr, HAS_SOURCE: tl.constexpr,
+):  # fmt: skip
+    """Return `spread` (C, E, R) with what a mode adds in a step, and `entered` (E, R) with what of it came through the faces.
+
+    Of the mode's part of the cells e^(−x) − 1, of that of a source φ₁(−x) − 1.
+    """
+    x, y, z = mode // (NY * NZ), (mode // NZ) % NY, mode % NZ
+    wave = _wave(waves[0], row, x, place[0], NX, is_at)
+    wave *= _wave(waves[1], row, y, place[1], NY, is_at) * _wave(waves[2], row, z, place[2], NZ, is_at)
+    total = (
+        _of_mode(sums[0], row, x, NX, is_row) * _of_mode(sums[1], row, y, NY, is_row) * _of_mode(sums[2], row, z, NZ, is_row)
+    )
+    power = rates[0] * _of_mode(powers[0], row, x, NX, is_row)
+    power += rates[1] * _of_mode(powers[1], row, y, NY, is_row)
+    power += rates[2] * _of_mode(powers[2], row, z, NZ, is_row)
+    decay = _expm1(-power)
+    along = (tl.sum(apart * wave[:, None, :], axis=0) + mean * total[None, :]) * decay[None, :]
+    if HAS_SOURCE:
+        along += (_delayed(power, decay) * tl.sum(made * wave, axis=0))[None, :]
+    return spread + along[None, :, :] * wave[:, None, :], entered + along * total[None, :]
+
+
+@triton.jit
+def _delayed(power, decay):
+    """Return φ₁(x) − 1 = (1 − e^(−x))/x − 1 from x and e^(−x) − 1."""
+    is_any = power > 1e-3
+    return tl.where(is_any, -decay / tl.where(is_any, power, 1.0) - 1.0, -0.5 * power * (1.0 - power * (1.0 / 3.0)))
+
+
+@triton.jit
+def _wave(vectors, row, mode, place, NUM: tl.constexpr, is_at):
     """Return a mode along an axis (C, R)."""
-    return tl.load(cosines + (row[None, :] * NUM + mode) * NUM + place[:, None], is_at, 0.0)
+    return tl.load(vectors + (row[None, :] * NUM + mode) * NUM + place[:, None], is_at, 0.0)
 
 
 @triton.jit
-def _power(exponent, row, mode, NUM: tl.constexpr, is_row):
-    """Return what αΔt/Δ² of a mode is multiplied with (R): 0 of the mean."""
-    return tl.load(exponent + row * (NUM - 1) + mode - 1, is_row & (mode > 0), 0.0)
+def _of_mode(values, row, mode, NUM: tl.constexpr, is_row):
+    """Return a number of a mode along an axis (R)."""
+    return tl.load(values + row * NUM + mode, is_row, 0.0)
+
+
+@triton.jit
+def _face(ends, films, row, place, NUM: tl.constexpr, is_at, heat, is_row, AXIS: tl.constexpr):
+    """Return exposed area over heat capacity (C, 1, R), resistance, and what modes lose (1, 1, R), of faces across an axis."""
+    exposed = tl.load(ends + row[None, :] * NUM + place[:, None], is_at, 0.0) / heat[None, :]
+    resistance, film = tl.load(films + 6 * row + AXIS, is_row, 0.0), tl.load(films + 6 * row + 3 + AXIS, is_row, 0.0)
+    return exposed[:, None, :], resistance[None, None, :], film[None, None, :]
 
 
 @triton.jit
@@ -261,21 +352,54 @@ def _expm1(x):
 
 
 @triton.jit
-def _lost(above, rate, glow, blowing, around):
+def _lost(above, face_x, face_y, face_z, linear_share, glow, blowing, around, step):
     """Return what temperatures above the surroundings gain, and the share of it that is radiation: see `losses`."""
+    total = _radiated(above, glow, around) + blowing
+    x, y, z = 1.0 / (1.0 + total * face_x[1]), 1.0 / (1.0 + total * face_y[1]), 1.0 / (1.0 + total * face_z[1])
+    middle = above * tl.exp(-0.5 * step * total * (face_x[0] * x + face_y[0] * y + face_z[0] * z))
+    rate, glowing = _through(middle * x, face_x, linear_share, glow, blowing, around)
+    more, more_glowing = _through(middle * y, face_y, linear_share, glow, blowing, around)
+    rate, glowing = rate + more, glowing + more_glowing
+    more, more_glowing = _through(middle * z, face_z, linear_share, glow, blowing, around)
+    return _decayed(above, rate + more, glowing + more_glowing, step)
+
+
+@triton.jit
+def _lost_by_one(above, face, glow, blowing, around, step):
+    """Return the same of bodies with one face."""
+    total = _radiated(above, glow, around) + blowing
+    part = 1.0 / (1.0 + total * face[1])
+    middle = above * tl.exp(-0.5 * step * total * (face[0] * part))
+    rate, glowing = _through(middle * part, face, 0.0, glow, blowing, around)
+    return _decayed(above, rate, glowing, step)
+
+
+@triton.jit
+def _decayed(above, rate, glowing, step):
+    """Return what temperatures gain at a rate, and the share of it that is radiation."""
+    is_any = rate != 0
+    return above * _expm1(-step * rate), tl.where(is_any, glowing, 0.0) / tl.where(is_any, rate, 1.0)
+
+
+@triton.jit
+def _through(surface, face, linear_share, glow, blowing, around):
+    """Return the rate at which faces across an axis lose heat beyond what modes lose, and what of it is radiation [1/s]."""
+    own_glow = _radiated(surface, glow, around)
+    own = own_glow + blowing
+    open_part = 1.0 / (1.0 + own * face[1])
+    return face[0] * (own * open_part - face[2]), face[0] * (own_glow * open_part - face[2] * linear_share)
+
+
+@triton.jit
+def _radiated(above, glow, around):
+    """Return the heat transfer coefficient of radiation."""
     hot = above + around
-    radiated = glow * (hot + around) * (hot * hot + around * around)
-    middle = above * tl.exp(-0.5 * rate * (radiated + blowing))
-    hot = middle + around
-    radiated = glow * (hot + around) * (hot * hot + around * around)
-    total = radiated + blowing
-    is_any = total > 0
-    return above * _expm1(-rate * total), tl.where(is_any, radiated, 0.0) / tl.where(is_any, total, 1.0)
+    return glow * (hot + around) * (hot * hot + around * around)
 
 
 @triton.jit
 def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, there):
-    """Return the conductance between each side and each cell (C, E, R, S) [W/K]: see `shares`."""
+    """Return conductances between sides and cells [W/K] and shares of cells (C, E, R, S), and Σ w² (E, R, S): see `shares`."""
     is_any = size > 0
     safe = tl.where(is_any, size, 1e-6)
     edge = 0.5 * tl.sqrt(safe)
@@ -294,7 +418,9 @@ def _conductances(size, pos, normal, k, volume, box_x, box_y, box_z, place, ther
     spot = tl.where(is_any, 2.0 * own * radius / (1.0 + 0.5 * rho) * fitted, 0.0)
     of_x, of_y, of_z = (spot * x[4])[None, :, :, :], (spot * y[4])[None, :, :, :], (spot * z[4])[None, :, :, :]
     found = x[0] * (y[0] * (cover[None, :, :, :] * z[0] + of_z * z[1]) + of_y * y[1] * z[0]) + of_x * x[1] * y[0] * z[0]
-    return tl.where(there[:, None, :, None], found, 0.0)
+    is_there = there[:, None, :, None]
+    shares = tl.where(is_there, x[0] * y[0] * z[0], 0.0)
+    return tl.where(is_there, found, 0.0), shares, x[2] * y[2] * z[2]
 
 
 @triton.jit
@@ -344,10 +470,9 @@ def _below(offset):
 
 @triton.jit
 def _touched(cells, nodes, capacity, inverse, flow, SIDES: tl.constexpr, ENVS: tl.constexpr, SIDE: tl.constexpr):
-    """Return what cells (C, E, R) and nodes (E, S) gain by contact [K]: see `conduction`."""
-    held = capacity[None, None, :]
-    over = 1.0 / (held + tl.sum(flow, axis=3))
-    weight = flow * (held * over)[:, :, :, None]
+    """Return what cells of some capacity (C, E, R) and nodes (E, S) gain by contact [K]: see `conduction`."""
+    over = 1.0 / (capacity + tl.sum(flow, axis=3))
+    weight = flow * (capacity * over)[:, :, :, None]
     pull = tl.sum(tl.sum(weight, axis=0), axis=1)
     right = nodes + inverse * tl.sum(tl.sum(weight * cells[:, :, :, None], axis=0), axis=1)
     if SIDES == 1:
