@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
@@ -62,7 +63,7 @@ class NewBody:
     conaffinity: int = 1
 
     @property
-    def geom(self) -> dict[str, tuple[float, ...]]:
+    def geom(self) -> dict[str, tuple[Any, ...]]:
         """Fields of its placeholder, which its geoms inherit: MuJoCo's own values, not those of the scene's `<default>`."""
         return PLAIN | {"contype": (self.contype,), "conaffinity": (self.conaffinity,), "group": (self.group,)}
 

@@ -192,7 +192,7 @@ def _advance_as_printed(
         block.above = block.above - dt * flux / heat * (_outer(block.count, np.ones(3), spec.exposed) > 0)  # type: ignore[arg-type]
 
 
-def _coefficient(spec: TemperatureGridSpec, block: Block, above: np.ndarray | float) -> np.ndarray:
+def _coefficient(spec: TemperatureGridSpec, block: Block, above: np.ndarray | float) -> np.ndarray | float:
     hot, around = np.asarray(above) + spec.ambient + KELVIN, spec.ambient + KELVIN
     return (spec.convection or 0.0) + block.emissivity * SIGMA * (hot + around) * (hot**2 + around**2)
 
