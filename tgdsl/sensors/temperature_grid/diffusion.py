@@ -181,7 +181,7 @@ def exponents(rates: Float[Tensor, "env row 3"], modes: tuple[Modes, ...]) -> Ce
     return outer([rates[..., axis, None] * own.exponent for axis, own in enumerate(modes)], torch.add)
 
 
-def warmed(source: Cells, x: Cells, modes: tuple[Modes, ...], is_implicit: bool) -> Spread:
+def warmed(source: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...], is_implicit: bool) -> Spread:
     """Return what the cells gain beyond a constant source's Δt s, as it spreads while it is made: (φ₁ − 1) Δt s.
 
     Args:
@@ -196,7 +196,7 @@ def warmed(source: Cells, x: Cells, modes: tuple[Modes, ...], is_implicit: bool)
     return by_modes(source, torch.where(x > 1e-3, -torch.expm1(-safe) / safe - 1.0, series), modes)
 
 
-def semi_implicit(cells: Cells, x: Cells, modes: tuple[Modes, ...]) -> Spread:
+def semi_implicit(cells: Cells, x: Float[Tensor, "#env row x y z"], modes: tuple[Modes, ...]) -> Spread:
     """Return what a step does that divides each mode by 1 + x."""
     return by_modes(cells, -x / (1.0 + x), modes)
 

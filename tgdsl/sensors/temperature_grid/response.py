@@ -42,7 +42,7 @@ class Response(NamedTuple):
 def response(
     parts: tuple[Axis, Axis, Axis],
     is_any: Tensor,
-    x: Float[Tensor, "env row x y z"],
+    x: Float[Tensor, "#env row x y z"],
     modes: tuple[Modes, ...],
     is_implicit: bool,
 ) -> Response:
