@@ -13,6 +13,8 @@ from tiny_tasks import tiny_env, write_task
 from tgdsl.errors import SimulationError, SpecError
 from tgdsl.rl.env import TouchEnv
 from tgdsl.rl.load import load_task
+from tgdsl.rl.playing.actions import ZeroActor
+from tgdsl.rl.playing.evaluation import evaluate
 from tgdsl.rl.schema import task_schema
 from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate
 
@@ -246,3 +248,20 @@ def test_editors_see_mistakes(tmp_path, more):
     document = YAML(typ="safe").load(write_task(tmp_path)) | YAML(typ="safe").load(more)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(document, task_schema())
+
+
+def test_a_task_without_sensors_is_evaluated(tmp_path):
+    """It looks at none unless it says so, and its policy may feel nothing: there are joints and an object all the same."""
+    task = write_task(tmp_path)
+    (tmp_path / "blind.py").write_text(
+        "from tgdsl.rl.tasks.in_palm_rotate import InPalmRotate\n\n\n"
+        "class Blind(InPalmRotate):\n"
+        "    senses = ()\n\n"
+        "    def reward(self, now, is_over):\n"
+        "        return {'spin': self.rate}\n"
+    )
+    task.write_text(task.read_text().replace("in_palm_rotate", "blind.py:Blind"))
+    env = TouchEnv(task, 2, overrides={"touch": "none"})
+    assert env.reset()["proprio"].shape[0] == 2 and "tactile_sensors" not in env.groups
+    found = evaluate(env, ZeroActor(env), 2)
+    assert found.gait.coasting is None and found.gait.link_forces == {} and found.gait.max_speed > 0

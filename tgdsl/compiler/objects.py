@@ -68,9 +68,11 @@ def _new_bodies(loaded: Loaded, scene: Model) -> tuple[NewBody, ...]:
             loaded.problems.append(loaded.problem(("objects", name), what, f"`body: {name}` gives that one these geoms"))
         elif target.body is None:
             pos, quat = target.pos or (0.0, 0.0, 0.0), target.quat or (1.0, 0.0, 0.0, 0.0)
-            own = NewBody(name, pos, quat, target.joint != "fixed", group, contype, conaffinity)
-            given = {bits: value for bits in ("contype", "conaffinity") if (value := getattr(target, bits)) is not None}
-            new.append(replace(own, **given))
+            bits = [
+                default if own is None else own
+                for own, default in ((target.contype, contype), (target.conaffinity, conaffinity))
+            ]
+            new.append(NewBody(name, pos, quat, target.joint != "fixed", group, *bits))
     return tuple(new)
 
 

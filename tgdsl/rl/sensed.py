@@ -138,11 +138,11 @@ def compile_sensed(
     """
     spec, file, document = loaded.spec, loaded.folder / loaded.spec.document, sensors_document(loaded)
     kinds = _kinds(document)
-    looked_at = [(kind, ("task",)) for kind in (loaded.task.senses if only is None else only)]
-    felt_kinds = [SENSED[name][0] for name in dict.fromkeys(each.type for each in feels)] if feels is not None else []
-    felt_kinds = [SENSED[spec.touch][0]] if feels is None and only is None and spec.touch != "none" else felt_kinds
-    named = _sensors_of(loaded, kinds, [*looked_at, *((kind, ("touch",)) for kind in felt_kinds)])
-    by_kind = {kind: named[kind] for kind, _ in looked_at}
+    senses = loaded.task.senses if only is None else only
+    of_policy = [] if only is not None or spec.touch == "none" else [spec.touch]
+    types = of_policy if feels is None else [each.type for each in feels]
+    sensor = _sensors_of(loaded, kinds, {"task": senses, "touch": [SENSED[type_][0] for type_ in types]})
+    by_kind = {kind: sensor[kind] for kind in senses}
     overrides: dict[str, Any] = {"observations": {}}
     if spec.resolution is not None:
         overrides["resolution"] = spec.resolution
@@ -152,11 +152,11 @@ def compile_sensed(
         overrides["robot.collision"] = spec.physics.collision
     felt, felts = None, {}
     if feels is not None:
-        felts = {each: named[SENSED[each.type][0]] for each in feels}
+        felts = {each: sensor[SENSED[each.type][0]] for each in feels}
         overrides |= _overrides(loaded, felts)
-    elif spec.touch != "none" and only is None:
+    elif of_policy:
         kind, observed = SENSED[spec.touch]
-        felt = named[kind]
+        felt = sensor[kind]
         overrides |= {f"sensors.{felt}.links": spec.placement, f"sensors.{felt}.noise": spec.noise}
         overrides["observations"] = {GROUP: [{"type": observed, "of": felt}]}
     overrides["observations"] = {**overrides["observations"], **(also or {})}
@@ -165,11 +165,10 @@ def compile_sensed(
         own = document.spec.sensors[contact].outputs  # type: ignore[attr-defined]
         wanted = ("force", "normal_force") if loaded.task.wants_normal_force else ("force",)
         overrides[f"sensors.{contact}.outputs"] = list(dict.fromkeys((*own, *wanted)))
-    kept = {*by_kind.values(), *felts.values(), *([felt] if felt else [])}
-    touch = compile_document(file, sensors=kept, overrides=overrides, device=device, progress=progress)
+    touch = compile_document(file, sensors=set(sensor.values()) or None, overrides=overrides, device=device, progress=progress)
     body = document.spec.objects[spec.object].body_of(spec.object)
     channels = next((own.channels for own in touch.outputs if own.name == contact), ())
-    groups = {each.group: _source(loaded, touch, each, sensor) for each, sensor in felts.items()}
+    groups = {each.group: _source(loaded, touch, each, name) for each, name in felts.items()}
     if felt:
         groups[GROUP] = Source(GROUP, None, _layout(touch, felt))
     return Sensed(touch, felt, contact, channels, by_kind.get("surface_distance"), body, by_kind, groups)
@@ -237,7 +236,7 @@ def check_felt(loaded: LoadedTask, feels: Sequence[Felt]) -> None:
     Raises:
         SpecError: If not, or all mistakes of the sensors' document.
     """
-    _sensors_of(loaded, _kinds(sensors_document(loaded)), [(SENSED[each.type][0], ("touch",)) for each in feels])
+    _sensors_of(loaded, _kinds(sensors_document(loaded)), {"touch": [SENSED[each.type][0] for each in feels]})
 
 
 def types_of(loaded: LoadedTask) -> list[str]:
@@ -305,26 +304,26 @@ def _kinds(document: Loaded) -> dict[str, str]:
     return {name: sensor.kind for name, sensor in document.spec.sensors.items()}  # type: ignore[attr-defined]
 
 
-def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Sequence[tuple[str, tuple[str, ...]]]) -> dict[str, str]:
-    """Return the document's only sensor of each kind that is wanted.
+def _sensors_of(loaded: LoadedTask, kinds: Mapping[str, str], wanted: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Return the document's only sensor of each kind that is wanted, by kind.
 
     Args:
         loaded: The task's document.
         kinds: Kind of each sensor.
-        wanted: Kinds, each with the place in the task's document that wants it.
+        wanted: Kinds, by the key of the task's document that wants them.
 
     Raises:
         SpecError: All kinds of which there is none, or several.
     """
-    named, problems = {}, []
-    for kind, place in wanted:
-        found = [name for name, own in kinds.items() if own == kind]
-        if len(found) == 1:
-            named[kind] = found[0]
+    sensor, problems = {}, []
+    for key, kind in dict.fromkeys((key, kind) for key, some in wanted.items() for kind in some):
+        names = [name for name, own in kinds.items() if own == kind]
+        if len(names) == 1:
+            sensor[kind] = names[0]
             continue
-        which = f"the sensors {listed(found)}" if found else "no sensor"
+        which = f"the sensors {listed(names)}" if names else "no sensor"
         what = f'"{loaded.spec.document}" has {which} of kind "{kind}", expected one'
-        problems += loaded.error(place, what).problems
+        problems += loaded.error((key,), what).problems
     if problems:
         raise SpecError(problems)
-    return named
+    return sensor

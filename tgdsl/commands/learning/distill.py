@@ -270,7 +270,8 @@ class _Part:
             total = command.iterations or loaded.spec.distill.iterations
             limit = float("inf") if command.minutes is None else 60.0 * command.minutes
             print(f"{len(self._keys)} students in {len(distiller.rollouts)} stacks, {self.envs} environments: {folder.path}")
-            bar = ProgressBar(total if limit == float("inf") else None, distiller.iteration, env.task.score_unit)
+            shown = total if command.minutes is None or command.iterations else None  # else time ends the run
+            bar = ProgressBar(shown, distiller.iteration, env.task.score_unit)
             try:
                 run.learn(total, limit, bar.show)
             finally:

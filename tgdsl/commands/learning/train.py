@@ -138,11 +138,8 @@ class Train:
                 print(f"TensorBoard is not installed: the curve is in {folder.curve} alone")
             total = self.iterations or loaded.spec.train.iterations
             limit = float("inf") if self.minutes is None else 60.0 * self.minutes
-            bar = (
-                ProgressBar(total if limit == float("inf") else None, learner.iteration, env.task.score_unit)
-                if ranks.is_first
-                else None
-            )
+            shown = total if self.minutes is None or self.iterations else None  # else time ends the run
+            bar = ProgressBar(shown, learner.iteration, env.task.score_unit) if ranks.is_first else None
             try:
                 run.learn(total, limit, bar.show if bar is not None else None)
             finally:

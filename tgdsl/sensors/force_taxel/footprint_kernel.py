@@ -309,8 +309,7 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
         place, inward = _taxel(pos, taxel)
-        arm = _arm(place, point)
-        facing = dot(inward, normal)
+        arm, facing = _arm(place, point), dot(inward, normal)
         weight = tl.load(weights + taxel)[:, None]
         near, part = _pull(arm, facing, weight, slope, top, inverse)
         nearest = tl.maximum(nearest, near, propagate_nan=tl.PropagateNan.ALL)
@@ -369,9 +368,8 @@ def _highest(pos, num_own, point, normal, slope, inverse):
     """Return the largest exponent of 2 among the taxels in reach on the contact's side, (env, contact)."""
     top = tl.full(point[0].shape, float("-inf"), tl.float32)
     for taxel in range(num_own):
-        at = pos + 6 * taxel
-        arm = _arm((tl.load(at), tl.load(at + 1), tl.load(at + 2)), point)
-        facing = dot((tl.load(at + 3), tl.load(at + 4), tl.load(at + 5)), normal)
+        place, inward = _taxel(pos, taxel)
+        arm, facing = _arm(place, point), dot(inward, normal)
         is_reached = (inverse * inverse * dot(arm, arm) < 1.0) & (facing > 0.0)
         top = tl.maximum(top, tl.where(is_reached, dot(slope, arm), float("-inf")))
     return tl.where(top == float("-inf"), 0.0, top)

@@ -68,7 +68,9 @@ def response(
     return Response(at_end, evenly - 0.5 * at_end)
 
 
-def shown(found: Response, flow: Float[Tensor, "env row side x y z"], capacity: Tensor) -> Float[Tensor, "env row x y z"]:
+def fraction_left(
+    found: Response, flow: Float[Tensor, "env row side x y z"], capacity: Tensor
+) -> Float[Tensor, "env row x y z"]:
     """Return κ of each cell; 1 where it touches nothing.
 
     Args:

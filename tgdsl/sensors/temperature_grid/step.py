@@ -16,7 +16,7 @@ from tgdsl.quantities.patches import ContactPatch
 from tgdsl.sensors.base import Constants
 from tgdsl.sensors.temperature_grid import conduction, diffusion, losses
 from tgdsl.sensors.temperature_grid.patch_flow import patch_area, patch_flow, resistance
-from tgdsl.sensors.temperature_grid.response import shown
+from tgdsl.sensors.temperature_grid.response import fraction_left
 from tgdsl.sensors.temperature_grid.rows import Rows, is_there, num_cells, of_cells, padded
 from tgdsl.tensors.operations import Operation
 
@@ -56,7 +56,7 @@ def step(cells: Tensor, nodes: Tensor, rows: Rows, patches: ContactPatch, consta
     if patches.topology.met:
         conductance, responds = patch_flow(patches, rows, constants, _exponents(rows, dt))
         flow = dt * conductance
-        left = shown(responds, flow, rows.capacity)
+        left = fraction_left(responds, flow, rows.capacity)
         sides = conduction.Sides(patches.sides, patches.topology.is_plain)
         # Sums, and no views of what the module overwrites: derivatives are taken of them later.
         before = cells + gained, nodes + nodes_gained
