@@ -3,9 +3,11 @@
 import pytest
 from resting_hands import resting
 
+from tgdsl.runtime.xhand1 import driver
 from tgdsl.runtime.xhand1.emulator.emulator import Emulator
 from tgdsl.runtime.xhand1.emulator.hand import EmulatedHand
 from tgdsl.runtime.xhand1.wire import ports
+from tgdsl.runtime.xhand1.wire.client import SerialTiming
 from tgdsl.runtime.xhand1.wire.payloads import PASSIVE, encode_command
 from tgdsl.runtime.xhand1.wire.protocol import Command, Register
 from tgdsl.runtime.xhand1.wire.serial_port import PortInfo
@@ -25,6 +27,12 @@ def emulator():
         }
         assert emulator.hand.is_passive
         assert not emulator.hand.position.any()
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """Wait for replies as long as a busy computer may take: an emulated hand shares it with all other tests."""
+    monkeypatch.setattr(driver, "SerialTiming", lambda: SerialTiming(reply_timeout_s=0.3))
 
 
 @pytest.fixture
