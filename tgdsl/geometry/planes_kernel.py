@@ -3,7 +3,7 @@
 A matrix is its upper triangle, row by row: xx, xy, xz, yy, yz, zz.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false
 
 from __future__ import annotations

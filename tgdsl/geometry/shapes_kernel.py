@@ -3,7 +3,7 @@
 A vector is a tuple of three blocks, a rotation one of nine, row by row. A geom's size lies in memory, one after the other.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ then joins.
 Shapes: as in `link_products`, and `tile` tiles.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs, `object` felt objects,
 `env` if an object differs between environments, `row` columns of a geom.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

@@ -7,6 +7,9 @@ Shapes: `env` environments, `taxel` probes, `pair` pairs of the object, `node` n
 (env, taxel).
 """
 
+# Only Triton's compiler knows the types in a kernel.
+# pyright: reportGeneralTypeIssues=false
+
 from __future__ import annotations
 
 from typing import Any
@@ -216,7 +219,7 @@ def nearby_kernel(
         num_z = tl.load(table + 3, is_probe)
     lattice = lattice_ptr + first_env * lattice_env_step + (env * lattice_env_step + taxel * lattice_taxel_step)
     cell = tl.load(lattice + 3, is_probe)
-    cell_x, along_x, is_in_x = _along((point_x - tl.load(lattice, is_probe)) / cell, num_x)  # pyright: ignore[reportGeneralTypeIssues]
+    cell_x, along_x, is_in_x = _along((point_x - tl.load(lattice, is_probe)) / cell, num_x)
     cell_y, along_y, is_in_y = _along((point_y - tl.load(lattice + 1, is_probe)) / cell, num_y)
     cell_z, along_z, is_in_z = _along((point_z - tl.load(lattice + 2, is_probe)) / cell, num_z)
 
@@ -227,7 +230,7 @@ def nearby_kernel(
     total = tl.zeros((BLOCK, 4), tl.float32)
     if IS_SHIFTED:
         shift = tl.load(shift_ptr + start + tl.arange(0, BLOCK), is_probe)
-    for corner in tl.static_range(8):  # pyright: ignore[reportGeneralTypeIssues]
+    for corner in tl.static_range(8):
         weight_x = along_x if corner // 4 else 1 - along_x
         weight_y = along_y if corner // 2 % 2 else 1 - along_y
         weight_z = along_z if corner % 2 else 1 - along_z

@@ -6,7 +6,7 @@ each is compared with each, so that it knows how many come before it, and with t
 Shapes of blocks: `P` pairs of a body and an object, environment by environment; `S` slots, a power of two.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportCallIssue=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

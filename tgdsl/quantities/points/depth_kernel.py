@@ -8,7 +8,7 @@ Shapes: `env` environments, `pair` pairs, `link` links that may meet the object,
 object differs between environments, `node` nodes of all grids.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ compacted in their order, and counted.
 Shapes: `env` environments, `link` links that may meet the object, `point` its points, `all` the points of all objects.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

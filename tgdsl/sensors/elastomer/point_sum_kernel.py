@@ -9,7 +9,7 @@ Shapes: `env` environments, `link` links that may meet an object, `point` points
 tiles.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ point of that box.
 Shapes: `env` environments, `body` bodies, `contact` contacts of a body, `taxel` taxels of all bodies, one body after the other.
 """
 
-# What a kernel's types are only Triton's compiler knows.
-# pyright: reportArgumentType=false
+# Only Triton's compiler knows the types in a kernel.
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ def _load(at, is_there):
 def _taxel(pos, taxel):
     """Return position and −2 times the normal of a taxel, read two numbers at a time: the same for all threads."""
     at = pos.to(tl.pointer_type(tl.int64)) + 3 * taxel
-    x, y = _halves(tl.load(at))  # pyright: ignore[reportGeneralTypeIssues]
+    x, y = _halves(tl.load(at))
     z, nx = _halves(tl.load(at + 1))
     ny, nz = _halves(tl.load(at + 2))
     return (x, y, z), (nx, ny, nz)
@@ -290,7 +290,7 @@ def _away(box, point, force, inverse):
 @triton.jit
 def _moments(pos, weights, num_own, box, point, normal, force, slope, inverse, IS_LONG: tl.constexpr):
     """Return γ, the shares' sum and its exponent, and mean [m] and covariance [m²] of the arms: (env, contact)."""
-    away, is_beside = _away(box, point, force, inverse)  # pyright: ignore[reportGeneralTypeIssues]
+    away, is_beside = _away(box, point, force, inverse)
     if is_beside:
         found = _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, IS_LONG, True)
     else:
@@ -307,7 +307,7 @@ def _moments_about(pos, weights, num_own, point, normal, slope, inverse, away, I
         top += _highest(pos, num_own, point, normal, slope, inverse)
     nearest, total = zero, zero
     x, y, z, xx, xy, xz, yy, yz, zz = zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):  # pyright: ignore[reportGeneralTypeIssues]
+    for taxel in tl.range(0, num_own, loop_unroll_factor=UNROLL):
         place, inward = _taxel(pos, taxel)
         arm, facing = _arm(place, point), dot(inward, normal)
         weight = tl.load(weights + taxel)[:, None]
@@ -384,7 +384,7 @@ def _summed(a):
 @triton.jit
 def _unmet(captured, mean, force, torque):
     """Return Σ_c γ_c (Σ_j λ_cj (x_j − x_c) × f_c − τ_c), (env,) [N·m]."""
-    x, y, z = cross(mean, force)  # pyright: ignore[reportGeneralTypeIssues]
+    x, y, z = cross(mean, force)
     return _summed(scale3(captured, (x - torque[0], y - torque[1], z - torque[2])))
 
 

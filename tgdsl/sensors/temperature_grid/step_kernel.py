@@ -8,7 +8,7 @@ Shapes of blocks: `C` cells of a box, `E` environments, `R` rows, `S` sides, eac
 then holds those of one patch, and what there is once for all of them is computed once.
 """
 
-# What a kernel's types are only Triton's compiler knows.
+# Only Triton's compiler knows the types in a kernel.
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportOperatorIssue=false
 
 from __future__ import annotations
